@@ -1,0 +1,98 @@
+"""Pinhole camera in OpenCV axes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera (x right, y down, z forward; pixel centres at +0.5).
+
+    Parameters
+    ----------
+    viewmat : (4, 4) float64
+        World to camera, in world units.
+    fx, fy : float
+        Focal lengths in pixels.
+    cx, cy : float
+        Principal point in pixels, from the upper left corner of the upper left pixel.
+    width, height : int
+        Image size in pixels.
+
+    Raises
+    ------
+    InputError
+        If a value is not finite, a focal length or a size is not positive, or the rotation is not one
+        (not orthonormal to 1e-3, or a reflection).
+    """
+
+    viewmat: NDArray[np.float64]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        viewmat = np.ascontiguousarray(self.viewmat, dtype=np.float64)
+        if viewmat.shape != (4, 4):
+            raise InputError(f"viewmat: expected shape (4, 4), found {viewmat.shape}")
+        object.__setattr__(self, "viewmat", viewmat)
+        intrinsics = np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64)
+        if not np.isfinite(viewmat).all() or not np.isfinite(intrinsics).all():
+            raise InputError("camera: expected finite viewmat and intrinsics, found NaN or infinity")
+        if self.fx <= 0 or self.fy <= 0:
+            raise InputError(f"camera: expected positive focal lengths, found fx={self.fx}, fy={self.fy}")
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"camera: expected a size of at least 1x1, found {self.width}x{self.height}")
+        rotation = viewmat[:3, :3]
+        # 1e-3 admits poses printed with four digits; a scaled or sheared matrix would render a wrong scene silently.
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+            raise InputError(
+                "viewmat: expected a rotation in its upper left 3x3 (orthonormal, determinant +1), found determinant "
+                f"{np.linalg.det(rotation):.4g}"
+            )
+
+    @property
+    def K(self) -> NDArray[np.float64]:  # noqa: N802 (the field's name for it)
+        """Intrinsic matrix, (3, 3), in pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """Camera centre in world units, (3,)."""
+        return -np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3])
+
+    @classmethod
+    def look_at(
+        cls, position: object, target: object, up: object, fx: float, width: int, height: int
+    ) -> "Camera":
+        """Camera at `position` (3,) looking at `target` (3,), the image's upper edge towards `up` (3,).
+
+        Square pixels of focal length `fx` in pixels, principal point in the middle of the image.
+        """
+        eye = np.asarray(position, dtype=np.float64)
+        forward = np.asarray(target, dtype=np.float64) - eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, np.asarray(up, dtype=np.float64))
+        right /= np.linalg.norm(right)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+        viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+        return cls(viewmat, fx, fx, width / 2, height / 2, width, height)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view at another image size; the intrinsics follow."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(self.viewmat, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
+
+    def translated(self, offset: NDArray[np.float64]) -> "Camera":
+        """The same camera in a world whose origin is moved to `offset` (3,)."""
+        viewmat = self.viewmat.copy()
+        viewmat[:3, 3] += viewmat[:3, :3] @ offset
+        return Camera(viewmat, self.fx, self.fy, self.cx, self.cy, self.width, self.height)

@@ -1,0 +1,144 @@
+"""Configuration: frozen dataclasses from which the command line, ``config.json`` and the docs table come."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from clsplat.constants import TILE
+
+Mode = Literal["classic", "antialiased"]
+Background = Literal["black", "white"]
+
+BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """How Gaussians become an image."""
+
+    mode: Mode = "classic"
+    """classic: the paper's dilation by 0.3 px². antialiased: opacity compensated for it (Mip-Splatting's 2D filter)."""
+    tile_size: Literal[8, 16] = TILE
+    """Edge of a tile in pixels; changes speed, not the image."""
+    compositor: Literal["auto", "cpu", "gpu"] = "auto"
+    """Kernel variant of the compositing stage; auto takes the one for the device's type."""
+
+
+@dataclass(frozen=True)
+class SfmConfig:
+    """How poses are recovered from photos (pycolmap: SIFT, matching, incremental mapping)."""
+
+    matching: Literal["exhaustive", "sequential"] = "exhaustive"
+    """exhaustive: every pair of photos. sequential: neighbours by file name, for video frames."""
+    camera_model: str = "OPENCV"
+    """COLMAP camera model that is fitted; photos are undistorted when they are loaded."""
+    single_camera: bool = True
+    """All photos come from one camera at one zoom; otherwise each photo gets intrinsics of its own."""
+    max_image_size: int = 1600
+    """Longer edge in pixels at which features are searched."""
+    min_registered: int = 3
+    """Fewer registered photos than this are an error."""
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which photos are read, and how."""
+
+    downscale: Literal[1, 2, 4, 8] = 1
+    """Reads images_2, images_4 or images_8 where present; resamples the photos otherwise."""
+    test_every: int = 8
+    """Every n-th photo by name is held out (0: none); ignored where the dataset brings its own split."""
+    background: Background = "black"
+    """Behind the scene, and behind transparent photos."""
+    masks: str | None = None
+    """Folder of masks named as the photos (NAME.png or NAME.jpg.png): white pixels train, black ones do not."""
+    sfm: SfmConfig = field(default_factory=SfmConfig)
+    """Used where there are photos but no poses."""
+
+
+@dataclass(frozen=True)
+class InitConfig:
+    """The Gaussians that training starts from."""
+
+    random_points: int = 100_000
+    """Gaussians of a random start, where the scene has no points (the original's number)."""
+    random_extent: float = 1 / 3
+    """Half edge of the random start's box, as a fraction of the cameras' mean distance from the point they look
+    at; for NeRF-synthetic scenes (distance 4) that is the original's box within 3 %."""
+    opacity: float = 0.1
+    """Opacity at the start (original)."""
+    sh_degree: Literal[0, 1, 2, 3] = 3
+    """Highest degree of the spherical harmonics."""
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Adam and its learning rates (the original's values)."""
+
+    means_lr: float = 1.6e-4
+    """At the start, times the scene's extent."""
+    means_lr_final: float = 1.6e-6
+    """At the last iteration, times the scene's extent; exponential in between."""
+    log_scales_lr: float = 5e-3
+    quats_lr: float = 1e-3
+    logit_opacities_lr: float = 5e-2
+    sh0_lr: float = 2.5e-3
+    sh_rest_lr: float = 2.5e-3 / 20
+    """Spherical harmonics of degree 1 and above."""
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+    ssim_weight: float = 0.2
+    """lambda of the loss (1 - lambda) L1 + lambda (1 - SSIM) (paper, equation 7)."""
+    sh_degree_every: int = 1000
+    """Iterations after which one more band of spherical harmonics is trained."""
+
+
+@dataclass(frozen=True)
+class AdcConfig:
+    """Adaptive density control (paper, section 5.2; the original's values)."""
+
+    start: int = 500
+    """First iteration after which Gaussians are added or removed."""
+    stop_fraction: float = 0.5
+    """Fraction of the iterations after which the number of Gaussians stays fixed."""
+    every: int = 100
+    """Iterations between two rounds."""
+    grad_threshold: float = 2e-4
+    """Mean norm of the positional gradient, in normalised device coordinates, above which a Gaussian is densified."""
+    scale_threshold: float = 0.01
+    """Largest scale, in scene extents, up to which it is cloned and beyond which it is split."""
+    opacity_min: float = 0.005
+    """Gaussians of a lower opacity are removed."""
+    scale_max: float = 0.1
+    """Gaussians with a larger scale, in scene extents, are removed once opacities have been reset."""
+    reset_every: int = 3000
+    """Iterations between two resets of the opacities."""
+    reset_opacity: float = 0.01
+    """Opacities are lowered to at most this value at a reset; it lies above ALPHA_MIN, so that gradients survive."""
+    max_gaussians: int = 6_000_000
+    """Never exceeded; the candidates with the largest gradients are densified first."""
+    min_gaussians: int = 16
+    """Pruning never leaves fewer, however transparent they are."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A whole training run; saved as ``config.json``, from which it can be repeated."""
+
+    iterations: int = 7000
+    """Optimisation steps; schedules stretch with them."""
+    seed: int = 0
+    """Of the random start, the order of the photos and the positions of split Gaussians."""
+    strategy: str = "adc"
+    """Densification strategy: a name of clsplat.densify.STRATEGIES."""
+    checkpoint_every: int = 1000
+    """Iterations between two checkpoints, from which an interrupted run resumes."""
+    eval_every: int = 0
+    """Iterations between two evaluations on the held-out photos (0: only at the end)."""
+    device: str | None = None
+    """Part of the platform's or device's name; PYOPENCL_CTX is honoured where this is not given."""
+    data: DataConfig = field(default_factory=DataConfig)
+    init: InitConfig = field(default_factory=InitConfig)
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    adc: AdcConfig = field(default_factory=AdcConfig)
+    render: RenderConfig = field(default_factory=RenderConfig)

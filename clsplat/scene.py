@@ -1,0 +1,61 @@
+"""A posed set of photos, as every reader of `clsplat.io` returns it."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photo and its camera.
+
+    Parameters
+    ----------
+    name : str
+        Path of the photo inside its folder, with forward slashes.
+    camera : Camera
+        Pinhole camera of the photo's size, in the scene's coordinates.
+    image : (H, W, 3) uint8
+        The photo: undistorted, upright, composited on the background where it was transparent.
+    mask : (H, W) bool, optional
+        True where pixels count.
+    """
+
+    name: str
+    camera: Camera
+    image: NDArray[np.uint8]
+    mask: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Views and points in one coordinate system.
+
+    Parameters
+    ----------
+    train, test : list of View
+        The photos trained on and the photos held out, each sorted by name.
+    points : (P, 3) float64
+        Sparse points in the scene's coordinates; P may be 0.
+    colors : (P, 3) uint8
+        Their colours.
+    offset : (3,) float64
+        What was subtracted from the world's coordinates: not 0 only for geo-referenced scenes.
+    """
+
+    train: list[View]
+    test: list[View]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def extent(self) -> float:
+        """Scale of the scene in world units: 1.1 times the largest distance of a training camera from their mean
+        (the original's `cameras_extent`); 1 where all cameras stand at one place."""
+        centres = np.array([view.camera.position for view in self.train])
+        radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+        return 1.1 * radius if radius > 0 else 1.0
