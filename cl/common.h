@@ -1,0 +1,50 @@
+// Real type, literals and index helpers shared by every stage.
+//
+// -DUSE_DOUBLE  selects real = double; without it real = float and the host passes -cl-single-precision-constant,
+//               so that unsuffixed literals are of type real in both builds.
+// -DALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN, BLUR, COMPENSATION_MIN, NEAR, FRUSTUM_MARGIN, QUAT_NORM2_MIN, EXTENT_SLACK
+//               the model's constants; their home, reasons and sources are in clsplat/constants.py.
+#ifndef CLSPLAT_COMMON_H
+#define CLSPLAT_COMMON_H
+
+#if !defined(ALPHA_MIN) || !defined(ALPHA_MAX) || !defined(TRANSMITTANCE_MIN) || !defined(BLUR) ||                   \
+    !defined(COMPENSATION_MIN) || !defined(NEAR) || !defined(QUAT_NORM2_MIN) || !defined(EXTENT_SLACK) ||            \
+    !defined(FRUSTUM_MARGIN)
+#error "the constants of clsplat/constants.py must be passed as -D; build through clsplat.device.Device.program"
+#endif
+
+#ifdef USE_DOUBLE
+#pragma OPENCL EXTENSION cl_khr_fp64 : enable
+typedef double real;
+typedef double2 real2;
+typedef double3 real3;
+typedef double4 real4;
+typedef double8 real8;
+typedef double16 real16;
+typedef long8 mask8; // what comparing two real8 gives
+typedef long16 mask16;
+#else
+typedef float real;
+typedef float2 real2;
+typedef float3 real3;
+typedef float4 real4;
+typedef float8 real8;
+typedef float16 real16;
+typedef int8 mask8;
+typedef int16 mask16;
+#endif
+
+#define CONCATENATE_(a, b) a##b
+#define CONCATENATE(a, b)  CONCATENATE_(a, b)
+
+inline real3 load3(const __global real *x, size_t i) {
+    return (real3)(x[3 * i], x[3 * i + 1], x[3 * i + 2]);
+}
+
+inline void store3(__global real *x, size_t i, real3 value) {
+    x[3 * i] = value.x;
+    x[3 * i + 1] = value.y;
+    x[3 * i + 2] = value.z;
+}
+
+#endif

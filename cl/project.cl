@@ -1,0 +1,306 @@
+// Stage project: Gaussians to splats, and gradients back.
+//
+// Computes for each Gaussian its centre in the image, the inverse of its 2D covariance (EWA splatting with
+// the local affine approximation J of the projection), its depth, the half widths of the box outside which
+// alpha < ALPHA_MIN, its opacity and its colour:
+//   cov2d = J W Sigma W^T J^T + BLUR I,  Sigma = R S S^T R^T          (Kerbl et al. 2023, equations 5 and 6)
+//   colour = max(SH(direction) + 1/2, 0)                               (original code)
+//   antialiased: opacity * sqrt(det(cov2d - BLUR I)/det(cov2d))        (Yu et al. 2024, "Mip-Splatting",
+//   equation 10)
+// docs/stages/project.md derives the gradients; clsplat/reference/project.py is the float64 twin.
+//
+// Mapping: one work-item per Gaussian, no local memory except for VIEWMAT_GRAD.
+//
+// Buffers, N Gaussians with K = (degree + 1)^2 coefficients stored, C = CHANNELS:
+//   in   means[N,3] world, log_scales[N,3] ln(world), quats[N,4] wxyz of any norm, logit_opacities[N],
+//   sh[N,K,3] out  means2d[N,2] px, conics[N,3] px^-2 (xx, xy, yy), depths[N] world, extents[N,2] px,
+//   opacities[N],
+//        colors[N,C] (RGB, then the depth if C is 4)
+//        An invisible Gaussian has extents 0 and all its other outputs 0.
+//   v_x  is the gradient with respect to x; v_viewmat[groups,12] holds a partial sum per work-group of the
+//        gradient with respect to rotation (9, row-major) and translation (3).
+//
+// -DCHANNELS=3|4      4: the depth is composited beside RGB
+// -DANTIALIASED=0|1   opacity compensation
+// -DVIEWMAT_GRAD=0|1  the backward kernel also writes v_viewmat; needs -DGROUP, the work-group size
+#include "common.h"
+#include "ellipse.h"
+#include "linalg.h"
+#include "sh.h"
+#include "structs.h"
+
+#if !defined(CHANNELS) || (CHANNELS != 3 && CHANNELS != 4)
+#error "-DCHANNELS must be 3 (RGB) or 4 (RGB and depth)"
+#endif
+#if !defined(ANTIALIASED) || !defined(VIEWMAT_GRAD)
+#error "-DANTIALIASED and -DVIEWMAT_GRAD must be 0 or 1"
+#endif
+#if VIEWMAT_GRAD && !defined(GROUP)
+#error "-DVIEWMAT_GRAD=1 needs -DGROUP, the work-group size of project_bwd"
+#endif
+
+inline mat3 camera_rotation(const Camera *camera) {
+    const real *r = camera->rotation;
+    mat3 m = {(real3)(r[0], r[1], r[2]), (real3)(r[3], r[4], r[5]), (real3)(r[6], r[7], r[8])};
+    return m;
+}
+
+// Slopes x/z and y/z at which the Jacobian is evaluated: clamped to the image enlarged by FRUSTUM_MARGIN.
+inline real2 clamped_slopes(const Camera *camera, real2 slopes) {
+    const real2 focal = (real2)(camera->fx, camera->fy), centre = (real2)(camera->cx, camera->cy);
+    const real2 size = (real2)(camera->width, camera->height);
+    const real2 margin = (real)(0.5 * FRUSTUM_MARGIN) * size / focal;
+    return clamp(slopes, -centre / focal - margin, (size - centre) / focal + margin);
+}
+
+// What forward and backward both need of one Gaussian.
+typedef struct {
+    real3 p;         // centre, camera frame
+    real2 slopes;    // clamped x/z, y/z
+    mat3 rotation;   // of the Gaussian
+    real3 scales;    // standard deviations, world units
+    real3 j0, j1;    // rows of J
+    real3 t0, t1;    // rows of J W
+    real3 b0, b1;    // rows of J W R S: cov2d = B B^T + BLUR I
+    real xx, xy, yy; // cov2d
+    real det0, det;  // determinants of cov2d without and with the blur
+} Footprint;
+
+inline Footprint footprint(const Camera *camera, real3 mean, real3 log_scales, real4 unit_quat) {
+    Footprint f;
+    const mat3 view = camera_rotation(camera);
+    f.p = mat3_mul(view, mean) + (real3)(camera->translation[0], camera->translation[1], camera->translation[2]);
+    const real inv_z = 1 / f.p.z;
+    f.slopes = clamped_slopes(camera, f.p.xy * inv_z);
+    f.j0 = (real3)(camera->fx * inv_z, 0, -camera->fx * f.slopes.x * inv_z);
+    f.j1 = (real3)(0, camera->fy * inv_z, -camera->fy * f.slopes.y * inv_z);
+    f.t0 = mat3_tmul(view, f.j0);
+    f.t1 = mat3_tmul(view, f.j1);
+    f.rotation = rotation_from_quat(unit_quat);
+    f.scales = exp(log_scales);
+    f.b0 = mat3_tmul(f.rotation, f.t0) * f.scales;
+    f.b1 = mat3_tmul(f.rotation, f.t1) * f.scales;
+    const real xx = dot(f.b0, f.b0), yy = dot(f.b1, f.b1);
+    // |b0 x b1|^2 = xx yy - xy^2 (Lagrange), without the cancellation that makes a needle's determinant
+    // negative.
+    const real3 normal = cross(f.b0, f.b1);
+    f.det0 = dot(normal, normal);
+    f.det = f.det0 + BLUR * (xx + yy) + BLUR * BLUR;
+    f.xx = xx + BLUR;
+    f.xy = dot(f.b0, f.b1);
+    f.yy = yy + BLUR;
+    return f;
+}
+
+typedef struct {
+    real3 p, log_scales, mean;
+    real4 quat; // of the unit quaternion
+    mat3 view;
+} FootprintGrad;
+
+// v_xx, v_xy, v_yy: gradients of cov2d, where xy stands for both off-diagonal entries.
+inline FootprintGrad footprint_vjp(const Camera *camera, const Footprint *f, real3 mean, real4 unit_quat, real3 v_cov,
+                                   real2 v_mean2d, real v_depth) {
+    FootprintGrad v;
+    const mat3 view = camera_rotation(camera);
+    const real3 v_b0 = 2 * v_cov.x * f->b0 + v_cov.y * f->b1;
+    const real3 v_b1 = 2 * v_cov.z * f->b1 + v_cov.y * f->b0;
+
+    // b = S R^T t
+    const real3 scaled0 = f->scales * v_b0, scaled1 = f->scales * v_b1;
+    v.log_scales = f->b0 * v_b0 + f->b1 * v_b1;
+    v.quat = rotation_from_quat_vjp(unit_quat, mat3_outer2(f->t0, scaled0, f->t1, scaled1));
+    const real3 v_t0 = mat3_mul(f->rotation, scaled0), v_t1 = mat3_mul(f->rotation, scaled1);
+
+    // t = W^T j
+    const real3 v_j0 = mat3_mul(view, v_t0), v_j1 = mat3_mul(view, v_t1);
+    v.view = mat3_outer2(f->j0, v_t0, f->j1, v_t1);
+
+    // j(slopes, z), the slopes' own derivative being 0 where they are clamped; then the centre and the depth.
+    const real inv_z = 1 / f->p.z;
+    const real2 focal = (real2)(camera->fx, camera->fy), slopes = f->p.xy * inv_z;
+    real2 v_slopes = v_mean2d * focal;
+    if (slopes.x == f->slopes.x)
+        v_slopes.x -= focal.x * inv_z * v_j0.z;
+    if (slopes.y == f->slopes.y)
+        v_slopes.y -= focal.y * inv_z * v_j1.z;
+    v.p.xy = v_slopes * inv_z;
+    v.p.z = v_depth - dot(v_slopes, slopes) * inv_z -
+            inv_z * inv_z * (focal.x * (v_j0.x - f->slopes.x * v_j0.z) + focal.y * (v_j1.y - f->slopes.y * v_j1.z));
+
+    // p = W mean + translation
+    v.mean = mat3_tmul(view, v.p);
+    v.view.row0 += v.p.x * mean;
+    v.view.row1 += v.p.y * mean;
+    v.view.row2 += v.p.z * mean;
+    return v;
+}
+
+// Factor on the opacity, and the gradients of the determinants with respect to it.
+inline real compensation(real det0, real det) {
+#if ANTIALIASED
+    return sqrt(fmax(det0 / det, (real)(COMPENSATION_MIN * COMPENSATION_MIN)));
+#else
+    return 1;
+#endif
+}
+
+inline real2 compensation_vjp(real det0, real det, real v_factor) {
+#if ANTIALIASED
+    const real ratio = det0 / det;
+    if (ratio <= (real)(COMPENSATION_MIN * COMPENSATION_MIN))
+        return 0;
+    const real v_ratio = v_factor * (real)0.5 / sqrt(ratio);
+    return (real2)(v_ratio / det, -v_ratio * ratio / det);
+#else
+    return 0;
+#endif
+}
+
+inline real sigmoid(real x) {
+    return 1 / (1 + exp(-x));
+}
+
+// conic (xx, xy, yy) = inverse of cov2d: v_cov = -Q V Q with the symmetric matrix V of (v_xx, v_xy/2, v_yy).
+inline real3 conic_vjp(real3 q, real3 v) {
+    return -(real3)(q.x * q.x * v.x + q.x * q.y * v.y + q.y * q.y * v.z,
+                    2 * q.x * q.y * v.x + (q.y * q.y + q.x * q.z) * v.y + 2 * q.y * q.z * v.z,
+                    q.y * q.y * v.x + q.y * q.z * v.y + q.z * q.z * v.z);
+}
+
+inline real3 from_camera(const Camera *camera, real3 mean) {
+    return mean - (real3)(camera->position[0], camera->position[1], camera->position[2]);
+}
+
+__kernel void project_fwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
+                          const __global real *means, const __global real *log_scales, const __global real *quats,
+                          const __global real *logit_opacities, const __global real *sh, __global real *means2d,
+                          __global real *conics, __global real *depths, __global real *extents,
+                          __global real *opacities, __global real *colors) {
+    const size_t i = get_global_id(0);
+    if (i >= n)
+        return;
+
+    const real3 mean = load3(means, i);
+    const real4 quat = vload4(i, quats);
+    const real norm2 = dot(quat, quat);
+    const Footprint f = footprint(&camera, mean, load3(log_scales, i), quat / sqrt(norm2));
+    const real opacity = sigmoid(logit_opacities[i]) * compensation(f.det0, f.det);
+    const real r2 = ellipse_r2(opacity);
+    const real2 centre = (real2)(camera.fx * f.p.x / f.p.z + camera.cx, camera.fy * f.p.y / f.p.z + camera.cy);
+    const real2 extent = sqrt(r2 * (real2)(f.xx, f.yy));
+    const real3 direction = normalize(from_camera(&camera, mean));
+    real basis[16];
+    sh_basis(direction, sh_degree, basis);
+    real3 color = (real)0.5;
+    for (int k = 0; k < (sh_degree + 1) * (sh_degree + 1); ++k)
+        color += basis[k] * load3(sh, i * sh_stride + k);
+
+    // Zero times infinity is NaN: one test finds what is not finite in any term.
+    const real any = f.det + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
+    bool visible = isfinite(0 * any) && f.p.z > NEAR && norm2 >= QUAT_NORM2_MIN && r2 > 0;
+    if (visible) {
+        const int2 columns = pixels_between(centre.x - extent.x, centre.x + extent.x, camera.width);
+        const int2 rows = pixels_between(centre.y - extent.y, centre.y + extent.y, camera.height);
+        visible = columns.x <= columns.y && rows.x <= rows.y;
+    }
+    vstore2(visible ? centre : (real2)0, i, means2d);
+    store3(conics, i, visible ? (real3)(f.yy, -f.xy, f.xx) / f.det : (real3)0);
+    depths[i] = visible ? f.p.z : 0;
+    vstore2(visible ? extent : (real2)0, i, extents);
+    opacities[i] = visible ? opacity : 0;
+    for (int k = 0; k < 3; ++k)
+        colors[CHANNELS * i + k] = visible ? fmax(((const real *)&color)[k], (real)0) : 0;
+#if CHANNELS == 4
+    colors[CHANNELS * i + 3] = visible ? f.p.z : 0;
+#endif
+}
+
+__kernel void project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
+                          const __global real *means, const __global real *log_scales, const __global real *quats,
+                          const __global real *logit_opacities, const __global real *extents,
+                          const __global real *conics, const __global real *colors, const __global real *sh,
+                          const __global real *v_means2d, const __global real *v_conics,
+                          const __global real *v_opacities, const __global real *v_colors, __global real *v_means,
+                          __global real *v_log_scales, __global real *v_quats, __global real *v_logit_opacities,
+                          __global real *v_sh
+#if VIEWMAT_GRAD
+                          ,
+                          __global real *v_viewmat
+#endif
+) {
+    const size_t i = get_global_id(0);
+    FootprintGrad v = {0};
+    real v_logit = 0;
+    if (i < n) {
+        const bool visible = extents[2 * i] > 0;
+        const int active = visible ? (sh_degree + 1) * (sh_degree + 1) : 0;
+        if (visible) {
+            const real3 mean = load3(means, i);
+            const real4 quat = vload4(i, quats);
+            const real4 unit_quat = quat / sqrt(dot(quat, quat));
+            const Footprint f = footprint(&camera, mean, load3(log_scales, i), unit_quat);
+
+            const real opacity = sigmoid(logit_opacities[i]);
+            const real factor = compensation(f.det0, f.det);
+            v_logit = v_opacities[i] * factor * opacity * (1 - opacity);
+            const real2 v_det = compensation_vjp(f.det0, f.det, v_opacities[i] * opacity);
+            real3 v_cov = conic_vjp(load3(conics, i), load3(v_conics, i));
+            v_cov +=
+                v_det.x * (real3)(f.yy - BLUR, -2 * f.xy, f.xx - BLUR) + v_det.y * (real3)(f.yy, -2 * f.xy, f.xx);
+
+            real v_depth = 0;
+#if CHANNELS == 4
+            v_depth = v_colors[CHANNELS * i + 3];
+#endif
+            v = footprint_vjp(&camera, &f, mean, unit_quat, v_cov, vload2(i, v_means2d), v_depth);
+            v.quat = normalize_quat_vjp(quat, v.quat);
+
+            // Colour; where it is clamped at 0 nothing passes.
+            real3 v_color;
+            v_color.x = colors[CHANNELS * i] > 0 ? v_colors[CHANNELS * i] : 0;
+            v_color.y = colors[CHANNELS * i + 1] > 0 ? v_colors[CHANNELS * i + 1] : 0;
+            v_color.z = colors[CHANNELS * i + 2] > 0 ? v_colors[CHANNELS * i + 2] : 0;
+            const real3 offset = from_camera(&camera, mean);
+            const real3 direction = normalize(offset);
+            real basis[16], v_basis[16];
+            sh_basis(direction, sh_degree, basis);
+            for (int k = 0; k < active; ++k) {
+                v_basis[k] = dot(load3(sh, i * sh_stride + k), v_color);
+                store3(v_sh, i * sh_stride + k, basis[k] * v_color);
+            }
+            const real3 v_offset = normalize_vjp(offset, sh_basis_vjp(direction, sh_degree, v_basis));
+            v.mean += v_offset;
+
+            // position = -W^-1 translation: v_translation = W v_offset, v_W = (W v_offset) position^T
+            const real3 v_translation = mat3_mul(camera_rotation(&camera), v_offset);
+            const real3 position = (real3)(camera.position[0], camera.position[1], camera.position[2]);
+            v.p += v_translation;
+            v.view.row0 += v_translation.x * position;
+            v.view.row1 += v_translation.y * position;
+            v.view.row2 += v_translation.z * position;
+        }
+        for (int k = active; k < sh_stride; ++k)
+            store3(v_sh, i * sh_stride + k, (real3)0);
+        store3(v_means, i, v.mean);
+        store3(v_log_scales, i, v.log_scales);
+        vstore4(v.quat, i, v_quats);
+        v_logit_opacities[i] = v_logit;
+    }
+
+#if VIEWMAT_GRAD
+    __local real partial[12 * GROUP];
+    const uint lane = get_local_id(0);
+    vstore3(v.view.row0, 4 * lane, partial);
+    vstore3(v.view.row1, 4 * lane + 1, partial);
+    vstore3(v.view.row2, 4 * lane + 2, partial);
+    vstore3(v.p, 4 * lane + 3, partial);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint k = lane; k < 12; k += GROUP) {
+        real sum = 0;
+        for (uint j = 0; j < GROUP; ++j)
+            sum += partial[12 * j + k];
+        v_viewmat[12 * get_group_id(0) + k] = sum;
+    }
+#endif
+}

@@ -1,0 +1,228 @@
+"""OpenCL context, program cache and buffers: with `clsplat.ops` the only code that imports pyopencl."""
+
+import os
+import re
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+from numpy.typing import DTypeLike
+
+from clsplat import constants
+from clsplat.errors import DeviceError
+
+POCL_HINT = "install one, for example the embedded CPU driver: pip install 'clsplat[pocl]'"
+
+# Passed to every program; the kernels' copy of clsplat/constants.py.
+MODEL_CONSTANTS = (
+    "ALPHA_MIN",
+    "ALPHA_MAX",
+    "TRANSMITTANCE_MIN",
+    "BLUR",
+    "COMPENSATION_MIN",
+    "NEAR",
+    "FRUSTUM_MARGIN",
+    "QUAT_NORM2_MIN",
+    "EXTENT_SLACK",
+)
+
+# Safe with every driver tried; -cl-fast-relaxed-math is not: it drops exp to 2e-4 on one and breaks it on another.
+BUILD_OPTIONS = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros"]
+
+
+def kernel_folder() -> Path:
+    """Folder of the OpenCL sources: inside the package when installed, beside it in a checkout."""
+    here = Path(__file__).resolve().parent
+    for folder in (here / "cl", here.parent / "cl"):
+        if (folder / "common.h").is_file():
+            return folder
+    raise DeviceError(
+        f"cl/common.h: expected the kernel sources in {here / 'cl'}, found none; reinstall clsplat"
+    )
+
+
+def inline_includes(name: str, folder: Path) -> str:
+    """Source of cl/`name` with every ``#include "..."`` replaced by the file, and #line directives.
+
+    Compilers then report errors as cl/FILE:LINE, and no driver's program cache can miss an edited header.
+    """
+    lines = [f'#line 1 "cl/{name}"']
+    for number, line in enumerate((folder / name).read_text().splitlines(), start=1):
+        include = re.match(r'\s*#include\s+"(.+)"', line)
+        if include:
+            lines += [inline_includes(include[1], folder), f'#line {number + 1} "cl/{name}"']
+        else:
+            lines.append(line)
+    return "\n".join(lines)
+
+
+def list_devices() -> list[cl.Device]:
+    """All OpenCL devices, in the order of platforms; empty where there is no driver."""
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError:  # the loader's way to say that there is no driver
+        return []
+    devices: list[cl.Device] = []
+    for platform in platforms:
+        try:
+            devices += platform.get_devices()
+        except cl.Error:  # a platform without devices says so by an error
+            continue
+    return devices
+
+
+def device_label(device: cl.Device) -> str:
+    """Platform and name of a device, as the user may write them after ``--device``."""
+    return f"{device.platform.name.strip()}: {device.name.strip()}"
+
+
+def select_device(name: str | None = None) -> cl.Device:
+    """The device whose label contains `name`; without a name what PYOPENCL_CTX says, else GPU before CPU.
+
+    Raises
+    ------
+    DeviceError
+        If there is no driver, or none or several of the labels contain `name`.
+    """
+    devices = list_devices()
+    if not devices:
+        raise DeviceError(f"no OpenCL device found: {POCL_HINT}")
+    if name is not None:
+        matches = [d for d in devices if name.lower() in device_label(d).lower()]
+        if not matches:
+            found = ", ".join(device_label(d) for d in devices)
+            raise DeviceError(f"--device {name!r}: expected part of one of these names: {found}")
+        return matches[0]
+    if os.environ.get("PYOPENCL_CTX"):
+        try:
+            return cl.create_some_context(interactive=False).devices[0]
+        except (cl.Error, RuntimeError) as error:
+            raise DeviceError(
+                f"PYOPENCL_CTX={os.environ['PYOPENCL_CTX']!r} selects no OpenCL device: {error}"
+            ) from error
+    kinds = [cl.device_type.GPU, cl.device_type.ACCELERATOR, cl.device_type.CPU]
+    return min(devices, key=lambda d: next((i for i, kind in enumerate(kinds) if d.type & kind), len(kinds)))
+
+
+class Device:
+    """An OpenCL device with its queue, programs and buffers.
+
+    Parameters
+    ----------
+    cl_device : pyopencl.Device, optional
+        Taken from `select_device` where not given.
+    real : float32 or float64
+        Type of every real number on the device. float64 needs cl_khr_fp64 and is meant for tests.
+    """
+
+    def __init__(self, cl_device: cl.Device | None = None, real: DTypeLike = np.float32):
+        self.cl_device = cl_device if cl_device is not None else select_device()
+        self.real = np.dtype(real)
+        if self.real == np.float64 and "cl_khr_fp64" not in self.cl_device.extensions:
+            raise DeviceError(
+                f"{self.label}: expected a device with double precision (cl_khr_fp64) for float64"
+            )
+        self.context = cl.Context([self.cl_device])
+        self.queue = cl.CommandQueue(self.context)
+        self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self.queue))
+        self._kernels: dict[tuple[Any, ...], cl.Kernel] = {}
+        self._scratch: dict[tuple[str, int], cl.array.Array] = {}
+
+    @property
+    def label(self) -> str:
+        """Platform and device name."""
+        return device_label(self.cl_device)
+
+    @cached_property
+    def is_cpu(self) -> bool:
+        """Whether work-items run on CPU cores: few of them then own large contiguous pieces of work."""
+        return bool(self.cl_device.type & cl.device_type.CPU)
+
+    def _check_size(self, what: str, nbytes: int) -> None:
+        limit = self.cl_device.max_mem_alloc_size
+        if nbytes > limit:
+            raise DeviceError(
+                f"{what}: needs a buffer of {nbytes / 2**20:.0f} MiB, but {self.label} allows at most "
+                f"{limit / 2**20:.0f} MiB per buffer; use fewer Gaussians or a smaller image (--downscale)"
+            )
+
+    def empty(
+        self, what: str, shape: tuple[int, ...] | int, dtype: DTypeLike | None = None
+    ) -> cl.array.Array:
+        """Uninitialised array of `dtype` (default: real); `what` names it in errors.
+
+        Raises
+        ------
+        DeviceError
+            If it exceeds the device's largest buffer or its memory.
+        """
+        dtype = self.real if dtype is None else np.dtype(dtype)
+        self._check_size(what, int(np.prod(shape)) * dtype.itemsize)
+        try:
+            return cl.array.Array(self.queue, shape, dtype, allocator=self._pool)
+        except cl.MemoryError as error:
+            raise DeviceError(
+                f"{what}: {self.label} has no memory left for {np.prod(shape) * dtype.itemsize / 2**20:.0f} MiB; "
+                "use fewer Gaussians or a smaller image (--downscale)"
+            ) from error
+
+    def scratch(self, what: str, size: int) -> cl.array.Array:
+        """Flat array of reals that lives as long as the device; zero where no kernel has written since."""
+        if (what, size) not in self._scratch:
+            self._scratch[what, size] = self.empty(what, size)
+            self._scratch[what, size].fill(0)
+        return self._scratch[what, size]
+
+    def upload(self, what: str, array: Any, dtype: DTypeLike | None = None) -> cl.array.Array:
+        """Copy of a host array on the device, converted to `dtype` (default: real)."""
+        host = np.ascontiguousarray(array, dtype=self.real if dtype is None else dtype)
+        result = self.empty(what, host.shape, host.dtype)
+        result.set(host)
+        return result
+
+    def launch(
+        self,
+        stage: str,
+        kernel: str,
+        global_size: tuple[int, ...],
+        arguments: list[Any],
+        *,
+        defines: dict[str, Any] | None = None,
+        group: tuple[int, ...] | None = None,
+    ) -> None:
+        """Queue `kernel` of cl/`stage`.cl, built with `defines`, over `global_size` work-items.
+
+        Arguments are device arrays, Python ints (passed as 32 bits), floats (as real) or NumPy scalars and structs.
+        """
+        key = (stage, kernel, *sorted((defines or {}).items()))
+        if key not in self._kernels:
+            program = self._build(stage, defines or {})
+            for built in program.all_kernels():
+                self._kernels[(stage, built.function_name, *key[2:])] = built
+        converted = [self._argument(a) for a in arguments]
+        self._kernels[key](self.queue, global_size, group, *converted)
+
+    def _argument(self, value: Any) -> Any:
+        if isinstance(value, cl.array.Array):
+            return value.data
+        if isinstance(value, int):
+            return np.int32(value) if value < 2**31 else np.uint32(value)
+        if isinstance(value, float):
+            return self.real.type(value)
+        return value
+
+    def _build(self, stage: str, defines: dict[str, Any]) -> cl.Program:
+        options = list(BUILD_OPTIONS)
+        if self.real == np.float64:
+            options.append("-DUSE_DOUBLE")
+        else:
+            options.append("-cl-single-precision-constant")
+        values = {name: getattr(constants, name) for name in MODEL_CONSTANTS} | defines
+        options += [
+            f"-D{name}={value!r}" if isinstance(value, float) else f"-D{name}={value}"
+            for name, value in values.items()
+        ]
+        return cl.Program(self.context, inline_includes(f"{stage}.cl", kernel_folder())).build(options)

@@ -1,0 +1,101 @@
+"""Launch of the stage composite (cl/composite_cpu.cl, cl/composite_gpu.cl)."""
+
+from typing import Any
+
+from clsplat.device import Device
+from clsplat.stages import Bins, Image, SplatGrads, Splats
+
+# Work-items of the GPU variant's backward kernel, one splat each: two or four subgroups on the GPUs known.
+GPU_BATCH = 64
+
+
+def _variant(device: Device, compositor: str) -> str:
+    if compositor == "auto":
+        compositor = "cpu" if device.is_cpu else "gpu"
+    return f"composite_{compositor}"
+
+
+def _launch(device: Device, stage: str, kernel: str, bins: Bins, channels: int, arguments: list[Any]) -> None:
+    tiles = bins.tile_ranges.shape[0]
+    defines = {"TILE": bins.tile_size, "CHANNELS": channels}
+    group = 1
+    if stage == "composite_gpu":
+        defines["BATCH"] = GPU_BATCH
+        group = bins.tile_size**2 if kernel == "composite_fwd" else GPU_BATCH
+    device.launch(stage, kernel, (tiles * group,), arguments, defines=defines, group=(group,))
+
+
+def composite_fwd(
+    device: Device, splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto"
+) -> Image:
+    """Composite splats front to back.
+
+    Parameters
+    ----------
+    splats : Splats with C colour channels
+    bins : Bins of the same splats
+    background : (C,) array on the host
+    compositor : {"auto", "cpu", "gpu"}
+        Kernel variant.
+    """
+    channels = splats.colors.shape[1]
+    result = Image(
+        device.empty("image", (bins.height, bins.width, channels)),
+        device.empty("alpha", (bins.height, bins.width)),
+    )
+    arguments = [
+        bins.width,
+        bins.height,
+        splats.means2d,
+        splats.conics,
+        splats.extents,
+        splats.opacities,
+        splats.colors,
+    ]
+    arguments += [bins.gauss_ids, bins.tile_ranges, device.upload("background", background), *result]
+    _launch(device, _variant(device, compositor), "composite_fwd", bins, channels, arguments)
+    return result
+
+
+def composite_bwd(
+    device: Device, splats: Splats, bins: Bins, image: Image, v_image: Image, *, compositor: str = "auto"
+) -> SplatGrads:
+    """Gradients with respect to the splats.
+
+    Parameters
+    ----------
+    splats, bins, compositor
+        As given to `composite_fwd`.
+    image : Image
+        Its result.
+    v_image : Image
+        Gradients with respect to the image and to alpha.
+    """
+    n, channels = splats.colors.shape
+    m = bins.gauss_ids.shape[0]
+    records = device.empty("gradients per intersection", (max(m, 1), 6 + channels))
+    arguments = [
+        bins.width,
+        bins.height,
+        splats.means2d,
+        splats.conics,
+        splats.extents,
+        splats.opacities,
+        splats.colors,
+    ]
+    arguments += [bins.gauss_ids, bins.tile_ranges, bins.slots, *image, *v_image, records]
+    stage = _variant(device, compositor)
+    _launch(device, stage, "composite_bwd", bins, channels, arguments)
+    v = SplatGrads(
+        device.empty("v_means2d", (n, 2)),
+        device.empty("v_conics", (n, 3)),
+        device.empty("v_opacities", n),
+        device.empty("v_colors", (n, channels)),
+    )
+    defines = {"TILE": bins.tile_size, "CHANNELS": channels} | (
+        {"BATCH": GPU_BATCH} if stage == "composite_gpu" else {}
+    )
+    device.launch(
+        stage, "composite_sum", (n,), [n, bins.order, bins.first_slots, records, *v], defines=defines
+    )
+    return v

@@ -1,0 +1,135 @@
+"""Launch of the stage project (cl/project.cl)."""
+
+from typing import Any
+
+import numpy as np
+
+from clsplat.camera import Camera
+from clsplat.device import Device
+from clsplat.gaussians import Gaussians
+from clsplat.stages import SplatGrads, Splats
+from clsplat.structs import camera_struct
+
+# Work-group size of the backward kernel where it adds up the gradient of the viewmat: 3 KiB of local memory.
+VIEWMAT_GROUP = 64
+
+
+def project_fwd(
+    device: Device,
+    gaussians: Gaussians,
+    camera: Camera,
+    sh_degree: int,
+    *,
+    antialiased: bool = False,
+    channels: int = 3,
+) -> Splats:
+    """Project Gaussians into a camera.
+
+    Parameters
+    ----------
+    gaussians : Gaussians of N >= 1 rows
+    camera : Camera
+    sh_degree : int
+        Highest degree evaluated, at most the stored one.
+    antialiased : bool
+        Compensate the opacity for the blur of the 2D covariance.
+    channels : {3, 4}
+        4 adds the depth to the colours.
+
+    Returns
+    -------
+    Splats
+    """
+    n = len(gaussians)
+    splats = Splats(
+        device.empty("means2d", (n, 2)),
+        device.empty("conics", (n, 3)),
+        device.empty("depths", n),
+        device.empty("extents", (n, 2)),
+        device.empty("opacities", n),
+        device.empty("colors", (n, channels)),
+    )
+    g = gaussians
+    device.launch(
+        "project",
+        "project_fwd",
+        (n,),
+        [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree]
+        + [g.means, g.log_scales, g.quats, g.logit_opacities, g.sh, *splats],
+        defines={"CHANNELS": channels, "ANTIALIASED": int(antialiased), "VIEWMAT_GRAD": 0},
+    )
+    return splats
+
+
+def project_bwd(
+    device: Device,
+    gaussians: Gaussians,
+    camera: Camera,
+    sh_degree: int,
+    splats: Splats,
+    v_splats: SplatGrads,
+    *,
+    antialiased: bool = False,
+    viewmat_grad: bool = False,
+) -> tuple[Gaussians, np.ndarray[Any, Any] | None]:
+    """Gradients with respect to the Gaussians and, if asked for, the viewmat.
+
+    Parameters
+    ----------
+    gaussians, camera, sh_degree, antialiased
+        As given to `project_fwd`.
+    splats : Splats
+        Its result.
+    v_splats : SplatGrads
+        Gradients with respect to it.
+
+    Returns
+    -------
+    v_gaussians : Gaussians
+        One gradient per field; 0 for invisible Gaussians.
+    v_viewmat : (4, 4) or None
+        Gradient with respect to each entry of the viewmat as an independent variable, its last row 0.
+    """
+    n, g = len(gaussians), gaussians
+    v = Gaussians(
+        device.empty("v_means", (n, 3)),
+        device.empty("v_log_scales", (n, 3)),
+        device.empty("v_quats", (n, 4)),
+        device.empty("v_logit_opacities", n),
+        device.empty("v_sh", g.sh.shape),
+    )
+    arguments = [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree]
+    arguments += [
+        g.means,
+        g.log_scales,
+        g.quats,
+        g.logit_opacities,
+        splats.extents,
+        splats.conics,
+        splats.colors,
+        g.sh,
+    ]
+    arguments += [*v_splats, *v.arrays().values()]
+    defines = {
+        "CHANNELS": splats.colors.shape[1],
+        "ANTIALIASED": int(antialiased),
+        "VIEWMAT_GRAD": int(viewmat_grad),
+    }
+    if not viewmat_grad:
+        device.launch("project", "project_bwd", (n,), arguments, defines=defines)
+        return v, None
+    groups = -(-n // VIEWMAT_GROUP)
+    partial = device.empty("v_viewmat", (groups, 12))
+    device.launch(
+        "project",
+        "project_bwd",
+        (groups * VIEWMAT_GROUP,),
+        [*arguments, partial],
+        defines=defines | {"GROUP": VIEWMAT_GROUP},
+        group=(VIEWMAT_GROUP,),
+    )
+    total = partial.get().astype(np.float64).sum(axis=0)
+    v_viewmat = np.zeros((4, 4))
+    v_viewmat[:3, :3] = total[:9].reshape(3, 3)
+    v_viewmat[:3, 3] = total[9:]
+    return v, v_viewmat

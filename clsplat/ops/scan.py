@@ -1,0 +1,53 @@
+"""Launch of the stage scan (cl/scan.cl)."""
+
+import numpy as np
+from pyopencl.array import Array
+
+from clsplat.device import Device
+from clsplat.errors import DeviceError
+
+
+def exclusive_scan(device: Device, values: Array, what: str = "scan") -> tuple[Array, int]:
+    """Exclusive prefix sum.
+
+    Parameters
+    ----------
+    values : (n,) uint32, n >= 1
+    what : str
+        Names the sum in the error.
+
+    Returns
+    -------
+    sums : (n + 1,) uint32
+        sums[i] is the sum of values[:i].
+    total : int
+        The sum of all values, read back from the device.
+
+    Raises
+    ------
+    DeviceError
+        If the total exceeds 2^32 - 1.
+    """
+    n = values.shape[0]
+    # A few chunks per core on a CPU; enough work-items to fill any GPU otherwise.
+    chunks = 4 * device.cl_device.max_compute_units if device.is_cpu else 8192
+    chunks = min(chunks, n)
+    defines = {"GROUP": 1 if device.is_cpu else 64}
+    partial = device.empty("scan", chunks + 1, np.uint64)
+    sums = device.empty("scan", n + 1, np.uint32)
+    device.launch("scan", "scan_reduce", (chunks,), [n, chunks, values, partial], defines=defines)
+    device.launch(
+        "scan",
+        "scan_spine",
+        (defines["GROUP"],),
+        [chunks, partial],
+        defines=defines,
+        group=(defines["GROUP"],),
+    )
+    device.launch("scan", "scan_down", (chunks,), [n, chunks, values, partial, sums], defines=defines)
+    total = int(partial[chunks].get())
+    if total >= 2**32:
+        raise DeviceError(
+            f"{what}: expected a total below 2^32, found {total}; use fewer Gaussians or a smaller image"
+        )
+    return sums, total

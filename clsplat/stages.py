@@ -1,0 +1,56 @@
+"""What flows between the stages: the same containers for device arrays (`clsplat.ops`) and NumPy (`clsplat.reference`).
+
+N Gaussians, M intersections of a splat with a tile, T tiles, C colour channels, H x W pixels.
+"""
+
+from typing import Any, NamedTuple
+
+
+class Splats(NamedTuple):
+    """Projected Gaussians; an invisible one has extents 0 and its other fields 0.
+
+    means2d (N, 2) px; conics (N, 3) px^-2, the entries xx, xy, yy of the inverse 2D covariance; depths (N,) world
+    units; extents (N, 2) px, half widths of the box outside which alpha < ALPHA_MIN; opacities (N,) in [0, 1],
+    compensation included; colors (N, C), RGB and, for C = 4, the depth.
+    """
+
+    means2d: Any
+    conics: Any
+    depths: Any
+    extents: Any
+    opacities: Any
+    colors: Any
+
+
+class SplatGrads(NamedTuple):
+    """Gradients with respect to the fields of `Splats` that compositing reads, of the same shapes."""
+
+    means2d: Any
+    conics: Any
+    opacities: Any
+    colors: Any
+
+
+class Bins(NamedTuple):
+    """Lists of splats per tile, in depth order.
+
+    gauss_ids (M,) uint32 and tile_ranges (T, 2) uint32: tile t, row-major, holds gauss_ids[begin:end]. order (N,)
+    uint32: the splats by depth, ties by index, invisible ones last; first_slots (N + 1,) uint32: splat order[i] owns
+    the slots first_slots[i] to first_slots[i + 1]; slots (M,) uint32: the slot of each entry of gauss_ids.
+    """
+
+    gauss_ids: Any
+    tile_ranges: Any
+    order: Any
+    first_slots: Any
+    slots: Any
+    tile_size: int
+    width: int
+    height: int
+
+
+class Image(NamedTuple):
+    """What compositing yields: image (H, W, C), background included, and alpha (H, W)."""
+
+    image: Any
+    alpha: Any
