@@ -8,7 +8,10 @@ from clsplat.constants import TILE
 Mode = Literal["classic", "antialiased"]
 Background = Literal["black", "white"]
 
-BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+BACKGROUNDS: dict[Background, tuple[float, float, float]] = {
+    "black": (0.0, 0.0, 0.0),
+    "white": (1.0, 1.0, 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -16,7 +19,7 @@ class RenderConfig:
     """How Gaussians become an image."""
 
     mode: Mode = "classic"
-    """classic: the paper's dilation by 0.3 px². antialiased: opacity compensated for it (Mip-Splatting's 2D filter)."""
+    """classic: the paper's dilation by 0.3 px^2. antialiased: opacity compensated for it (Mip-Splatting)."""
     tile_size: Literal[8, 16] = TILE
     """Edge of a tile in pixels; changes speed, not the image."""
     compositor: Literal["auto", "cpu", "gpu"] = "auto"

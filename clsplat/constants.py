@@ -5,6 +5,8 @@ and the documentation. Sources: "paper" is Kerbl et al. 2023, doi:10.1145/359243
 published with it.
 """
 
+from math import exp
+
 ALPHA_MIN = 1.0 / 255.0
 """Pairs with a smaller alpha are skipped: less than one step of an 8-bit image (original, section 6 of the paper)."""
 
@@ -50,3 +52,7 @@ SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 """Window, its standard deviation in pixels and the stabilisers for images in [0, 1]: Wang et al. 2004,
 doi:10.1109/TIP.2003.819861. Borders are padded with zeros, as in the original's training loss."""
+
+_WINDOW = [exp(-0.5 * (i - SSIM_WINDOW // 2) ** 2 / SSIM_SIGMA**2) for i in range(SSIM_WINDOW)]
+SSIM_TAPS = tuple(w / sum(_WINDOW) for w in _WINDOW)
+"""Weights of the window along one axis, of sum 1."""

@@ -39,9 +39,7 @@ def kernel_folder() -> Path:
     for folder in (here / "cl", here.parent / "cl"):
         if (folder / "common.h").is_file():
             return folder
-    raise DeviceError(
-        f"cl/common.h: expected the kernel sources in {here / 'cl'}, found none; reinstall clsplat"
-    )
+    raise DeviceError(f"cl/common.h: expected the kernel sources in {here / 'cl'}, found none; reinstall clsplat")
 
 
 def inline_includes(name: str, folder: Path) -> str:
@@ -122,9 +120,7 @@ class Device:
         self.cl_device = cl_device if cl_device is not None else select_device()
         self.real = np.dtype(real)
         if self.real == np.float64 and "cl_khr_fp64" not in self.cl_device.extensions:
-            raise DeviceError(
-                f"{self.label}: expected a device with double precision (cl_khr_fp64) for float64"
-            )
+            raise DeviceError(f"{self.label}: expected a device with double precision (cl_khr_fp64) for float64")
         self.context = cl.Context([self.cl_device])
         self.queue = cl.CommandQueue(self.context)
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self.queue))
@@ -149,9 +145,7 @@ class Device:
                 f"{limit / 2**20:.0f} MiB per buffer; use fewer Gaussians or a smaller image (--downscale)"
             )
 
-    def empty(
-        self, what: str, shape: tuple[int, ...] | int, dtype: DTypeLike | None = None
-    ) -> cl.array.Array:
+    def empty(self, what: str, shape: tuple[int, ...] | int, dtype: DTypeLike | None = None) -> cl.array.Array:
         """Uninitialised array of `dtype` (default: real); `what` names it in errors.
 
         Raises

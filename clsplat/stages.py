@@ -1,4 +1,5 @@
-"""What flows between the stages: the same containers for device arrays (`clsplat.ops`) and NumPy (`clsplat.reference`).
+"""What flows between the stages: one set of containers for device arrays (`clsplat.ops`) and NumPy
+(`clsplat.reference`).
 
 N Gaussians, M intersections of a splat with a tile, T tiles, C colour channels, H x W pixels.
 """

@@ -1,0 +1,19 @@
+"""Launches of the stages: `clsplat.reference`'s functions with a `clsplat.device.Device` as first argument."""
+
+from clsplat.ops.bin import bin_splats
+from clsplat.ops.composite import composite_bwd, composite_fwd
+from clsplat.ops.loss import l1_ssim
+from clsplat.ops.project import project_bwd, project_fwd
+from clsplat.ops.scan import exclusive_scan
+from clsplat.ops.sort import argsort
+
+__all__ = [
+    "argsort",
+    "bin_splats",
+    "composite_bwd",
+    "composite_fwd",
+    "exclusive_scan",
+    "l1_ssim",
+    "project_bwd",
+    "project_fwd",
+]

@@ -44,9 +44,7 @@ def bin_splats(device: Device, splats: Splats, width: int, height: int, tile_siz
     gauss_ids = device.empty("intersections", max(m, 1), np.uint32)
     device.launch("bin", "bin_emit", (n,), [*geometry, first_slots, tiles, slot_gauss], defines=defines)
     sorted_tiles, slots = argsort(device, tiles, tile_count.bit_length()) if m else (tiles, slot_gauss)
-    device.launch(
-        "bin", "bin_ranges", (tile_count,), [m, tile_count, sorted_tiles, tile_ranges], defines=defines
-    )
+    device.launch("bin", "bin_ranges", (tile_count,), [m, tile_count, sorted_tiles, tile_ranges], defines=defines)
     if m:
         device.launch("bin", "bin_gather", (m,), [m, slots, slot_gauss, gauss_ids], defines=defines)
     return Bins(gauss_ids[:m], tile_ranges, order, first_slots, slots[:m], tile_size, width, height)

@@ -25,9 +25,7 @@ def _launch(device: Device, stage: str, kernel: str, bins: Bins, channels: int, 
     device.launch(stage, kernel, (tiles * group,), arguments, defines=defines, group=(group,))
 
 
-def composite_fwd(
-    device: Device, splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto"
-) -> Image:
+def composite_fwd(device: Device, splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto") -> Image:
     """Composite splats front to back.
 
     Parameters
@@ -95,7 +93,5 @@ def composite_bwd(
     defines = {"TILE": bins.tile_size, "CHANNELS": channels} | (
         {"BATCH": GPU_BATCH} if stage == "composite_gpu" else {}
     )
-    device.launch(
-        stage, "composite_sum", (n,), [n, bins.order, bins.first_slots, records, *v], defines=defines
-    )
+    device.launch(stage, "composite_sum", (n,), [n, bins.order, bins.first_slots, records, *v], defines=defines)
     return v

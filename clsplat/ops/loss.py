@@ -5,17 +5,11 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from clsplat.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
+from clsplat.constants import SSIM_C1, SSIM_C2, SSIM_TAPS
 from clsplat.device import Device
 
 SEGMENT = 16  # pixels per work-item, as in the kernel
-RADIUS = SSIM_WINDOW // 2
-
-
-def ssim_taps() -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Weights of the window along one axis, (SSIM_WINDOW,), of sum 1."""
-    weights = np.exp(-0.5 * (np.arange(SSIM_WINDOW) - RADIUS) ** 2 / SSIM_SIGMA**2)
-    return weights / weights.sum()
+RADIUS = len(SSIM_TAPS) // 2
 
 
 def l1_ssim(
@@ -42,7 +36,7 @@ def l1_ssim(
     defines = {
         "SSIM_C1": SSIM_C1,
         "SSIM_C2": SSIM_C2,
-        "SSIM_TAPS": ",".join(repr(float(w)) for w in ssim_taps()),
+        "SSIM_TAPS": ",".join(map(repr, SSIM_TAPS)),
         "RADIUS": RADIUS,
     }
     plane = 3 * (height + 2 * RADIUS) * (segments + 2) * SEGMENT

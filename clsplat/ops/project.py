@@ -54,8 +54,7 @@ def project_fwd(
         "project",
         "project_fwd",
         (n,),
-        [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree]
-        + [g.means, g.log_scales, g.quats, g.logit_opacities, g.sh, *splats],
+        [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree, *g.arrays().values(), *splats],
         defines={"CHANNELS": channels, "ANTIALIASED": int(antialiased), "VIEWMAT_GRAD": 0},
     )
     return splats

@@ -32,7 +32,7 @@ def argsort(device: Device, keys: Array, bits: int, method: str = "auto") -> tup
     n = keys.shape[0]
     defines = {
         "KEY_BITS": 8 * keys.dtype.itemsize,
-        # A core counts 2048 digits in its L1 cache; a GPU's work-group keeps 16 counters per work-item in local memory.
+        # A core counts 2048 digits in its L1 cache; a GPU's work-item keeps 16 counters in local memory.
         "DIGIT_BITS": 11 if device.is_cpu else 4,
         "GROUP": 1 if device.is_cpu else 64,
         "BITONIC": BITONIC_MAX,
@@ -41,9 +41,7 @@ def argsort(device: Device, keys: Array, bits: int, method: str = "auto") -> tup
     if method == "bitonic" or (method == "auto" and n <= BITONIC_MAX):
         sorted_keys = device.empty("sort keys", n, keys.dtype)
         order = device.empty("sort order", n, np.uint32)
-        device.launch(
-            "sort", "sort_bitonic", (64,), [n, keys, sorted_keys, order], defines=defines, group=(64,)
-        )
+        device.launch("sort", "sort_bitonic", (64,), [n, keys, sorted_keys, order], defines=defines, group=(64,))
         return sorted_keys, order
 
     group, digit_bits = defines["GROUP"], defines["DIGIT_BITS"]

@@ -1,0 +1,19 @@
+"""The stages in float64 NumPy: readable mathematics, the oracle of the tests, and a renderer without OpenCL."""
+
+from clsplat.reference.bin import bin_splats
+from clsplat.reference.composite import composite_bwd, composite_fwd
+from clsplat.reference.loss import l1_ssim
+from clsplat.reference.project import project_bwd, project_fwd
+from clsplat.reference.scan import exclusive_scan
+from clsplat.reference.sort import argsort
+
+__all__ = [
+    "argsort",
+    "bin_splats",
+    "composite_bwd",
+    "composite_fwd",
+    "exclusive_scan",
+    "l1_ssim",
+    "project_bwd",
+    "project_fwd",
+]

@@ -1,0 +1,236 @@
+"""Rendering and its gradients: the stages in their order, on a device or by the float64 twins."""
+
+from dataclasses import dataclass
+from functools import partial
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat import reference
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.stages import Bins, Image, Splats
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+Array = NDArray[Any]
+
+
+class Gradients(NamedTuple):
+    """Gradients of a scalar with respect to what was rendered.
+
+    gaussians: per field of `Gaussians`, pre-activation; means2d (N, 2): per pixel, the statistic of densification;
+    viewmat (4, 4): each entry as an independent variable, or None if it was not asked for.
+    """
+
+    gaussians: Gaussians
+    means2d: Any
+    viewmat: NDArray[np.float64] | None
+
+
+def stage_functions(device: "Device | None") -> Any:
+    """Namespace of the stage functions: `clsplat.ops` bound to `device`, or `clsplat.reference` for None."""
+    if device is None:
+        return reference
+    from clsplat import ops
+
+    return SimpleNamespace(**{name: partial(getattr(ops, name), device) for name in ops.__all__})
+
+
+@dataclass(frozen=True)
+class Pass:
+    """A forward pass: what `backward` needs of it. Arrays live where the stages ran."""
+
+    gaussians: Gaussians
+    camera: Camera
+    config: RenderConfig
+    sh_degree: int
+    splats: Splats
+    bins: Bins
+    image: Image
+
+
+def forward(
+    device: "Device | None",
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RenderConfig,
+    background: Any,
+    sh_degree: int,
+) -> Pass:
+    """Run the stages from Gaussians to an image.
+
+    Parameters
+    ----------
+    device : Device or None
+        None runs the twins.
+    gaussians : Gaussians of N >= 1 rows, arrays of the device
+    background : (C,) array on the host
+        Its length is the number of channels: 3 for RGB, 4 to composite the depth too.
+    """
+    stage = stage_functions(device)
+    antialiased = config.mode == "antialiased"
+    splats = stage.project_fwd(gaussians, camera, sh_degree, antialiased=antialiased, channels=len(background))
+    # The twins work splat by splat and gain nothing from tiles.
+    tile_size = max(camera.width, camera.height) if device is None else config.tile_size
+    bins = stage.bin_splats(splats, camera.width, camera.height, tile_size)
+    image = stage.composite_fwd(splats, bins, background, compositor=config.compositor)
+    return Pass(gaussians, camera, config, sh_degree, splats, bins, image)
+
+
+def backward(device: "Device | None", run: Pass, v_image: Image, *, viewmat_grad: bool = False) -> Gradients:
+    """Gradients of a forward pass, from the gradients with respect to its image and alpha."""
+    stage = stage_functions(device)
+    v_splats = stage.composite_bwd(run.splats, run.bins, run.image, v_image, compositor=run.config.compositor)
+    v_gaussians, v_viewmat = stage.project_bwd(
+        run.gaussians,
+        run.camera,
+        run.sh_degree,
+        run.splats,
+        v_splats,
+        antialiased=run.config.mode == "antialiased",
+        viewmat_grad=viewmat_grad,
+    )
+    return Gradients(v_gaussians, v_splats.means2d, v_viewmat)
+
+
+def upload(device: "Device | None", gaussians: Gaussians) -> Gaussians:
+    """The Gaussians on the device; as float64 for None."""
+    if device is None:
+        return gaussians.astype(np.float64)
+    return Gaussians(**{name: device.upload(name, array) for name, array in gaussians.arrays().items()})
+
+
+def download(array: Any) -> Array:
+    """A device array on the host; a NumPy array as it is."""
+    return array if isinstance(array, np.ndarray) else array.get()
+
+
+class Rendering:
+    """A rendered image that knows how to differentiate itself; made by `render`.
+
+    Attributes
+    ----------
+    rgb : (H, W, 3)
+        Colours, background included; not clamped above.
+    alpha : (H, W)
+        1 - transmittance.
+    depth : (H, W) or None
+        Expected depth: the mean of the splats' depths in world units, weighted as the colours are; 0 where alpha is
+        0. None unless asked for.
+    """
+
+    def __init__(self, device: "Device | None", run: Pass | None, gaussians: Gaussians, image: Array, alpha: Array):
+        self._device, self._run, self._gaussians = device, run, gaussians
+        self.rgb, self.alpha = image[:, :, :3], alpha
+        self.depth: Array | None = None
+        if image.shape[2] == 4:
+            self.depth = np.divide(image[:, :, 3], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+
+    def backward(
+        self,
+        v_rgb: Array | None = None,
+        v_alpha: Array | None = None,
+        v_depth: Array | None = None,
+        *,
+        viewmat_grad: bool = False,
+    ) -> Gradients:
+        """Gradients of a scalar with respect to the Gaussians and the camera.
+
+        Parameters
+        ----------
+        v_rgb, v_alpha, v_depth : arrays of the shapes of rgb, alpha and depth, optional
+            The scalar's gradients with respect to them; left out: 0.
+        viewmat_grad : bool
+            Also return the gradient with respect to the viewmat.
+
+        Returns
+        -------
+        Gradients
+            NumPy arrays.
+
+        Raises
+        ------
+        InputError
+            If a shape does not fit, or v_depth is given though no depth was rendered.
+        """
+        for name, v, shape in (
+            ("v_rgb", v_rgb, self.rgb.shape),
+            ("v_alpha", v_alpha, self.alpha.shape),
+            ("v_depth", v_depth, None if self.depth is None else self.depth.shape),
+        ):
+            if v is not None and np.shape(v) != shape:
+                raise InputError(f"{name}: expected shape {shape}, found {np.shape(v)}")
+        if self._run is None:
+            zeros = Gaussians(**{k: np.zeros_like(a) for k, a in self._gaussians.arrays().items()})
+            return Gradients(zeros, np.zeros((0, 2)), np.zeros((4, 4)) if viewmat_grad else None)
+        # Filled on the host: its dtype is that of the image.
+        v_image = np.zeros((*self.alpha.shape, 3 if self.depth is None else 4), dtype=self.alpha.dtype)
+        v_total_alpha = np.zeros_like(self.alpha) if v_alpha is None else np.array(v_alpha, dtype=self.alpha.dtype)
+        if v_rgb is not None:
+            v_image[:, :, :3] = v_rgb
+        if v_depth is not None and self.depth is not None:
+            v_image[:, :, 3] = np.divide(v_depth, self.alpha, out=np.zeros_like(self.alpha), where=self.alpha > 0)
+            v_total_alpha -= v_image[:, :, 3] * self.depth
+        v_run = Image(v_image, v_total_alpha)
+        if self._device is not None:
+            v_run = Image(*(self._device.upload("v_image", a) for a in v_run))
+        result = backward(self._device, self._run, v_run, viewmat_grad=viewmat_grad)
+        v_gaussians = Gaussians(**{k: download(a) for k, a in result.gaussians.arrays().items()})
+        return Gradients(v_gaussians, download(result.means2d), result.viewmat)
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RenderConfig = RenderConfig(),
+    device: "Device | None" = None,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    sh_degree: int | None = None,
+    depth: bool = False,
+) -> Rendering:
+    """Render Gaussians (Kerbl et al. 2023).
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Pre-activation, on the host.
+    camera : Camera
+    config : RenderConfig
+    device : Device, optional
+        None renders with the float64 twins: exact and slow.
+    background : (3,) floats
+        RGB behind the Gaussians.
+    sh_degree : int, optional
+        Highest degree of the spherical harmonics evaluated; default: all that are stored.
+    depth : bool
+        Composite the expected depth too.
+
+    Returns
+    -------
+    Rendering
+
+    Raises
+    ------
+    InputError
+        If the Gaussians' shapes do not fit each other or sh_degree exceeds what is stored.
+    DeviceError
+        If a buffer exceeds the device's limits.
+    """
+    gaussians.validate()
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    if not 0 <= degree <= gaussians.sh_degree:
+        raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree} (what is stored), found {degree}")
+    behind = np.array([*background, 0.0] if depth else background)
+    if len(gaussians) == 0:
+        dtype = np.float64 if device is None else device.real
+        image = np.broadcast_to(behind.astype(dtype), (camera.height, camera.width, len(behind)))
+        return Rendering(device, None, gaussians, image, np.zeros(image.shape[:2], dtype))
+    run = forward(device, upload(device, gaussians), camera, config, behind, degree)
+    return Rendering(device, run, gaussians, download(run.image.image), download(run.image.alpha))
