@@ -1,0 +1,73 @@
+"""Readers and writers: one file each, enrolled by one line in `FORMATS`."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.config import Mode
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.io.ply import load_ply, save_ply
+
+Loader = Callable[[str | Path], tuple[Gaussians, Mode, NDArray[np.float64]]]
+Saver = Callable[[str | Path, Gaussians, Mode, ArrayLike | None], None]
+
+# Suffix of the file name -> (load, save).
+FORMATS: dict[str, tuple[Loader, Saver]] = {
+    ".ply": (load_ply, save_ply),
+}
+
+
+def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
+    """Read Gaussians from a file in a format of `FORMATS`, told by its suffix.
+
+    Returns
+    -------
+    gaussians : Gaussians
+        float32, at least one.
+    mode : {"classic", "antialiased"}
+        The rendering mode the file says it was trained for; classic where the format does not say.
+    offset : (3,) float64
+        What was subtracted from the world's coordinates, in world units; zeros where the format does not say.
+
+    Raises
+    ------
+    InputError
+        If no format has this suffix, or the file is not of its format.
+    """
+    return _format(path)[0](path)
+
+
+def save_gaussians(
+    path: str | Path, gaussians: Gaussians, mode: Mode = "classic", offset: ArrayLike | None = None
+) -> None:
+    """Write Gaussians to a file in the format of `FORMATS` that its suffix names.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; its folder must exist. It is replaced only once all is written.
+    gaussians : Gaussians
+        At least one, finite.
+    mode : {"classic", "antialiased"}
+        The rendering mode they were trained for.
+    offset : (3,) array_like, optional
+        What was subtracted from the world's coordinates, in world units.
+
+    Raises
+    ------
+    InputError
+        If no format has this suffix, the Gaussians cannot be stored, or the file cannot be written.
+    """
+    _format(path)[1](path, gaussians, mode, offset)
+
+
+def _format(path: str | Path) -> tuple[Loader, Saver]:
+    suffix = Path(path).suffix.lower()
+    if suffix not in FORMATS:
+        raise InputError(
+            f"{path}: expected a file of Gaussians named *{', *'.join(FORMATS)}, found suffix {suffix!r}"
+        )
+    return FORMATS[suffix]
