@@ -285,12 +285,12 @@ def _to_gaussians(path: str | Path, data: Array, names: list[str]) -> Gaussians:
 
 
 def _normalised(quats: Array) -> Array:
-    """Unit quaternions, (N, 4); zero where the renderer finds no direction and culls."""
+    """Unit quaternions, (N, 4): zeros where the renderer finds no direction and culls, NaN where one is not finite."""
     wide = quats.astype(np.float64)
     norm2 = np.einsum("ni,ni->n", wide, wide)[:, None]
-    norm = np.sqrt(norm2)
-    scale = np.where(np.abs(norm - 1) <= UNIT_SLACK, 1.0, np.maximum(norm, QUAT_NORM2_MIN))
-    return np.where(norm2 >= QUAT_NORM2_MIN, wide / scale, 0.0)
+    norm = np.where(norm2 < QUAT_NORM2_MIN, np.inf, np.sqrt(norm2))
+    with np.errstate(invalid="ignore"):
+        return wide / np.where(np.abs(norm - 1) <= UNIT_SLACK, 1.0, norm)
 
 
 def _check_finite(path: str | Path, table: Array, names: tuple[str, ...]) -> None:
