@@ -1,0 +1,14 @@
+"""Densification strategies: one file and one line each.
+
+A strategy is a class with the interface of `clsplat.densify.strategy.Strategy`; `clsplat.train` and the tests know
+strategies only through this table.
+"""
+
+from clsplat.densify.adc import Adc
+from clsplat.densify.strategy import Edit, Strategy
+
+STRATEGIES: dict[str, type[Strategy]] = {
+    "adc": Adc,
+}
+
+__all__ = ["STRATEGIES", "Edit", "Strategy"]

@@ -1,0 +1,92 @@
+"""Adaptive density control: clone, split, prune, reset (Kerbl et al. 2023, section 5.2)."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config import TrainConfig
+from clsplat.densify.strategy import Edit
+from clsplat.gaussians import Gaussians, logit
+from clsplat.randomness import stream
+from clsplat.reference.project import rotations
+
+Array = NDArray[Any]
+
+# Children of a split: their number, and the divisor of their scales (original: 0.8 * 2).
+CHILDREN = 2
+CHILD_SHRINK = 1.6
+
+
+class Adc:
+    """The paper's strategy, with a hard cap on the number of Gaussians and a floor under pruning.
+
+    Statistics: `grad_sum`, the sum over iterations of the norm of the positional gradient in normalised device
+    coordinates, and `seen`, the number of iterations in which the Gaussian was on screen.
+    """
+
+    def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
+        self.config, self.seed, self.extent = config.adc, config.seed, extent
+        self.stop = round(config.adc.stop_fraction * config.iterations)
+        self.statistics: dict[str, Array] = {}
+        self._clear(n)
+
+    def _clear(self, n: int) -> None:
+        self.statistics = {"grad_sum": np.zeros(n, np.float32), "seen": np.zeros(n, np.int32)}
+
+    def observe(self, v_means2d: Array, visible: Array, width: int, height: int) -> None:
+        """See `clsplat.densify.Strategy`."""
+        # One unit of normalised device coordinates is half the image.
+        self.statistics["grad_sum"] += np.hypot(v_means2d[:, 0] * (width / 2), v_means2d[:, 1] * (height / 2))
+        self.statistics["seen"] += visible
+
+    def edit(self, iteration: int, gaussians: Gaussians) -> Edit | None:
+        """See `clsplat.densify.Strategy`."""
+        c = self.config
+        if iteration >= self.stop:
+            return None
+        edit = None
+        if iteration >= c.start and iteration % c.every == 0:
+            edit = self._densify(iteration, gaussians)
+            edit = self._prune(iteration, edit)
+            self._clear(len(edit.rows))
+        if iteration % c.reset_every == 0:
+            edit = edit or Edit(gaussians, np.arange(len(gaussians)), np.zeros(len(gaussians), bool))
+            lowered = Gaussians(**edit.gaussians.arrays())
+            lowered.logit_opacities = np.minimum(lowered.logit_opacities, np.float32(logit(c.reset_opacity)))
+            edit = edit._replace(gaussians=lowered, reset_opacities=True)
+        return edit
+
+    def _densify(self, iteration: int, gaussians: Gaussians) -> Edit:
+        c, n = self.config, len(gaussians)
+        grads = self.statistics["grad_sum"] / np.maximum(self.statistics["seen"], 1)
+        chosen = np.flatnonzero(grads >= c.grad_threshold)
+        # Each adds one Gaussian; where the cap leaves no room for all, the largest gradients come first.
+        room = max(0, c.max_gaussians - n)
+        if len(chosen) > room:
+            chosen = np.sort(chosen[np.argsort(-grads[chosen], kind="stable")[:room]])
+        large = gaussians.scales[chosen].max(axis=1) > c.scale_threshold * self.extent
+        cloned, split = chosen[~large], chosen[large]
+        kept = np.setdiff1d(np.arange(n), split)
+
+        parents = np.repeat(split, CHILDREN)
+        children = gaussians.take(parents)
+        noise = stream(self.seed, "positions of split Gaussians", iteration).standard_normal((len(parents), 3))
+        quats = children.quats / np.linalg.norm(children.quats, axis=1, keepdims=True)
+        children.means = children.means + np.einsum(
+            "nij,nj->ni", rotations(quats), noise.astype(np.float32) * children.scales
+        )
+        children.log_scales = children.log_scales - np.float32(np.log(CHILD_SHRINK))
+        rows = np.concatenate([kept, cloned, parents])
+        result = Gaussians.concatenate([gaussians.take(kept), gaussians.take(cloned), children])
+        return Edit(result, rows, np.arange(len(rows)) >= len(kept))
+
+    def _prune(self, iteration: int, edit: Edit) -> Edit:
+        c, gaussians = self.config, edit.gaussians
+        doomed = gaussians.opacities < c.opacity_min
+        if iteration > c.reset_every:
+            doomed |= gaussians.scales.max(axis=1) > c.scale_max * self.extent
+        if len(gaussians) - doomed.sum() < c.min_gaussians:
+            doomed[np.argsort(-gaussians.logit_opacities, kind="stable")[: c.min_gaussians]] = False
+        keep = np.flatnonzero(~doomed)
+        return Edit(gaussians.take(keep), edit.rows[keep], edit.fresh[keep])

@@ -1,0 +1,45 @@
+"""What a densification strategy is."""
+
+from typing import Any, NamedTuple, Protocol
+
+from numpy.typing import NDArray
+
+from clsplat.config import TrainConfig
+from clsplat.gaussians import Gaussians
+
+Array = NDArray[Any]
+
+
+class Edit(NamedTuple):
+    """New rows for old ones.
+
+    gaussians: after the edit; rows (M,): the old row that each new one continues; fresh (M,) bool: whether the
+    optimiser's moments of a new row start at 0; reset_opacities: whether those of all logits of opacities do.
+    """
+
+    gaussians: Gaussians
+    rows: Array
+    fresh: Array
+    reset_opacities: bool = False
+
+
+class Strategy(Protocol):
+    """Decides when Gaussians are added and removed, from statistics of the gradients.
+
+    A strategy keeps all it remembers between iterations in `statistics`, arrays of one row per Gaussian: checkpoints
+    save and restore them, so that a resumed run continues to the same bits.
+    """
+
+    statistics: dict[str, Array]
+
+    def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
+        """Statistics of `n` Gaussians in a scene of the given extent, in world units."""
+
+    def observe(self, v_means2d: Array, visible: Array, width: int, height: int) -> None:
+        """Take in one iteration: gradients (N, 2) with respect to the splats' centres in pixels, whether each splat
+        is on screen (N,), and the image's size in pixels."""
+
+    def edit(self, iteration: int, gaussians: Gaussians) -> Edit | None:
+        """The edit due after an iteration, counted from 1, or None.
+
+        Leaves `gaussians` as they are, and the statistics in step with the result."""

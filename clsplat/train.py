@@ -1,0 +1,211 @@
+"""Training: algorithm 1 of Kerbl et al. 2023."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from clsplat.checkpoint import load_arrays, log_file, save_arrays
+from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.densify import STRATEGIES, Strategy
+from clsplat.errors import ClsplatError, InputError
+from clsplat.gaussians import Gaussians
+from clsplat.initialize import initialize
+from clsplat.optim import Moments, adam_step, learning_rates, sh_degree_at
+from clsplat.randomness import stream
+from clsplat.render import backward, download, forward, stage_functions, upload
+from clsplat.scene import Scene, View
+from clsplat.stages import Image
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+# Iterations per line of the log: its loss is their mean, since the loss of single photos says little.
+LOG_EVERY = 10
+# Photos stay on the device up to this share of its memory.
+PHOTO_SHARE = 0.25
+
+
+@dataclass
+class State:
+    """All that training changes: what a checkpoint holds."""
+
+    iteration: int
+    seconds: float
+    gaussians: Gaussians
+    moments: Moments
+    strategy: Strategy
+
+
+class _Photos:
+    """Photos and masks on the device, uploaded when first asked for."""
+
+    def __init__(self, device: "Device", views: list[View]):
+        self._device = device
+        self._kept: dict[str, tuple[Any, Any]] = {}
+        self._budget = PHOTO_SHARE * device.cl_device.global_mem_size
+
+    def __call__(self, view: View) -> tuple[Any, Any]:
+        if view.name in self._kept:
+            return self._kept[view.name]
+        photo = self._device.upload("photo", view.image, np.uint8)
+        mask = None if view.mask is None else self._device.upload("mask", view.mask, np.uint8)
+        self._budget -= photo.nbytes + (0 if mask is None else mask.nbytes)
+        if self._budget >= 0:
+            self._kept[view.name] = photo, mask
+        return photo, mask
+
+
+def view_at(iteration: int, views: list[View], seed: int) -> View:
+    """The view trained on in an iteration, counted from 1: every epoch takes all views in an order of its own."""
+    epoch, position = divmod(iteration - 1, len(views))
+    return views[stream(seed, "order of the views", epoch).permutation(len(views))[position]]
+
+
+def train(
+    scene: Scene,
+    config: TrainConfig,
+    device: "Device",
+    out: Path,
+    *,
+    resume: bool = False,
+    evaluate: Callable[[Gaussians], dict[str, float]] | None = None,
+    progress: Callable[[dict[str, Any]], None] = lambda record: None,
+) -> Gaussians:
+    """Train Gaussians on a scene's photos.
+
+    Parameters
+    ----------
+    scene : Scene
+    config : TrainConfig
+    device : Device
+    out : Path
+        Folder for checkpoint.npz, from which an interrupted run resumes, and log.jsonl, one JSON object per line.
+    resume : bool
+        Continue from the checkpoint in `out`, to the same bits as a run that was never interrupted.
+    evaluate : callable, optional
+        Called every `config.eval_every` iterations; what it returns is logged. Its time does not count.
+    progress : callable
+        Called after every iteration with iteration, loss and num_gaussians.
+
+    Returns
+    -------
+    Gaussians
+        In the scene's coordinates.
+
+    Raises
+    ------
+    InputError
+        If the scene has no photos to train on, or the checkpoint is of another configuration.
+    ClsplatError
+        If the loss stops being finite.
+    """
+    if not scene.train:
+        raise InputError("scene: expected at least one photo to train on, found none; lower --data.test-every")
+    state = load_state(out, scene, config) if resume else initial_state(scene, config)
+    photos = _Photos(device, scene.train)
+    losses: list[float] = []
+    with log_file(out / "log.jsonl", state.iteration) as log:
+        started = time.perf_counter() - state.seconds
+        for iteration in range(state.iteration + 1, config.iterations + 1):
+            loss = step(state, iteration, view_at(iteration, scene.train, config.seed), photos, config, device)
+            if not np.isfinite(loss):
+                raise ClsplatError(
+                    f"training diverged: the loss of iteration {iteration} is {loss}; lower the learning rates "
+                    f"(--optim.*); the last checkpoint in {out} is intact"
+                )
+            losses.append(loss)
+            progress({"iteration": iteration, "loss": loss, "num_gaussians": len(state.gaussians)})
+            state.seconds = time.perf_counter() - started
+            record: dict[str, Any] = {}
+            if iteration % LOG_EVERY == 0 or iteration == config.iterations:
+                record = {"loss": float(np.mean(losses))}
+                losses.clear()
+            if evaluate and config.eval_every and iteration % config.eval_every == 0:
+                record |= evaluate(state.gaussians)
+                started = time.perf_counter() - state.seconds
+            if record:
+                about = {"iteration": iteration, "num_gaussians": len(state.gaussians), "seconds": state.seconds}
+                log(about | record)
+            if iteration % config.checkpoint_every == 0 or iteration == config.iterations:
+                save_state(out, state, config)
+    return state.gaussians
+
+
+def step(state: State, iteration: int, view: View, photos: _Photos, config: TrainConfig, device: "Device") -> float:
+    """One iteration: render, compare, differentiate, update, densify. Changes `state`, returns the loss."""
+    gaussians, camera = state.gaussians, view.camera
+    sh_degree = sh_degree_at(iteration, config.optim, gaussians.sh_degree)
+    photo, mask = photos(view)
+
+    run = forward(
+        device, upload(device, gaussians), camera, config.render, BACKGROUNDS[config.data.background], sh_degree
+    )
+    loss, v_image = stage_functions(device).l1_ssim(run.image.image, photo, config.optim.ssim_weight, mask)
+    # No kernel writes this buffer: the loss does not depend on alpha.
+    v_alpha = device.scratch("v_alpha", camera.height * camera.width)
+    gradients = backward(device, run, Image(v_image, v_alpha))
+
+    visible = download(run.splats.extents)[:, 0] > 0
+    state.strategy.observe(download(gradients.means2d), visible, camera.width, camera.height)
+    rates = learning_rates(iteration, config.iterations, state.strategy.extent, config.optim)
+    v_gaussians = Gaussians(**{name: download(array) for name, array in gradients.gaussians.arrays().items()})
+    adam_step(gaussians, v_gaussians, state.moments, rates, iteration, sh_degree, config.optim)
+
+    edit = state.strategy.edit(iteration, gaussians)
+    if edit is not None:
+        state.gaussians, state.moments = edit.gaussians, state.moments.take(edit.rows, edit.fresh)
+        if edit.reset_opacities:
+            state.moments.first.logit_opacities[:] = 0
+            state.moments.second.logit_opacities[:] = 0
+    state.iteration = iteration
+    return loss
+
+
+def initial_state(scene: Scene, config: TrainConfig) -> State:
+    """The state before the first iteration."""
+    gaussians = initialize(scene, config.init, config.seed)
+    strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
+    return State(0, 0.0, gaussians, Moments.zeros(gaussians), strategy)
+
+
+def save_state(out: Path, state: State, config: TrainConfig) -> None:
+    """Write the state to checkpoint.npz in `out`, whole or not at all."""
+    arrays: dict[str, Any] = {"iteration": state.iteration, "seconds": state.seconds}
+    arrays["config"] = json.dumps(asdict(config), sort_keys=True)
+    parts = {"gaussians": state.gaussians, "first": state.moments.first, "second": state.moments.second}
+    for part, gaussians in parts.items():
+        arrays |= {f"{part}.{name}": array for name, array in gaussians.arrays().items()}
+    arrays |= {f"statistics.{name}": array for name, array in state.strategy.statistics.items()}
+    save_arrays(out / "checkpoint.npz", arrays)
+
+
+def load_state(out: Path, scene: Scene, config: TrainConfig) -> State:
+    """The state saved in `out`.
+
+    Raises
+    ------
+    InputError
+        If there is no readable checkpoint, or it was made with another configuration.
+    """
+    path = out / "checkpoint.npz"
+    arrays = load_arrays(path)
+    saved, asked = json.loads(str(arrays["config"])), json.loads(json.dumps(asdict(config)))
+    for free in ("device", "checkpoint_every", "eval_every"):  # they do not change the result
+        saved.pop(free, None), asked.pop(free, None)
+    if saved != asked:
+        changed = sorted(k for k in asked if asked[k] != saved.get(k))
+        raise InputError(f"{path}: expected the configuration it was made with, found other {', '.join(changed)}")
+
+    def part(name: str) -> Gaussians:
+        return Gaussians(**{k: arrays[f"{name}.{k}"] for k in Gaussians.__dataclass_fields__})
+
+    gaussians = part("gaussians")
+    strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
+    strategy.statistics = {k: arrays[f"statistics.{k}"] for k in strategy.statistics}
+    moments = Moments(part("first"), part("second"))
+    return State(int(arrays["iteration"]), float(arrays["seconds"]), gaussians, moments, strategy)
