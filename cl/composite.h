@@ -1,10 +1,9 @@
-// Alpha of one splat at one pixel and its vector-Jacobian product: the mathematics that both variants of the
-// compositing stage share. REALV is real or a vector of reals (a row of pixels); MASKV what comparing two
-// gives.
+// One splat over a group of pixels and the gradients of that: the mathematics that both variants of the
+// compositing stage share. REALV is real (one pixel) or a vector of reals (a row of pixels); MASKV what
+// comparing two gives.
 //
-//   sigma = (a dx^2 + c dy^2)/2 + b dx dy,   alpha = min(ALPHA_MAX, opacity exp(-sigma))    (paper, equation
-//   4) C = sum_i c_i alpha_i T_i,   T_i = prod_{j<i} (1 - alpha_j)                              (paper,
-//   equation 3)
+//   sigma = (a dx^2 + c dy^2)/2 + b dx dy,   alpha = min(ALPHA_MAX, opacity exp(-sigma))    (paper, equation 4)
+//   C = sum_i c_i alpha_i T_i,   T_i = prod_{j<i} (1 - alpha_j)                             (paper, equation 3)
 #ifndef CLSPLAT_COMPOSITE_H
 #define CLSPLAT_COMPOSITE_H
 
@@ -12,7 +11,7 @@
 #error "define REALV and MASKV, the types of a group of pixels, before including composite.h"
 #endif
 
-#ifndef CHANNELS
+#if !defined(CHANNELS) || CHANNELS < 1
 #error "-DCHANNELS must give the number of colour channels, 1 or more"
 #endif
 
@@ -47,6 +46,32 @@ inline REALV splat_alpha(const Splat *s, REALV dx, real dy) {
 // Gradient of sigma from that of the clamped alpha; alpha is splat_alpha's value. The clamp passes nothing.
 inline REALV splat_alpha_vjp(REALV alpha, REALV v_alpha) {
     return alpha < (REALV)ALPHA_MAX ? -alpha * v_alpha : (REALV)0;
+}
+
+// Composites one splat over a group of pixels. Pixels of *live where T would fall too low leave it; *alpha is 0
+// where the splat is not drawn and not clamped elsewhere; returns the weight alpha T. *transmittance goes from
+// before to behind the splat. True is -1 in a vector's mask and 1 in a scalar's: only what is right for both
+// stands here, and *live must be such a mask.
+inline REALV splat_over(const Splat *s, REALV dx, real dy, REALV *transmittance, MASKV *live, REALV *alpha) {
+    const REALV raw = splat_alpha(s, dx, dy);
+    const REALV clamped = raw < (REALV)ALPHA_MAX ? raw : (REALV)ALPHA_MAX;
+    const REALV before = *transmittance, behind = before * (1 - clamped);
+    const MASKV reached = *live & (raw >= (REALV)ALPHA_MIN);
+    const MASKV drawn = reached & (behind > (REALV)TRANSMITTANCE_MIN);
+    *live &= ~reached | drawn;
+    *transmittance = drawn ? behind : before;
+    *alpha = drawn ? raw : (REALV)0;
+    return drawn ? clamped * before : (REALV)0;
+}
+
+// Gradient of sigma; alpha and weight as splat_over gave them, T as it was before the splat, u = colour . v_image.
+// *behind goes from the sum of u alpha T over this splat and all behind it, the background included, to that
+// without it.
+inline REALV splat_over_vjp(REALV alpha, REALV weight, REALV before, REALV u, REALV *behind) {
+    *behind -= weight * u;
+    // ALPHA_MAX < 1 bounds the quotient; where alpha is clamped its gradient is dropped anyway.
+    const REALV clamped = alpha < (REALV)ALPHA_MAX ? alpha : (REALV)ALPHA_MAX;
+    return splat_alpha_vjp(alpha, before * u - *behind / (1 - clamped));
 }
 
 // Sums over pixels of v_sigma, v_sigma dx, ... from which every gradient of a splat follows.

@@ -63,21 +63,6 @@ inline int2 visible_rows(const Splat *s, real2 extent, int x0, int y0, int rows)
     return range.x > range.y ? (int2)(1, 0) : pixels_between(s->y - y0 + range.x, s->y - y0 + range.y, rows);
 }
 
-// One splat against one row of pixels. Pixels of *live where T would fall too low leave it; *alpha is 0 where
-// the splat is not drawn and not clamped elsewhere; returns the weight alpha T. *transmittance goes from
-// before to behind the splat.
-inline REALV splat_row(const Splat *s, REALV dx, real dy, REALV *transmittance, MASKV *live, REALV *alpha) {
-    const REALV raw = splat_alpha(s, dx, dy);
-    const REALV clamped = raw < (REALV)ALPHA_MAX ? raw : (REALV)ALPHA_MAX;
-    const REALV before = *transmittance, behind = before * (1 - clamped);
-    const MASKV reached = *live & (raw >= (REALV)ALPHA_MIN);
-    const MASKV drawn = reached & (behind > (REALV)TRANSMITTANCE_MIN);
-    *live &= ~reached | drawn;
-    *transmittance = drawn ? behind : before;
-    *alpha = drawn ? raw : (REALV)0;
-    return drawn ? clamped * before : (REALV)0;
-}
-
 // Bit r is set while row r has a live pixel.
 inline uint live_rows(const MASKV *live) {
     uint rows = 0;
@@ -119,7 +104,7 @@ __kernel void composite_fwd(const int width, const int height, const __global re
             if (!(unfinished >> r & 1))
                 continue;
             REALV alpha;
-            const REALV weight = splat_row(&s, dx, y0 + r + (real)0.5 - s.y, &transmittance[r], &live[r], &alpha);
+            const REALV weight = splat_over(&s, dx, y0 + r + (real)0.5 - s.y, &transmittance[r], &live[r], &alpha);
             for (int k = 0; k < CHANNELS; ++k)
                 sums[r][k] += weight * s.color[k];
         }
@@ -188,16 +173,13 @@ __kernel void composite_bwd(const int width, const int height, const __global re
             const real dy = y0 + r + (real)0.5 - s.y;
             const REALV before = transmittance[r];
             REALV alpha;
-            const REALV weight = splat_row(&s, dx, dy, &transmittance[r], &live[r], &alpha);
+            const REALV weight = splat_over(&s, dx, dy, &transmittance[r], &live[r], &alpha);
             REALV u = 0;
             for (int k = 0; k < CHANNELS; ++k) {
                 u += s.color[k] * v_pixels[r][k];
                 v_colors[k] += weight * v_pixels[r][k];
             }
-            behind[r] -= weight * u;
-            // ALPHA_MAX < 1 bounds the quotient; where alpha is clamped its gradient is dropped anyway.
-            const REALV clamped = alpha < (REALV)ALPHA_MAX ? alpha : (REALV)ALPHA_MAX;
-            const REALV v_sigma = splat_alpha_vjp(alpha, before * u - behind[r] / (1 - clamped));
+            const REALV v_sigma = splat_over_vjp(alpha, weight, before, u, &behind[r]);
             sum += v_sigma;
             sum_dy += dy * v_sigma;
             sum_dy2 += dy * dy * v_sigma;

@@ -1,0 +1,189 @@
+// Stage composite, variant for GPUs: splats to pixels, front to back, and gradients back.
+//
+// The equations, the recurrence of the backward pass and the results are those of composite_cpu.cl, and
+// composite.h holds the mathematics of both; only the mapping differs.
+//
+// Forward mapping: one work-group per tile, one work-item per pixel. The group stages BATCH splats at a time in
+// local memory, and each work-item composites them onto its pixel. A work-item whose pixel is finished, or lies
+// outside the image, goes on staging; the group stops together once live_pixels, counted down once per pixel, is 0.
+//
+// Backward mapping: one work-group of BATCH work-items per tile, one work-item per splat of a batch; the pixels
+// of the tile stream past them.
+//
+// How does the diagonal scheme of the backward pass work? A pixel's state (transmittance, the part behind, the
+// gradient of its colour) waits in local memory. At step s of a batch, work-item t takes its splat over pixel s - t,
+//
+//          step  0  1  2  3 ...          so a pixel meets the splats front to back, one step apart, as in the
+//   work-item 0  p0 p1 p2 p3 ...         forward pass, and no two work-items ever hold the same pixel. One barrier
+//   work-item 1     p0 p1 p2 ...         per step hands the pixels on. All sums of a splat over the tile's pixels
+//   work-item 2        p0 p1 ...         stay in its work-item's registers: no reduction, no atomics, no subgroups,
+//                                        and the same bits in each run.
+// A batch takes TILE*TILE + BATCH - 1 steps. The work-item of its last splat sees each pixel as the batch leaves it:
+// its vote stops the group where no pixel is left, and the records behind are zeros.
+//
+// Buffers: as in composite_cpu.cl; extents[N,2] is not read, since no pixel can be skipped at less than the cost
+// of its test.
+// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (6 + CHANNELS), backward TILE^2
+// (2 + CHANNELS). At TILE 16, BATCH 64 and CHANNELS 4 that is 2.5 KiB and 6 KiB (double: 5 KiB and 12 KiB) of the
+// 32 KiB which OpenCL 1.2 guarantees.
+// -DTILE=8|16   edge of a tile, px; the forward work-group has TILE*TILE work-items
+// -DCHANNELS    colour channels, 1 or more
+// -DBATCH       splats per batch, 1 or more; the backward work-group has BATCH work-items
+#include "common.h"
+
+#if TILE != 8 && TILE != 16
+#error "-DTILE must be 8 or 16: TILE*TILE work-items must fit the work-groups of every GPU"
+#endif
+#if !defined(BATCH) || BATCH < 1
+#error "-DBATCH must give the number of splats per batch, 1 or more"
+#endif
+#define REALV real
+#define MASKV int
+#include "composite.h"
+
+#define PIXELS (TILE * TILE)
+
+// Where pixel p of the tile with origin (x0, y0) lies.
+inline int2 pixel_of(int x0, int y0, uint p) {
+    return (int2)(x0 + p % TILE, y0 + p / TILE);
+}
+
+__kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1))) void
+composite_fwd(const int width, const int height, const __global real *means2d, const __global real *conics,
+              const __global real *extents, const __global real *opacities, const __global real *colors,
+              const __global uint *gauss_ids, const __global uint *tile_ranges, const __global real *background,
+              __global real *image, __global real *alpha_image) {
+    __local Splat staged[BATCH];
+    __local int live_pixels;
+    const uint t = get_group_id(0), lane = get_local_id(0);
+    const int tiles_x = (width + TILE - 1) / TILE;
+    const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
+    const int2 pixel = pixel_of(x0, y0, lane);
+    const int inside = pixel.x < width && pixel.y < height;
+
+    if (lane == 0)
+        live_pixels = min(TILE, width - x0) * min(TILE, height - y0);
+    real transmittance = 1, sums[CHANNELS];
+    int live = inside;
+    for (int k = 0; k < CHANNELS; ++k)
+        sums[k] = 0;
+
+    const uint begin = tile_ranges[2 * t], length = tile_ranges[2 * t + 1] - begin;
+    for (uint first = 0; first < length; first += BATCH) {
+        barrier(CLK_LOCAL_MEM_FENCE); // live_pixels is written, and nobody reads the last batch any more
+        if (live_pixels == 0)
+            break;
+        const uint count = min((uint)BATCH, length - first);
+        for (uint j = lane; j < count; j += PIXELS)
+            staged[j] = splat_load(gauss_ids[begin + first + j], means2d, conics, opacities, colors);
+        barrier(CLK_LOCAL_MEM_FENCE);
+        const int was_live = live;
+        for (uint j = 0; j < count && live; ++j) {
+            const Splat s = staged[j];
+            const real dx = pixel.x + (real)0.5 - s.x, dy = pixel.y + (real)0.5 - s.y;
+            real alpha;
+            const real weight = splat_over(&s, dx, dy, &transmittance, &live, &alpha);
+            for (int k = 0; k < CHANNELS; ++k)
+                sums[k] += weight * s.color[k];
+        }
+        if (was_live && !live)
+            atomic_dec(&live_pixels);
+    }
+
+    if (inside) {
+        const size_t p = (size_t)pixel.y * width + pixel.x;
+        for (int k = 0; k < CHANNELS; ++k)
+            image[CHANNELS * p + k] = sums[k] + transmittance * background[k];
+        alpha_image[p] = 1 - transmittance;
+    }
+}
+
+__kernel __attribute__((reqd_work_group_size(BATCH, 1, 1))) void
+composite_bwd(const int width, const int height, const __global real *means2d, const __global real *conics,
+              const __global real *extents, const __global real *opacities, const __global real *colors,
+              const __global uint *gauss_ids, const __global uint *tile_ranges, const __global uint *slots,
+              const __global real *image, const __global real *alpha_image, const __global real *v_image,
+              const __global real *v_alpha_image, __global real *records) {
+    // Transmittance 0 marks a finished pixel or one outside the image: no live one ever falls to it.
+    __local real transmittance[PIXELS], behind[PIXELS], v_pixels[CHANNELS][PIXELS];
+    __local int unfinished;
+    const uint t = get_group_id(0), lane = get_local_id(0);
+    const int tiles_x = (width + TILE - 1) / TILE;
+    const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
+
+    for (uint p = lane; p < PIXELS; p += BATCH) {
+        const int2 pixel = pixel_of(x0, y0, p);
+        const int inside = pixel.x < width && pixel.y < height;
+        transmittance[p] = inside;
+        if (!inside)
+            continue;
+        const size_t i = (size_t)pixel.y * width + pixel.x;
+        real sum = (alpha_image[i] - 1) * v_alpha_image[i];
+        for (int k = 0; k < CHANNELS; ++k) {
+            const real v = v_image[CHANNELS * i + k];
+            sum += image[CHANNELS * i + k] * v;
+            v_pixels[k][p] = v;
+        }
+        behind[p] = sum;
+    }
+    if (lane == 0)
+        unfinished = 1;
+    barrier(CLK_LOCAL_MEM_FENCE);
+
+    const uint begin = tile_ranges[2 * t], length = tile_ranges[2 * t + 1] - begin;
+    uint first = 0;
+    for (; first < length && unfinished; first += BATCH) {
+        const uint count = min((uint)BATCH, length - first);
+        const uint i = begin + first + lane;
+        Splat s;
+        Moments m = {0, 0, 0, 0, 0, 0};
+        real v_color[CHANNELS];
+        int any_live = 0;
+        if (lane < count)
+            s = splat_load(gauss_ids[i], means2d, conics, opacities, colors);
+        for (int k = 0; k < CHANNELS; ++k)
+            v_color[k] = 0;
+
+        for (uint step = 0; step < PIXELS + count - 1; ++step) {
+            const uint p = step - lane; // wraps to beyond PIXELS where the stream has not reached this work-item
+            if (lane < count && p < PIXELS && transmittance[p] > 0) {
+                const int2 pixel = pixel_of(x0, y0, p);
+                const real dx = pixel.x + (real)0.5 - s.x, dy = pixel.y + (real)0.5 - s.y;
+                const real before = transmittance[p];
+                real after = before, alpha;
+                int live = 1;
+                const real weight = splat_over(&s, dx, dy, &after, &live, &alpha);
+                any_live |= live;
+                if (weight > 0) {
+                    real u = 0, part = behind[p];
+                    for (int k = 0; k < CHANNELS; ++k) {
+                        u += s.color[k] * v_pixels[k][p];
+                        v_color[k] += weight * v_pixels[k][p];
+                    }
+                    const real v_sigma = splat_over_vjp(alpha, weight, before, u, &part);
+                    transmittance[p] = after;
+                    behind[p] = part;
+                    m.m0 += v_sigma;
+                    m.mx += dx * v_sigma;
+                    m.my += dy * v_sigma;
+                    m.mxx += dx * dx * v_sigma;
+                    m.mxy += dx * dy * v_sigma;
+                    m.myy += dy * dy * v_sigma;
+                } else if (!live) {
+                    transmittance[p] = 0;
+                }
+            }
+            barrier(CLK_LOCAL_MEM_FENCE);
+        }
+
+        if (lane < count)
+            splat_record(&s, m, v_color, records + (size_t)RECORD * slots[i]);
+        if (lane == count - 1)
+            unfinished = any_live;
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
+    for (uint j = first + lane; j < length; j += BATCH)
+        splat_record_zero(records + (size_t)RECORD * slots[begin + j]);
+}
+
+#include "composite_sum.h"
