@@ -285,7 +285,7 @@ def _to_gaussians(path: str | Path, data: Array, names: list[str]) -> Gaussians:
 
 
 def _normalised(quats: Array) -> Array:
-    """Unit quaternions, (N, 4): zeros where the renderer finds no direction and culls, NaN where one is not finite."""
+    """Unit quaternions, (N, 4): zeros where the renderer finds no direction and culls, NaN where not finite."""
     wide = quats.astype(np.float64)
     norm2 = np.einsum("ni,ni->n", wide, wide)[:, None]
     norm = np.where(norm2 < QUAT_NORM2_MIN, np.inf, np.sqrt(norm2))

@@ -1,0 +1,143 @@
+"""Image metrics as the field reports them: PSNR, SSIM, and FLIP where it is installed.
+
+Images are (H, W, 3), uint8 or floats in [0, 1]; floats are rounded to 8 bits first, since that is what a photo
+and a saved render are. Figures of a scene are the means over its images, not metrics of the mean error.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
+from clsplat.errors import InputError
+
+Array = NDArray[Any]
+
+
+def to_uint8(image: Array) -> NDArray[np.uint8]:
+    """Round an image to 8 bits, (H, W, 3): values are clamped to [0, 1]; uint8 is returned as it is.
+
+    Raises
+    ------
+    InputError
+        If the shape is not (H, W, 3), the dtype neither uint8 nor float, or a value not finite.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise InputError(f"image: expected shape (H, W, 3), found {image.shape}")
+    if image.dtype == np.uint8:
+        return image
+    if not np.issubdtype(image.dtype, np.floating):
+        raise InputError(f"image: expected uint8 or floats in [0, 1], found {image.dtype}")
+    if not np.isfinite(image).all():
+        raise InputError("image: expected finite values, found NaN or infinity")
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+
+
+def psnr(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> float:
+    """Peak signal-to-noise ratio over all pixels and channels.
+
+    Parameters
+    ----------
+    image, truth : (H, W, 3) uint8 or float in [0, 1]
+    mask : (H, W) bool, optional
+        True where pixels count.
+
+    Returns
+    -------
+    float
+        Decibels; infinite for equal images.
+
+    Raises
+    ------
+    InputError
+        If the shapes differ, a value is not finite, or the mask leaves no pixel.
+    """
+    a, b, mask = _prepare(image, truth, mask)
+    mse = float(np.mean((a - b)[mask] ** 2))
+    return -10 * math.log10(mse) if mse > 0 else math.inf
+
+
+def ssim(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> float:
+    """Structural similarity (Wang et al. 2004, doi:10.1109/TIP.2003.819861), mean over all pixels and channels.
+
+    Gaussian window of 11x11 pixels, sigma 1.5, population variances, borders padded with zeros as in the
+    original's training loss; scikit-image mirrors the borders instead.
+
+    Parameters
+    ----------
+    image, truth : (H, W, 3) uint8 or float in [0, 1]
+    mask : (H, W) bool, optional
+        True where pixels count. Windows that reach beyond see the truth's pixels there in both images.
+
+    Returns
+    -------
+    float
+        1 for equal images.
+
+    Raises
+    ------
+    InputError
+        As `psnr`.
+    """
+    from scipy.ndimage import correlate1d
+
+    a, b, mask = _prepare(image, truth, mask)
+    offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+    window = np.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    window /= window.sum()
+
+    def blur(x: Array) -> Array:
+        return correlate1d(correlate1d(x, window, axis=0, mode="constant"), window, axis=1, mode="constant")
+
+    mu_a, mu_b = blur(a), blur(b)
+    var_a, var_b = blur(a * a) - mu_a**2, blur(b * b) - mu_b**2
+    cov = blur(a * b) - mu_a * mu_b
+    luminance = (2 * mu_a * mu_b + SSIM_C1) / (mu_a**2 + mu_b**2 + SSIM_C1)
+    structure = (2 * cov + SSIM_C2) / (var_a + var_b + SSIM_C2)
+    return float(np.mean((luminance * structure)[mask]))
+
+
+def flip(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> float | None:
+    """Mean FLIP error (Andersson et al. 2020, doi:10.1145/3406183) at its default of 67 pixels per degree.
+
+    Parameters
+    ----------
+    image, truth : (H, W, 3) uint8 or float in [0, 1]
+    mask : (H, W) bool, optional
+        True where pixels count.
+
+    Returns
+    -------
+    float or None
+        0 for equal images, at most 1; None where the package flip-evaluator is not installed.
+
+    Raises
+    ------
+    InputError
+        As `psnr`.
+    """
+    a, b, mask = _prepare(image, truth, mask)
+    try:
+        import flip_evaluator
+    except ImportError:
+        return None
+    errors, _, _ = flip_evaluator.evaluate(
+        b.astype(np.float32), a.astype(np.float32), "LDR", applyMagma=False, computeMeanError=False
+    )
+    return float(np.mean(errors[..., 0][mask], dtype=np.float64))
+
+
+def _prepare(image: Array, truth: Array, mask: NDArray[np.bool_] | None) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Both images rounded to 8 bits as float64 in [0, 1], equal where the mask is False; and the mask."""
+    a, b = to_uint8(image) / 255, to_uint8(truth) / 255
+    if a.shape != b.shape:
+        raise InputError(f"image: expected the truth's shape {b.shape}, found {a.shape}")
+    if mask is None:
+        mask = np.ones(a.shape[:2], dtype=bool)
+    if mask.shape != a.shape[:2] or mask.dtype != bool:
+        raise InputError(f"mask: expected bool of shape {a.shape[:2]}, found {mask.dtype} of shape {mask.shape}")
+    if not mask.any():
+        raise InputError("mask: expected at least one pixel that counts, found none")
+    return np.where(mask[..., None], a, b), b, mask
