@@ -135,3 +135,16 @@ def test_what_is_refused(pair, metric):
     for mask in (np.zeros((40, 50), bool), np.ones((40, 49), bool), np.ones((40, 50))):
         with pytest.raises(InputError, match="mask"):
             metric(image, truth, mask)
+
+
+@pytest.mark.parametrize(("metric", "best"), [(ssim, 1), (flip, 0)])
+def test_the_mean_is_over_the_mask(pair, metric, best):
+    if metric is flip:
+        pytest.importorskip("flip_evaluator")
+    image = pair[1].copy()
+    image[18:22, 23:27] = 0
+    mask = np.zeros(image.shape[:2], dtype=bool)
+    mask[3:37, 8:42] = True
+    # All differences lie in the mask, the windows of both metrics included: only the number of pixels changes.
+    whole, masked = (metric(image, pair[1], m) - best for m in (None, mask))
+    assert masked * mask.sum() == pytest.approx(whole * mask.size, rel=1e-6)
