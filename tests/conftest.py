@@ -1,0 +1,52 @@
+"""Fixtures: OpenCL devices of both precisions, one that poses as a GPU, and the data beside the project."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.device import Device
+
+PROJECT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def device():
+    """The device in float32, as users run it."""
+    return Device()
+
+
+@pytest.fixture(scope="session")
+def device64():
+    """The device in float64, in which gradients are proved."""
+    return Device(real=np.float64)
+
+
+@pytest.fixture(scope="session", params=["as it is", "as a GPU"])
+def configured_device(request):
+    """The float32 device, and one that the launches configure like a GPU, whatever it is."""
+    device = Device()
+    if request.param == "as a GPU":
+        device.is_cpu = False  # shadows the cached property
+    return device
+
+
+@pytest.fixture(scope="session", params=["float64", "float32"])
+def any_device(request):
+    """The device in both precisions."""
+    return request.getfixturevalue("device64" if request.param == "float64" else "device")
+
+
+@pytest.fixture(scope="session")
+def project():
+    """The project's root."""
+    return PROJECT
+
+
+@pytest.fixture(scope="session")
+def shared():
+    """Real scenes and gold renders, beside the project and not part of it."""
+    folder = PROJECT.parent / "shared"
+    if not folder.is_dir():
+        pytest.skip("../shared, the scenes and gold renders beside the project, is missing")
+    return folder
