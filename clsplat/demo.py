@@ -1,0 +1,108 @@
+"""The demonstration that needs no download: photos of a scene made of formulas, and training on them."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.io.atomic import replacing
+from clsplat.raytrace import Array, Solid, bake, camera_rays, radiance
+from clsplat.still_life import still_life
+
+SENSOR_NOISE = 0.005
+"""Standard deviation in sRGB of full scale 1: a good camera in daylight."""
+
+TILE = 128
+"""Edge in rays of the squares of a photo that are traced at once: their arrays stay in a core's cache."""
+
+FOCAL_35MM = 35
+"""Focal length in millimetres of the 35 mm camera with the same diagonal field of view: all that EXIF knows of it."""
+
+
+def viewpoints(count: int, width: int, height: int, rng: np.random.Generator) -> list[Camera]:
+    """Cameras on one and a half rings around the scene: two thirds on a low one, the others on a high one."""
+    fx = FOCAL_35MM * np.hypot(width, height) / np.hypot(36, 24)
+    low = count - count // 3
+    turns = np.concatenate([np.arange(low) / low, (np.arange(count - low) + 0.25) / max(count - low, 1)])
+    cameras = []
+    for k, turn in enumerate(turns):
+        angle = 2 * np.pi * turn + rng.normal(0, 0.03)
+        radius, z = np.array([2.95, 1.75] if k < low else [2.3, 2.65]) + rng.normal(0, 0.1, 2)
+        eye = np.array([radius * np.cos(angle), radius * np.sin(angle), z])
+        cameras.append(Camera.look_at(eye, rng.normal([0, 0, 0.25], 0.05), (0, 0, 1), fx, width, height))
+    return cameras
+
+
+def expose(rgb: Array) -> Array:
+    """sRGB in [0, 1] of linear radiance; highlights are rolled off."""
+    x = 0.62 * rgb
+    x = np.clip(x * (1 + x / 4) / (1 + 0.55 * x), 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def take_photo(camera: Camera, solids: list[Solid]) -> Array:
+    """sRGB (H, W, 3) in [0, 1]: two rays per pixel and axis, each pixel a weighted mean over four."""
+    xs, ys = ((np.arange(-1, 2 * n + 1) + 0.5) / 2 for n in (camera.width, camera.height))
+    fine = np.empty((len(ys), len(xs), 3))
+    for top in range(0, len(ys), TILE):
+        for left in range(0, len(xs), TILE):
+            tile = np.s_[top : top + TILE, left : left + TILE]
+            y, x = np.meshgrid(ys[tile[0]], xs[tile[1]], indexing="ij")
+            rgb = radiance(camera.position, camera_rays(camera, x.ravel(), y.ravel()), solids)
+            fine[tile] = rgb.T.reshape(*x.shape, 3)
+    for _ in range(2):
+        a, b, c, d = (fine[k : len(fine) - 3 + k : 2] for k in range(4))
+        fine = ((a + d + 3 * (b + c)) / 8).swapaxes(0, 1)
+    return expose(fine)
+
+
+def make_photos(folder: Path, count: int = 30, width: int = 480, height: int = 360, seed: int = 0) -> list[Camera]:
+    """Write photos of the still life: ``000.jpg`` and on.
+
+    Parameters
+    ----------
+    folder : Path
+        Made where it is missing; files of the same names are replaced.
+    count : int
+        Number of photos.
+    width, height : int
+        Their size in pixels.
+    seed : int
+        Of the cameras' places and of the noise of the sensor; the scene is always the same.
+
+    Returns
+    -------
+    list of Camera
+        The true cameras of the photos, in their order, in metres.
+
+    Raises
+    ------
+    InputError
+        If there would be no photo, or one without a pixel; if the seed is negative; if a file cannot be written.
+    """
+    from PIL import ExifTags, Image
+
+    if min(count, width, height) < 1:
+        raise InputError(f"count, width, height: expected at least 1 each, found {count}, {width}, {height}")
+    if seed < 0:
+        raise InputError(f"seed: expected 0 or more, found {seed}")
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = viewpoints(count, width, height, np.random.default_rng(seed))
+    solids = still_life()
+    bake(solids)
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = FOCAL_35MM
+
+    def write(k: int) -> None:
+        rng = np.random.default_rng([seed, k])
+        photo = take_photo(cameras[k], solids) + rng.normal(0, SENSOR_NOISE, (height, width, 3))
+        pixels = np.rint(255 * photo.clip(0, 1)).astype(np.uint8)
+        with replacing(folder / f"{k:03}.jpg") as file:
+            Image.fromarray(pixels).save(file, "jpeg", quality=95, subsampling="4:4:4", exif=exif)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(write, range(count)))
+    return cameras
