@@ -1,0 +1,153 @@
+"""The point the cameras look at, and the path around it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.camera import Camera, focus_point
+from clsplat.errors import InputError
+from clsplat.orbit import orbit
+
+TARGET = np.array([1.0, -2.0, 3.0])
+UP = np.array([0.0, 0.6, 0.8])
+EAST = np.array([1.0, 0.0, 0.0])
+
+
+def ring(angles, radius=5.0, height=2.0):
+    """Cameras around TARGET, their upper edges towards UP."""
+    north = np.cross(UP, EAST)
+    arms = [radius * (np.cos(a) * EAST + np.sin(a) * north) + height * UP for a in angles]
+    return [Camera.look_at(TARGET + arm, TARGET, UP, 500.0, 640, 480) for arm in arms]
+
+
+def test_focus_is_where_the_axes_meet():
+    cameras = ring(np.linspace(0, 2, 7))
+    np.testing.assert_allclose(focus_point(cameras), TARGET, atol=1e-12)
+    # Far from the origin only the rounding of the positions in float64 remains.
+    offset = np.array([5e5, 5.6e6, 300.0])
+    far = [camera.translated(-offset) for camera in cameras]
+    np.testing.assert_allclose(focus_point(far), TARGET + offset, atol=1e-7)
+
+
+def test_focus_minimises_the_distances_from_the_axes():
+    rng = np.random.default_rng(0)
+    cameras = [Camera.look_at(rng.normal(size=3) * 5, rng.normal(size=3), UP, 500.0, 640, 480) for _ in range(9)]
+    positions = np.array([c.position for c in cameras])
+    axes = np.array([c.viewmat[2, :3] for c in cameras])
+
+    def cost(p):
+        return (np.cross(p - positions, axes) ** 2).sum()
+
+    best = focus_point(cameras)
+    for step in np.vstack([np.eye(3), -np.eye(3)]) * 1e-3:
+        assert cost(best) < cost(best + step)
+
+
+def test_focus_without_an_intersection_in_front():
+    parallel = [Camera.look_at([x, 0, 0], [x, 0, 9], UP, 500.0, 640, 480) for x in (-3, 0, 3)]
+    np.testing.assert_allclose(focus_point(parallel), [0, 0, 3], atol=1e-12)
+    # Half a degree between the axes is no intersection either: at 300 units, where 3 are between the cameras.
+    nearly = [Camera.look_at([x, 0, 0], [0, 0, 300], UP, 500.0, 640, 480) for x in (-3, 0, 3)]
+    np.testing.assert_allclose(focus_point(nearly), [0, 0, 3], atol=1e-3)
+    outwards = [
+        Camera.look_at([x, 0, z], [3 * x, 0, 3 * z], UP, 500.0, 640, 480) for x, z in [(-1, 2), (0, 2), (1, 2)]
+    ]
+    focus = focus_point(outwards)
+    assert focus[2] > 2, "the axes meet behind the cameras, at the origin"
+    np.testing.assert_allclose(focus_point(ring([0])), ring([0])[0].position + ring([0])[0].viewmat[2, :3])
+    with pytest.raises(InputError, match="at least one camera"):
+        focus_point([])
+
+
+def test_a_full_ring_gives_a_full_circle():
+    cameras = ring(np.linspace(0, 2 * np.pi, 12, endpoint=False) + 0.3)
+    path = orbit(cameras, 8, 320, 240)
+    arms = np.array([c.position for c in path]) - TARGET
+    np.testing.assert_allclose(arms @ UP, 2, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(arms - 2 * UP, axis=1), 5, atol=1e-9)
+    np.testing.assert_allclose(arms[0], cameras[0].position - TARGET, atol=1e-9)
+    steps = np.linalg.norm(np.diff(arms, axis=0, append=arms[:1]), axis=1)
+    np.testing.assert_allclose(steps, 2 * 5 * np.sin(np.pi / 8), atol=1e-9)
+    for camera in path:
+        np.testing.assert_allclose(camera.viewmat @ [*TARGET, 1], [0, 0, np.sqrt(29), 1], atol=1e-9)
+        assert camera.viewmat[1, :3] @ UP < 0, "y points down"
+
+
+def test_an_arc_is_swung_over_and_never_left():
+    arc = np.array([2.9, 3.3, 3.0, 3.5, 4.0])  # across the seam of arctan2
+    path = orbit(ring(arc, height=0.0), 40, 320, 240)
+    arms = np.array([c.position for c in path]) - TARGET
+    angles = np.arctan2(arms @ np.cross(UP, EAST), arms @ EAST) % (2 * np.pi)
+    assert angles.min() == pytest.approx(2.9) and angles.max() == pytest.approx(4.0)
+    assert np.abs(np.diff(angles, append=angles[:1])).max() < 0.1, "no jump, not even where the video loops"
+
+
+def test_one_camera_and_one_frame():
+    (camera,) = ring([1.0])
+    (frame,) = orbit([camera], 1, 640, 480)
+    np.testing.assert_allclose(frame.position, camera.position, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "fx"), [(640, 480, 500), (1280, 480, 500), (320, 480, 250), (64, 48, 50)]
+)
+def test_the_first_cameras_field_of_view_fits_the_frame(width, height, fx):
+    camera = orbit(ring([0, 1, 2]), 3, width, height)[1]
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (width, height, width / 2, height / 2)
+    assert camera.fx == camera.fy == fx
+
+
+def test_radius_and_height_are_means():
+    turn = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    top = Camera.look_at(TARGET + 9 * UP, TARGET, EAST, 500.0, 640, 480)
+    arms = (
+        np.array([c.position for c in orbit([top, *ring(turn, 4.0, 1.0), *ring(turn, 8.0, 2.0)], 4, 64, 48)]) - TARGET
+    )
+    centre = arms.mean(axis=0)
+    # The camera above sees EAST as up and tilts the axis by a few degrees.
+    assert np.linalg.norm(arms - centre, axis=1) == pytest.approx(16 * 6 / 17, rel=0.02)
+    assert np.linalg.norm(centre) == pytest.approx((8 + 16 + 9) / 17, rel=0.02)
+
+
+def test_what_has_no_orbit():
+    with pytest.raises(InputError, match="frames"):
+        orbit(ring([0, 1]), 0, 64, 48)
+    turn = np.linspace(0, 2 * np.pi, 6, endpoint=False)
+    panorama = [Camera.look_at([0, 0, 0], [np.cos(a), np.sin(a), 0], [0, 0, 1], 500.0, 640, 480) for a in turn]
+    with pytest.raises(InputError, match="found none beside it"):
+        orbit(panorama, 4, 64, 48)
+
+
+def test_cameras_upside_down_to_each_other():
+    cameras = [Camera.look_at(TARGET + x * EAST, TARGET, x * UP, 500.0, 640, 480) for x in (4, -4)]
+    path = np.array([frame.position for frame in orbit(cameras, 4, 64, 48)])
+    # Half a circle between the two: over the top or through the side, but at their distance.
+    np.testing.assert_allclose(np.linalg.norm(path - TARGET, axis=1), 4, atol=1e-9)
+    np.testing.assert_allclose(np.sort((path - TARGET) @ EAST), [-4, 0, 0, 4], atol=1e-9)
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["fox_pinhole", "bonsai", "fern", "sceaux", "castle_p30"])
+def test_real_scenes_are_seen_from_the_orbit(name):
+    model = Path(__file__).parents[2] / "shared" / "data" / name / "sparse" / "0"
+    if not model.is_dir():
+        pytest.skip(f"{name} is not there")
+    pycolmap = pytest.importorskip("pycolmap")
+    reconstruction = pycolmap.Reconstruction(model)
+    (intrinsics,) = reconstruction.cameras.values()
+    cameras = []
+    for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
+        viewmat = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        cameras.append(Camera(viewmat, *intrinsics.params, intrinsics.width, intrinsics.height))
+    points = np.array([point.xyz for point in reconstruction.points3D.values()])
+
+    def share_seen(camera):
+        x, y, z = camera.viewmat[:3, :3] @ points.T + camera.viewmat[:3, 3:]
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        return np.mean((z > 0.01) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height))
+
+    path = orbit(cameras, 12, intrinsics.width, intrinsics.height)
+    photos = np.mean([share_seen(camera) for camera in cameras])
+    # Half of what a photo sees: a path that looks elsewhere sees a tenth.
+    assert np.mean([share_seen(camera) for camera in path]) > 0.5 * photos
