@@ -197,7 +197,7 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
         color += basis[k] * load3(sh, i * sh_stride + k);
 
     // Zero times infinity is NaN: one test finds what is not finite in any term.
-    const real any = f.det + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
+    const real any = norm2 + f.det + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
     bool visible = isfinite(0 * any) && f.p.z > NEAR && norm2 >= QUAT_NORM2_MIN && r2 > 0;
     if (visible) {
         const int2 columns = pixels_between(centre.x - extent.x, centre.x + extent.x, camera.width);

@@ -104,10 +104,11 @@ def project_fwd(
         size = np.array([camera.width, camera.height])
         first = np.ceil(np.clip(f["means2d"] - extents - 0.5, 0, size))
         last = np.floor(np.clip(f["means2d"] + extents - 0.5, -1, size - 1))
+        norm2 = f["norm"] ** 2
         finite = np.isfinite(
-            f["det"] + f["means2d"].sum(axis=1) + extents.sum(axis=1) + f["color"].sum(axis=1) + f["p"].sum(axis=1)
+            norm2 + f["det"] + (f["means2d"] + extents).sum(axis=1) + f["color"].sum(axis=1) + f["p"].sum(axis=1)
         )
-        visible = finite & (f["p"][:, 2] > NEAR) & (f["norm"] ** 2 >= QUAT_NORM2_MIN) & (threshold > 0)
+        visible = finite & (f["p"][:, 2] > NEAR) & (norm2 >= QUAT_NORM2_MIN) & (threshold > 0)
         visible &= (first <= last).all(axis=1)
     splats = Splats(f["means2d"], conics, f["p"][:, 2], extents, opacities, colors)
     return Splats(*(np.where(visible.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in splats))

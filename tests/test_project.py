@@ -1,0 +1,336 @@
+"""Stage project: against the twin, against central differences, on degenerate input."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tolerances import DOUBLE, FLOAT
+
+from clsplat import ops, reference
+from clsplat.camera import Camera
+from clsplat.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN, NEAR
+from clsplat.gaussians import Gaussians, logit
+from clsplat.render import download, upload
+from clsplat.stages import SplatGrads, Splats
+from clsplat.testing import assert_matches, gradcheck, synthetic_scene, threshold_distances
+
+GRADIENTS = ("means2d", "conics", "opacities", "colors")
+MODES = pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
+
+
+def host(arrays):
+    """The same container with NumPy arrays."""
+    if isinstance(arrays, Gaussians):
+        return Gaussians(**{k: download(a) for k, a in arrays.arrays().items()})
+    return type(arrays)(*map(download, arrays))
+
+
+def forward(device, gaussians, camera, degree=3, **options):
+    return host(ops.project_fwd(device, upload(device, gaussians), camera, degree, **options))
+
+
+def backward(device, gaussians, camera, splats, v_splats, degree=3, **options):
+    uploaded = [type(a)(*(device.upload("splats", x) for x in a)) for a in (splats, v_splats)]
+    v, v_viewmat = ops.project_bwd(device, upload(device, gaussians), camera, degree, *uploaded, **options)
+    return host(v), v_viewmat
+
+
+def random_grads(splats, seed=0):
+    rng = np.random.default_rng(seed)
+    return SplatGrads(*(rng.normal(size=getattr(splats, name).shape) for name in GRADIENTS))
+
+
+def from_view(camera, points):
+    """World coordinates of points (N, 3) in the camera's frame."""
+    return (np.asarray(points) - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+
+
+def wide_scene(n=1000, seed=5):
+    """Gaussians everywhere: behind the camera, beyond the image's borders, close, far, faint; float32 values."""
+    gaussians, camera = synthetic_scene(n, seed, width=97, height=61)
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(-1, 8, n)
+    slopes = rng.uniform(-1.2, 1.2, (n, 2)) * [1, camera.height / camera.width]
+    gaussians.means[:] = from_view(camera, np.concatenate([slopes * z[:, None], z[:, None]], axis=1))
+    gaussians.log_scales[:] = rng.uniform(np.log(0.003), np.log(0.6), (n, 3))
+    gaussians.logit_opacities[:] = rng.uniform(-7, 5, n)
+    gaussians.sh[:, 0] -= 0.5
+    return gaussians.astype(np.float32), camera
+
+
+@MODES
+@pytest.mark.parametrize("degree", range(4))
+def test_forward_matches_twin(device64, antialiased, degree):
+    gaussians, camera = wide_scene()
+    channels = 4 if antialiased else 3
+    actual = forward(device64, gaussians, camera, degree, antialiased=antialiased, channels=channels)
+    expected = reference.project_fwd(gaussians, camera, degree, antialiased=antialiased, channels=channels)
+    shown = expected.extents[:, 0] > 0
+    assert 0.2 < shown.mean() < 0.8 and (expected.colors[shown] == 0).any(), "the scene lacks a case"
+    np.testing.assert_array_equal(actual.extents[:, 0] > 0, shown)
+    for name in Splats._fields:
+        assert_matches(name, getattr(actual, name), getattr(expected, name), DOUBLE)
+
+
+@MODES
+@pytest.mark.parametrize("degree", range(4))
+def test_backward_matches_twin(device64, antialiased, degree):
+    gaussians, camera = wide_scene()
+    channels = 4 if antialiased else 3
+    splats = reference.project_fwd(gaussians, camera, degree, antialiased=antialiased, channels=channels)
+    v_splats = random_grads(splats)
+    # The two variants of the kernel, with and without the viewmat, are one each here.
+    options = {"antialiased": antialiased, "viewmat_grad": antialiased}
+    actual, v_viewmat = backward(device64, gaussians, camera, splats, v_splats, degree, **options)
+    expected, v_viewmat_expected = reference.project_bwd(gaussians, camera, degree, splats, v_splats, **options)
+    for name, array in expected.arrays().items():
+        assert_matches(f"v_{name}", actual.arrays()[name], array, DOUBLE)
+    if antialiased:
+        assert_matches("v_viewmat", v_viewmat, v_viewmat_expected, DOUBLE)
+    else:
+        assert v_viewmat is None and v_viewmat_expected is None
+
+
+@MODES
+def test_float_matches_twin(device, antialiased):
+    gaussians, camera = wide_scene()
+    # Depths just above the near plane lose their digits to the camera's distance from the origin.
+    z = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+    gaussians = gaussians.take((z < 0) | (z > 0.2))
+    options = {"antialiased": antialiased, "channels": 4 if antialiased else 3}
+    actual = forward(device, gaussians, camera, **options)
+    expected = reference.project_fwd(gaussians, camera, 3, **options)
+    same = (actual.extents[:, 0] > 0) == (expected.extents[:, 0] > 0)
+    # A flip needs the edge of an extent within 1e-5 px of a pixel's centre: one row in 1e4.
+    assert (~same).sum() <= 1
+    for name in Splats._fields:
+        assert_matches(name, getattr(actual, name), getattr(expected, name), FLOAT, where=same)
+
+    v_splats = random_grads(expected)
+    options = {"antialiased": antialiased, "viewmat_grad": antialiased}
+    v_actual, v_viewmat = backward(device, gaussians, camera, expected, v_splats, **options)
+    v_expected, v_viewmat_expected = reference.project_bwd(gaussians, camera, 3, expected, v_splats, **options)
+    for name, array in v_expected.arrays().items():
+        assert_matches(f"v_{name}", v_actual.arrays()[name], array, FLOAT)
+    if antialiased:
+        assert_matches("v_viewmat", v_viewmat, v_viewmat_expected, FLOAT)
+
+
+def check_gradients(device, gaussians, camera, antialiased, degree=3):
+    """Central differences of a random linear function of what is differentiable, by every input."""
+    options = {"antialiased": antialiased, "channels": 4}
+    splats = forward(device, gaussians, camera, degree, **options)
+    assert (splats.extents > 0).all(), "every Gaussian must be visible"
+    v_splats = random_grads(splats)
+
+    def scalar(viewmat, **arrays):
+        moved = forward(device, Gaussians(**arrays), replace(camera, viewmat=viewmat), degree, **options)
+        # Differences of the outputs, lest those that are large and do not change drown the rest in rounding.
+        return sum(float(((getattr(moved, k) - getattr(splats, k)) * getattr(v_splats, k)).sum()) for k in GRADIENTS)
+
+    v, v_viewmat = backward(
+        device, gaussians, camera, splats, v_splats, degree, antialiased=antialiased, viewmat_grad=True
+    )
+    inputs = {**gaussians.arrays(), "viewmat": camera.viewmat}
+    gradcheck(scalar, inputs, {**v.arrays(), "viewmat": v_viewmat})
+    return v
+
+
+@MODES
+@pytest.mark.parametrize("degree", [0, 3])
+def test_central_differences(device64, antialiased, degree):
+    gaussians, camera = synthetic_scene(75, seed=1, margin=1e-3)
+    shown = reference.project_fwd(gaussians, camera, degree, antialiased=antialiased).extents[:, 0] > 0
+    gaussians = gaussians.take(shown)
+    assert len(gaussians) > 64, "the viewmat's gradient must be summed over more than one work-group"
+    v = check_gradients(device64, gaussians, camera, antialiased, degree)
+    assert (v.sh[:, (degree + 1) ** 2 :] == 0).all(), "bands that are not evaluated have no gradient"
+
+
+@MODES
+def test_central_differences_in_the_clamped_zone(device64, antialiased):
+    """Large Gaussians outside the enlarged image, beyond each border and each corner, still reach into it."""
+    gaussians, camera = synthetic_scene(8, seed=2)
+    limits = (0.5 + 0.5 * FRUSTUM_MARGIN) * np.array([camera.width / camera.fx, camera.height / camera.fy])
+    sides = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if (x, y) != (0, 0)])
+    z = np.linspace(2, 4, 8)[:, None]
+    slopes = 1.2 * limits * sides
+    gaussians.means[:] = from_view(camera, np.concatenate([slopes * z, z], axis=1))
+    gaussians.log_scales[:] = np.random.default_rng(2).uniform(-0.3, 0.3, (8, 3))
+    points = gaussians.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    outside = np.abs(points[:, :2] / points[:, 2:]) / limits
+    assert ((outside > 1.1) == (sides != 0)).all() and ((outside < 0.9) == (sides == 0)).all()
+    check_gradients(device64, gaussians, camera, antialiased)
+
+
+@MODES
+def test_central_differences_at_the_clamps(device64, antialiased):
+    """Colours clamped at 0 in one, two or three channels, and a compensation at its floor."""
+    gaussians, camera = synthetic_scene(6, seed=3, margin=0.02)
+    gaussians.sh[0, 0, 0] = gaussians.sh[1, 0, 1:] = gaussians.sh[2, 0] = -8
+    # A speck of opacity 0.00475 is seen at a pixel's centre only.
+    gaussians.means[3] = from_view(camera, [4 * 2 / camera.fx, 4 * 1 / camera.fy, 4])
+    gaussians.log_scales[3] = -8
+    gaussians.logit_opacities[3] = logit(0.95)
+    splats = reference.project_fwd(gaussians, camera, 3, antialiased=antialiased)
+    assert (splats.colors[:3] == 0).sum() == 6
+    if antialiased:
+        assert splats.opacities[3] == pytest.approx(0.95 * COMPENSATION_MIN, rel=1e-12)
+    v = check_gradients(device64, gaussians, camera, antialiased)
+    assert (v.sh[2] == 0).all() and (v.sh[0, :, 0] == 0).all() and (v.sh[0, :, 1] != 0).all()
+
+
+def test_the_scene_keeps_its_margin():
+    gaussians, camera = synthetic_scene(30, seed=1, margin=1e-3)
+    for antialiased in (False, True):
+        assert threshold_distances(gaussians, camera, antialiased=antialiased).min() >= 1e-3
+
+
+NAN, INF = np.nan, np.inf
+INVISIBLE = {
+    "mean is NaN": ("means", (NAN, 0, 0)),
+    "mean is infinite": ("means", (INF, 0, 0)),
+    "mean is minus infinite": ("means", (0, -INF, 0)),
+    "scale is NaN": ("log_scales", (0, NAN, 0)),
+    "scale is infinite": ("log_scales", (0, 0, INF)),
+    "scale overflows": ("log_scales", (800, 0, 0)),
+    "quaternion is zero": ("quats", (0, 0, 0, 0)),
+    "quaternion is denormal": ("quats", (1e-40, 0, 0, 1e-41)),
+    "quaternion is NaN": ("quats", (1, NAN, 0, 0)),
+    "quaternion is infinite": ("quats", (1, 0, INF, 0)),
+    "opacity is NaN": ("logit_opacities", NAN),
+    "opacity is 0": ("logit_opacities", -INF),
+    "opacity is too small to see": ("logit_opacities", logit(ALPHA_MIN * 0.99)),
+    "colour is NaN": ("sh", NAN),
+    "colour is infinite": ("sh", -INF),
+}
+VISIBLE = {
+    "scale is 0": ("log_scales", (-INF, -INF, -INF)),
+    "scale is denormal": ("log_scales", (-100, -3, -100)),
+    "scale is huge": ("log_scales", (12, 12, 12)),
+    "needle": ("log_scales", (2, -18, -18)),
+    "disc": ("log_scales", (0, 0, -40)),
+    "quaternion is large": ("quats", (1e15, 3e15, 0, 1e15)),
+    "quaternion is small": ("quats", (1.1e-4, 0, 0, 1e-5)),
+    "opacity is 1": ("logit_opacities", INF),
+    "opacity rounds to 1": ("logit_opacities", 200.0),
+    "colour is huge": ("sh", 1e10),
+    "colour is denormal": ("sh", 1e-40),
+}
+
+
+def poisoned(gaussians, rows):
+    """The Gaussians with one more row for each entry of `rows`, a copy of row 0 changed in one field, put between."""
+    parts, poison = [], []
+    for k, (field, value) in enumerate(rows.values()):
+        bad = gaussians.take([0])
+        getattr(bad, field)[0] = value
+        poison.append(sum(map(len, parts)) + 1)
+        parts += [gaussians.take([k % len(gaussians)]), bad]
+    parts.append(gaussians.take(np.arange(len(rows), len(gaussians))))
+    mixed = Gaussians.concatenate(parts)
+    healthy = np.setdiff1d(np.arange(len(mixed)), poison)
+    return mixed, healthy, np.array(poison)
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")
+@MODES
+def test_invalid_gaussians_are_invisible(any_device, antialiased):
+    gaussians, camera = synthetic_scene(40, seed=4, width=97, height=61)
+    gaussians.means[0] = 0
+    mixed, healthy, poison = poisoned(gaussians, INVISIBLE)
+    mixed = mixed.astype(any_device.real)
+    options = {"antialiased": antialiased, "channels": 4}
+    clean, splats = (forward(any_device, g, camera, **options) for g in (mixed.take(healthy), mixed))
+    twin = reference.project_fwd(mixed, camera, 3, **options)
+    assert clean.extents[0, 0] > 0, "the row that is poisoned must be visible when healthy"
+    for name in Splats._fields:
+        rows = getattr(splats, name)
+        assert (rows[poison] == 0).all() and (getattr(twin, name)[poison] == 0).all(), name
+        np.testing.assert_array_equal(rows[healthy], getattr(clean, name), err_msg=name)
+
+    # Nor do they pass a gradient on, to themselves or to the camera, whatever arrives.
+    v_splats = random_grads(clean)
+    for grads in (splats, twin):
+        v_mixed = SplatGrads(*(np.full(getattr(grads, k).shape, 1e3) for k in GRADIENTS))
+        for name in GRADIENTS:
+            getattr(v_mixed, name)[healthy] = getattr(v_splats, name)
+    options = {"antialiased": antialiased, "viewmat_grad": True}
+    v_clean, v_viewmat_clean = backward(any_device, mixed.take(healthy), camera, clean, v_splats, **options)
+    v, v_viewmat = backward(any_device, mixed, camera, splats, v_mixed, **options)
+    v_twin, v_viewmat_twin = reference.project_bwd(mixed, camera, 3, twin, v_mixed, **options)
+    table = DOUBLE if any_device.real == np.float64 else FLOAT
+    for name, array in v.arrays().items():
+        assert (array[poison] == 0).all() and (v_twin.arrays()[name][poison] == 0).all(), name
+        np.testing.assert_array_equal(array[healthy], v_clean.arrays()[name], err_msg=name)
+    assert_matches("v_viewmat", v_viewmat, v_viewmat_clean, table)  # summed in other groups
+    assert_matches("v_viewmat", v_viewmat, v_viewmat_twin, table)
+
+
+@MODES
+def test_extreme_gaussians_stay_finite(any_device, antialiased):
+    gaussians, camera = synthetic_scene(40, seed=4, width=97, height=61)
+    gaussians.means[0] = 0
+    gaussians.logit_opacities[0] = 4
+    mixed, healthy, extreme = poisoned(gaussians, VISIBLE)
+    mixed = mixed.astype(any_device.real)
+    options = {"antialiased": antialiased, "channels": 4}
+    splats = forward(any_device, mixed, camera, **options)
+    assert (splats.extents[extreme] > 0).all()
+    v_splats = random_grads(splats)
+    v, v_viewmat = backward(any_device, mixed, camera, splats, v_splats, antialiased=antialiased, viewmat_grad=True)
+    for name, array in [*splats._asdict().items(), *v.arrays().items(), ("viewmat", v_viewmat)]:
+        assert np.isfinite(array).all(), name
+    clean = forward(any_device, mixed.take(healthy), camera, **options)
+    for name in Splats._fields:
+        np.testing.assert_array_equal(getattr(splats, name)[healthy], getattr(clean, name), err_msg=name)
+
+
+def test_quaternion_whose_norm_overflows_is_invisible(any_device):
+    gaussians, camera = synthetic_scene(3, seed=4)
+    gaussians.quats[1] *= 1e30 if any_device.real == np.float32 else 1e200
+    splats = forward(any_device, gaussians.astype(any_device.real), camera)
+    np.testing.assert_array_equal(splats.extents[:, 0] > 0, [1, 0, 1])
+
+
+def test_near_plane_and_behind(any_device):
+    """Depths on both sides of the near plane, at it, at 0 and behind the camera; far away; off screen."""
+    gaussians, camera = synthetic_scene(9, seed=6, width=97, height=61)
+    camera = replace(camera, viewmat=np.eye(4))
+    z = np.array([NEAR * (1 + 1e-5), NEAR * (1 - 1e-5), 0, -NEAR, -3, 1e-40, 1e6, 1e30, 2])
+    gaussians.means[:] = np.stack([0 * z, 0 * z, z], axis=1)
+    gaussians.means[8] = (100, 0, 2)
+    gaussians.log_scales[8] = -3
+    splats = forward(any_device, gaussians.astype(any_device.real), camera, channels=4)
+    np.testing.assert_array_equal(splats.extents[:, 0] > 0, [1, 0, 0, 0, 0, 0, 1, 1, 0])
+    v, v_viewmat = backward(any_device, gaussians, camera, splats, random_grads(splats), viewmat_grad=True)
+    for name, array in [*splats._asdict().items(), *v.arrays().items(), ("viewmat", v_viewmat)]:
+        assert np.isfinite(array).all(), name
+
+
+def test_nothing_of_the_box_is_lost():
+    """The extents are those of {alpha >= ALPHA_MIN}: on the box's border alpha is ALPHA_MIN but for the slack."""
+    gaussians, camera = wide_scene()
+    splats = reference.project_fwd(gaussians, camera, 3)
+    shown = splats.extents[:, 0] > 0
+    (a, b, c), extents = splats.conics[shown].T, splats.extents[shown]
+    # At the rightmost point dy = -(b/c) dx; sigma there is dx^2 (a - b^2/c)/2.
+    sigma = 0.5 * extents[:, 0] ** 2 * (a - b * b / c)
+    alpha = splats.opacities[shown] * np.exp(-sigma)
+    np.testing.assert_allclose(alpha, ALPHA_MIN * np.exp(-1e-3), rtol=1e-6)
+
+
+def test_camera_of_the_demo_faces_its_target():
+    """An anchor outside the twin: known points of a camera without rotation."""
+    camera = Camera(np.eye(4), 100, 50, 32, 24, 64, 48)
+    gaussians, _ = synthetic_scene(1)
+    gaussians.means[0] = (0.5, -0.25, 5)
+    gaussians.log_scales[0] = np.log(0.2)
+    splats = reference.project_fwd(gaussians, camera, 0)
+    np.testing.assert_allclose(splats.means2d[0], (42, 21.5))
+    # On the axis a sphere's covariance is (f s/z)^2; off it the Jacobian's third column adds (f s x/z^2)^2.
+    xx, yy = 16 * (1 + 0.01) + 0.3, 4 * (1 + 0.0025) + 0.3
+    xy = 100 * 50 * 0.04 * 0.5 * -0.25 / 5**4
+    inverse = np.linalg.inv([[xx, xy], [xy, yy]])
+    np.testing.assert_allclose(splats.conics[0], inverse[[0, 0, 1], [0, 1, 1]], rtol=1e-12)
+    np.testing.assert_allclose(splats.colors[0], np.maximum(0.5 + 0.28209479177387814 * gaussians.sh[0, 0], 0))

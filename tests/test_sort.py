@@ -1,0 +1,64 @@
+"""Stage sort: both algorithms against a stable argsort of NumPy, in the configurations of CPUs and GPUs."""
+
+import numpy as np
+import pytest
+
+from clsplat import ops, reference
+from clsplat.ops.sort import BITONIC_MAX
+
+# Around runs of 16 keys, work-groups of 64, the bitonic sort's capacity, and blocks of 64 x 16 keys.
+SIZES = [1, 2, 15, 16, 17, 63, 64, 65, 1023, 1024, 1025, 4097, 100_000]
+WIDTHS = {32: np.uint32, 64: np.uint64}
+
+
+def keys_of(kind, n, bits, dtype):
+    """Random keys of `bits` bits; few distinct ones; one; all bits set; sorted backwards."""
+    rng = np.random.default_rng(n)
+    largest = 2**bits - 1
+    keys = {
+        "random": lambda: rng.integers(0, largest, n, dtype=np.uint64, endpoint=True),
+        "few": lambda: rng.integers(0, largest, 3, dtype=np.uint64)[rng.integers(0, 3, n)],
+        "equal": lambda: np.full(n, largest // 3),
+        "largest": lambda: np.full(n, largest, dtype=np.uint64),
+        "backwards": lambda: np.arange(n, 0, -1),
+    }
+    return keys[kind]().astype(dtype)
+
+
+def check(device, keys, bits, method):
+    array = device.upload("keys", keys, keys.dtype)
+    sorted_keys, order = (a.get() for a in ops.argsort(device, array, bits, method))
+    expected_keys, expected_order = reference.argsort(keys, bits)
+    assert sorted_keys.dtype == keys.dtype and order.dtype == np.uint32
+    np.testing.assert_array_equal(order, expected_order)
+    np.testing.assert_array_equal(sorted_keys, expected_keys)
+    np.testing.assert_array_equal(array.get(), keys, err_msg="the keys were changed")
+
+
+@pytest.mark.parametrize("kind", ["random", "few", "equal", "largest", "backwards"])
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("n", SIZES)
+def test_radix(configured_device, n, width, kind):
+    check(configured_device, keys_of(kind, n, width, WIDTHS[width]), width, "radix")
+
+
+@pytest.mark.parametrize("kind", ["random", "few", "equal", "largest", "backwards"])
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("n", [n for n in SIZES if n <= BITONIC_MAX])
+def test_bitonic(configured_device, n, width, kind):
+    check(configured_device, keys_of(kind, n, width, WIDTHS[width]), width, "bitonic")
+
+
+@pytest.mark.parametrize("n", [BITONIC_MAX, BITONIC_MAX + 1])
+def test_automatic_choice(device, n):
+    check(device, keys_of("few", n, 32, np.uint32), 32, "auto")
+
+
+@pytest.mark.parametrize("bits", [1, 4, 5, 11, 12, 23])
+def test_few_bits(configured_device, bits):
+    check(configured_device, keys_of("random", 3000, bits, np.uint32), bits, "radix")
+
+
+def test_twin_is_numpy():
+    keys = keys_of("few", 1000, 32, np.uint32)
+    np.testing.assert_array_equal(reference.argsort(keys, 32)[1], np.argsort(keys, kind="stable"))

@@ -1,0 +1,36 @@
+"""Every tolerance of the tests: quantity -> (rtol, atol, why), see `clsplat.testing.Tolerance`.
+
+rtol is a fraction of each expected value, atol of the largest. Float errors are measured on PoCL (x86) and rounded up by
+a factor of 3 to 10: other devices may contract and order sums otherwise.
+"""
+
+from clsplat.testing import Tolerance
+
+_REORDERED = "float64 on both sides: a few hundred ulps for sums in another order"
+_CANCELS = "float64 on both sides; the determinant of a 2D covariance may cancel by a factor of 1e3"
+
+DOUBLE = {
+    "means2d": Tolerance(1e-12, 1e-13, _REORDERED),
+    "conics": Tolerance(1e-10, 1e-12, _CANCELS),
+    "depths": Tolerance(1e-12, 1e-13, _REORDERED),
+    "extents": Tolerance(1e-11, 1e-13, _REORDERED),
+    "opacities": Tolerance(1e-11, 1e-13, _REORDERED),
+    "colors": Tolerance(1e-11, 1e-13, _REORDERED),
+}
+DOUBLE |= {
+    f"v_{name}": Tolerance(1e-9, 1e-12, _CANCELS)
+    for name in ("means", "log_scales", "quats", "logit_opacities", "sh", "viewmat")
+}
+
+FLOAT = {
+    "means2d": Tolerance(1e-5, 1e-6, "float32: 1e-7 of a coordinate that may cancel against the camera's"),
+    "conics": Tolerance(1e-3, 1e-5, "float32: needles cancel in the determinant"),
+    "depths": Tolerance(1e-6, 1e-6, "float32"),
+    "extents": Tolerance(1e-5, 1e-6, "float32"),
+    "opacities": Tolerance(1e-5, 1e-6, "float32"),
+    "colors": Tolerance(1e-5, 1e-6, "float32"),
+}
+FLOAT |= {
+    f"v_{name}": Tolerance(1e-3, 1e-4, "float32: for a needle the gradient by its covariance cancels along its axis")
+    for name in ("means", "log_scales", "quats", "logit_opacities", "sh", "viewmat")
+}
