@@ -1,0 +1,126 @@
+"""Tables made from the package while the pages are built, so that they cannot disagree with it.
+
+``{constants}`` lists clsplat/constants.py; ``{config} NAME`` a dataclass of clsplat/config.py.
+"""
+
+import ast
+import dataclasses
+import inspect
+import re
+import typing
+from types import ModuleType
+from typing import Any
+
+from clsplat import config, constants
+from docutils import nodes
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+HEADER_RULE = "|---"
+
+
+def _docstring(statement: ast.stmt | None) -> str | None:
+    """The text of a string that stands alone, as it does under the name it describes; on one line."""
+    if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
+        if isinstance(statement.value.value, str):
+            return " ".join(statement.value.value.split())
+    return None
+
+
+def _prose(text: str) -> str:
+    """A docstring's plain text as Markdown: everything but its code spans escaped."""
+    parts = re.split(r"(``.+?``|`.+?`)", text)
+    return "".join(p if i % 2 else re.sub(r"([\\*_<>|\[\]$])", r"\\\1", p) for i, p in enumerate(parts))
+
+
+def _code(text: str) -> str:
+    return "`" + text.replace("|", r"\|") + "`"
+
+
+def _row(*cells: str) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(f"{v:.5f}" for v in value)
+    return repr(value) if isinstance(value, int) else f"{value:.9g}"
+
+
+def constants_table() -> str:
+    """Markdown table of the public constants; those that share a docstring share a row."""
+    body = ast.parse(inspect.getsource(constants)).body
+    rows, names = [_row("constant", "value", "reason and source"), HEADER_RULE * 3 + "|"], []
+    for statement, following in zip(body, [*body[1:], None], strict=True):
+        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
+            name = statement.targets[0].id
+            if not name.startswith("_"):
+                names.append(name)
+                text = _docstring(following)
+                if text is not None:
+                    values = [_value(getattr(constants, n)) for n in names]
+                    rows.append(_row("<br>".join(map(_code, names)), "<br>".join(values), _prose(text)))
+                    names = []
+    if names:
+        raise ValueError(f"clsplat/constants.py: expected a docstring below {names[-1]}, found none")
+    return "\n".join(rows)
+
+
+def _type_name(hint: Any) -> str:
+    if typing.get_origin(hint) is typing.Literal:
+        return " | ".join(map(repr, typing.get_args(hint)))
+    return hint.__name__ if isinstance(hint, type) else str(hint)
+
+
+def _default(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else repr(value)
+
+
+def config_table(name: str) -> str:
+    """Markdown: the docstring of a configuration class and the table of its fields."""
+    cls = getattr(config, name)
+    body = ast.parse(inspect.getsource(cls)).body[0].body
+    texts = {
+        statement.target.id: _docstring(following) or ""
+        for statement, following in zip(body, [*body[1:], None], strict=True)
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name)
+    }
+    hints = typing.get_type_hints(cls)
+    rows = [_row("field", "type", "default", "meaning"), HEADER_RULE * 4 + "|"]
+    for field in dataclasses.fields(cls):
+        hint = hints[field.name]
+        nested = dataclasses.is_dataclass(hint)
+        kind = f"[{hint.__name__}](#{hint.__name__.lower()})" if nested else _code(_type_name(hint))
+        default = "" if nested else _code(_default(field.default))
+        rows.append(_row(_code(field.name), kind, default, _prose(texts[field.name])))
+    return f"{_prose(cls.__doc__ or '')}\n\n" + "\n".join(rows)
+
+
+class Table(SphinxDirective):
+    """Base: parses Markdown that is made from a module."""
+
+    def parse(self, text: str, module: ModuleType) -> list[nodes.Node]:
+        self.env.note_dependency(module.__file__)
+        return self.parse_text_to_nodes(text)
+
+
+class Constants(Table):
+    """``{constants}``"""
+
+    def run(self) -> list[nodes.Node]:
+        return self.parse(constants_table(), constants)
+
+
+class Config(Table):
+    """``{config} NAME``"""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        return self.parse(config_table(self.arguments[0]), config)
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    app.add_directive("constants", Constants)
+    app.add_directive("config", Config)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
