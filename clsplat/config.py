@@ -1,7 +1,9 @@
 """Configuration: frozen dataclasses from which the command line, ``config.json`` and the docs table come."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from clsplat.constants import TILE
 
@@ -140,8 +142,8 @@ class TrainConfig:
     """Iterations between two evaluations on the held-out photos (0: only at the end)."""
     device: str | None = None
     """Part of the platform's or device's name; PYOPENCL_CTX is honoured where this is not given."""
-    data: DataConfig = field(default_factory=DataConfig)
+    data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     init: InitConfig = field(default_factory=InitConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     adc: AdcConfig = field(default_factory=AdcConfig)
-    render: RenderConfig = field(default_factory=RenderConfig)
+    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)

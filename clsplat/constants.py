@@ -6,6 +6,7 @@ published with it.
 """
 
 from math import exp
+from typing import Literal
 
 ALPHA_MIN = 1.0 / 255.0
 """Pairs with a smaller alpha are skipped: less than one step of an 8-bit image (original, section 6 of the paper)."""
@@ -36,7 +37,7 @@ EXTENT_SLACK = 1e-3
 the slack keeps float32 rounding of an extent from deciding first, so that tilings agree. It costs 0.02 % of
 the area at opacity 1."""
 
-TILE = 16
+TILE: Literal[8, 16] = 16
 """Edge of a tile in pixels: one row is one float16 vector of the CPU compositor and 16x16 work-items are a
 work-group that every GPU accepts."""
 

@@ -1,0 +1,156 @@
+"""`rasterization`: gsplat's function of that name on OpenCL, forward only."""
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians, logit
+from clsplat.render import download, stage_functions, upload
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+
+
+def rasterization(
+    means: ArrayLike,
+    quats: ArrayLike,
+    scales: ArrayLike,
+    opacities: ArrayLike,
+    colors: ArrayLike,
+    viewmats: ArrayLike,
+    Ks: ArrayLike,
+    width: int,
+    height: int,
+    *,
+    sh_degree: int | None = None,
+    tile_size: Literal[8, 16] = 16,
+    backgrounds: ArrayLike | None = None,
+    render_mode: RenderMode = "RGB",
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    device: "Device | None" = None,
+) -> tuple[NDArray[Any], NDArray[Any], dict[str, Any]]:
+    """Render a batch of cameras from activated parameters, with gsplat's arguments.
+
+    Parameters
+    ----------
+    means : (N, 3)
+        Centres, world units.
+    quats : (N, 4)
+        wxyz, of any norm.
+    scales : (N, 3)
+        Standard deviations (activated), world units.
+    opacities : (N,)
+        In [0, 1] (activated).
+    colors : (N, D) or (C, N, D), or (N, K, 3) with sh_degree
+        Values of D channels per Gaussian (and camera), or coefficients of spherical harmonics.
+    viewmats : (C, 4, 4)
+        World to camera.
+    Ks : (C, 3, 3)
+        Intrinsic matrices, px.
+    width, height : int
+        Image size, px.
+    sh_degree : int, optional
+        Degree up to which `colors` are evaluated as spherical harmonics; None takes them as they are.
+    tile_size : {8, 16}
+        Edge of a tile, px.
+    backgrounds : (C, D), optional
+        Behind the Gaussians; default 0. No background is put behind the depth.
+    render_mode : {"RGB", "D", "ED", "RGB+D", "RGB+ED"}
+        Colours, accumulated depth, expected depth (accumulated depth / alpha), or colours and one of them.
+    rasterize_mode : {"classic", "antialiased"}
+        antialiased compensates opacities for the dilation of small splats.
+    device : Device, optional
+        None renders with the float64 twins.
+
+    Returns
+    -------
+    render : (C, H, W, X)
+        X channels: D, 1 or D + 1, the depth last.
+    alpha : (C, H, W, 1)
+    meta : dict
+        means2d (C, N, 2), conics (C, N, 3), depths (C, N), opacities (C, N) with the compensation, radii (C, N, 2) px
+        as integers, 0 for what is not visible, tiles_per_gauss (C, N); width, height, tile_size, n_cameras.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit each other, naming the argument.
+
+    Notes
+    -----
+    For gradients see `clsplat.render`.
+    """
+    means, viewmats, Ks = (np.asarray(a, dtype=np.float64) for a in (means, viewmats, Ks))
+    colors = np.asarray(colors, dtype=np.float64)
+    n, cameras = len(means), len(viewmats)
+    _check_shape("viewmats", viewmats, (cameras, 4, 4))
+    _check_shape("Ks", Ks, (cameras, 3, 3))
+    if sh_degree is None:
+        colors = np.broadcast_to(colors, (cameras, *colors.shape)) if colors.ndim == 2 else colors
+        _check_shape("colors", colors, (cameras, n, colors.shape[-1] if colors.ndim else 0))
+        sh = np.zeros((n, 1, 3))
+        channels = colors.shape[2]
+    else:
+        sh, channels = colors, 3
+    with np.errstate(divide="ignore"):  # opacities 0 and 1, scales 0
+        gaussians = Gaussians(
+            means,
+            np.log(np.asarray(scales, dtype=np.float64)),
+            np.asarray(quats, dtype=np.float64),
+            logit(np.asarray(opacities, dtype=np.float64)),
+            sh,
+        ).validate()
+    if sh_degree is not None and not 0 <= sh_degree <= gaussians.sh_degree:
+        raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree} (what colors hold), found {sh_degree}")
+    if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
+        raise InputError(f"render_mode: expected RGB, D, ED, RGB+D or RGB+ED, found {render_mode!r}")
+    behind = np.zeros((cameras, channels)) if backgrounds is None else np.asarray(backgrounds, dtype=np.float64)
+    _check_shape("backgrounds", behind, (cameras, channels))
+
+    stage = stage_functions(device)
+    parameters = upload(device, gaussians) if n else gaussians
+    renders, alphas, metas = [], [], []
+    for i in range(cameras):
+        if n == 0:
+            raise InputError("means: expected at least one Gaussian, found none")
+        camera = Camera(viewmats[i], Ks[i, 0, 0], Ks[i, 1, 1], Ks[i, 0, 2], Ks[i, 1, 2], width, height)
+        splats = stage.project_fwd(parameters, camera, sh_degree or 0, antialiased=rasterize_mode == "antialiased")
+        bins = stage.bin_splats(splats, width, height, max(width, height) if device is None else tile_size)
+        values = colors[i] if sh_degree is None else download(splats.colors)
+        values = _with_depth(values, download(splats.depths), render_mode)
+        background = np.zeros(values.shape[1])
+        if "RGB" in render_mode:
+            background[:channels] = behind[i]
+        values = values if device is None else device.upload("colors", values)
+        image = stage.composite_fwd(splats._replace(colors=values), bins, background)
+        render, alpha = np.array(download(image.image)), download(image.alpha)[:, :, None]
+        if "ED" in render_mode:
+            render[:, :, -1:] = np.divide(render[:, :, -1:], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+        renders.append(render)
+        alphas.append(alpha)
+        order, first = download(bins.order), download(bins.first_slots).astype(np.int64)
+        tiles = np.empty(n, dtype=np.int64)
+        tiles[order] = np.diff(first)
+        meta = {name: download(getattr(splats, name)) for name in ("means2d", "conics", "depths", "opacities")}
+        metas.append(meta | {"radii": np.ceil(download(splats.extents)).astype(np.int32), "tiles_per_gauss": tiles})
+    stacked: dict[str, Any] = {name: np.stack([meta[name] for meta in metas]) for name in metas[0]}
+    stacked |= {"width": width, "height": height, "tile_size": tile_size, "n_cameras": cameras}
+    return np.stack(renders), np.stack(alphas), stacked
+
+
+def _with_depth(values: NDArray[Any], depths: NDArray[Any], render_mode: str) -> NDArray[Any]:
+    if render_mode == "RGB":
+        return values
+    if render_mode in ("D", "ED"):
+        return depths[:, None]
+    return np.concatenate([values, depths[:, None]], axis=1)
+
+
+def _check_shape(name: str, array: NDArray[Any], expected: tuple[int, ...]) -> None:
+    if array.shape != expected:
+        raise InputError(f"{name}: expected shape {expected}, found {array.shape}")
