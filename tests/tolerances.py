@@ -34,3 +34,20 @@ FLOAT |= {
     f"v_{name}": Tolerance(1e-3, 1e-4, "float32: for a needle the gradient by its covariance cancels along its axis")
     for name in ("means", "log_scales", "quats", "logit_opacities", "sh", "viewmat")
 }
+
+DOUBLE |= {
+    "image": Tolerance(1e-11, 1e-13, _REORDERED),
+    "alpha": Tolerance(1e-11, 1e-13, _REORDERED),
+    "v_means2d": Tolerance(1e-9, 1e-12, _CANCELS),
+    "v_conics": Tolerance(1e-9, 1e-12, _CANCELS),
+    "v_opacities": Tolerance(1e-9, 1e-12, _CANCELS),
+    "v_colors": Tolerance(1e-9, 1e-12, _CANCELS),
+}
+FLOAT |= {
+    "image": Tolerance(1e-5, 1e-6, "float32"),
+    "alpha": Tolerance(1e-5, 1e-6, "float32"),
+    "v_means2d": Tolerance(1e-3, 1e-5, "float32"),
+    "v_conics": Tolerance(1e-3, 1e-5, "float32"),
+    "v_opacities": Tolerance(1e-3, 1e-5, "float32"),
+    "v_colors": Tolerance(1e-3, 1e-5, "float32"),
+}

@@ -1,0 +1,304 @@
+"""Stage composite: both variants against the twin, against central differences, on degenerate input."""
+
+import numpy as np
+import pytest
+from tolerances import DOUBLE, FLOAT
+
+from clsplat import ops, reference
+from clsplat.constants import ALPHA_MAX, ALPHA_MIN, EXTENT_SLACK, TRANSMITTANCE_MIN
+from clsplat.stages import Bins, Image, SplatGrads, Splats
+from clsplat.testing import ambiguous_pixels, assert_matches, gradcheck, synthetic_scene
+
+TILE_SIZES = pytest.mark.parametrize("tile_size", [8, 16])
+CHANNELS = pytest.mark.parametrize("channels", [3, 4])
+BACKGROUND = (0.3, 0.6, 0.1, 0.0)
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def compositor(request):
+    """Kernel variant; each runs on every device."""
+    return request.param
+
+
+def make_splats(n, seed=0, *, width=37, height=29, channels=4, margin=0.0):
+    """Visible splats whose values are float32 numbers, and the image's size."""
+    gaussians, camera = synthetic_scene(n, seed, width=width, height=height, margin=margin)
+    splats = reference.project_fwd(gaussians, camera, 3, channels=channels)
+    return rounded(splats), width, height
+
+
+def rounded(splats):
+    return Splats(*(a.astype(np.float32).astype(np.float64) for a in splats))
+
+
+def with_extents(splats):
+    """The splats with the extents that belong to their conics and opacities."""
+    a, b, c = splats.conics.T
+    r2 = 2 * (np.log(splats.opacities / ALPHA_MIN) + EXTENT_SLACK)
+    variances = np.stack([c, a], axis=1) / (a * c - b * b)[:, None]
+    return splats._replace(extents=np.sqrt(r2[:, None] * variances))
+
+
+def handmade(means2d, cov, opacities, colors):
+    """Splats of one covariance, front to back."""
+    n = len(means2d)
+    conics = np.tile(np.linalg.inv(cov)[[0, 0, 1], [0, 1, 1]], (n, 1))
+    fields = (means2d, conics, 1 + np.arange(n), np.zeros((n, 2)), opacities, colors)
+    return with_extents(Splats(*(np.array(a, dtype=np.float64) for a in fields)))
+
+
+def on_device(device, splats, bins):
+    arrays = [device.upload("bins", a, np.uint32) for a in bins[:5]]
+    return Splats(*(device.upload("splats", a) for a in splats)), Bins(*arrays, *bins[5:])
+
+
+def forward(device, compositor, splats, bins, background):
+    image = ops.composite_fwd(device, *on_device(device, splats, bins), background, compositor=compositor)
+    return Image(*(a.get() for a in image))
+
+
+def backward(device, compositor, splats, bins, image, v_image):
+    images = [Image(*(device.upload("image", a) for a in i)) for i in (image, v_image)]
+    v = ops.composite_bwd(device, *on_device(device, splats, bins), *images, compositor=compositor)
+    return SplatGrads(*(a.get() for a in v))
+
+
+def random_grads(image, seed=0):
+    rng = np.random.default_rng(seed)
+    return Image(rng.normal(size=image.image.shape), rng.normal(size=image.alpha.shape))
+
+
+def brute_force(splats, width, height, background):
+    """Equation 3, pixel by pixel as it is written: no tiles, no boxes, no arrays of pixels."""
+    image, alphas = np.zeros((height, width, len(background))), np.zeros((height, width))
+    shown = [g for g in np.argsort(splats.depths, kind="stable") if splats.extents[g, 0] > 0]
+    for i in range(height):
+        for j in range(width):
+            transmittance = 1.0
+            for g in shown:
+                d = np.array([j + 0.5, i + 0.5]) - splats.means2d[g]
+                a, b, c = splats.conics[g]
+                alpha = min(ALPHA_MAX, splats.opacities[g] * np.exp(-0.5 * d @ [[a, b], [b, c]] @ d))
+                if alpha < ALPHA_MIN:
+                    continue
+                if transmittance * (1 - alpha) <= TRANSMITTANCE_MIN:
+                    break
+                image[i, j] += splats.colors[g] * alpha * transmittance
+                transmittance *= 1 - alpha
+            image[i, j] += transmittance * np.array(background)
+            alphas[i, j] = 1 - transmittance
+    return Image(image, alphas)
+
+
+def test_twin_matches_brute_force():
+    splats, width, height = make_splats(60, 1, width=19, height=13)
+    expected = brute_force(splats, width, height, BACKGROUND)
+    assert expected.alpha.max() > 0.9
+    for tile_size in (8, 16, 19):
+        image = reference.composite_fwd(splats, reference.bin_splats(splats, width, height, tile_size), BACKGROUND)
+        assert_matches("image", image.image, expected.image, DOUBLE)
+        assert_matches("alpha", image.alpha, expected.alpha, DOUBLE)
+
+
+@TILE_SIZES
+@CHANNELS
+def test_double_matches_twin(device64, compositor, tile_size, channels):
+    """300 splats in one to four tiles: more than a batch of the GPU variant, and pixels that stop early."""
+    splats, width, height = make_splats(300, 2, channels=channels)
+    assert not ambiguous_pixels(splats, width, height, margin=1e-9).any()
+    bins = reference.bin_splats(splats, width, height, tile_size)
+    assert np.diff(bins.tile_ranges).max() > 64
+    expected = reference.composite_fwd(splats, bins, BACKGROUND[:channels])
+    image = forward(device64, compositor, splats, bins, BACKGROUND[:channels])
+    assert_matches("image", image.image, expected.image, DOUBLE)
+    assert_matches("alpha", image.alpha, expected.alpha, DOUBLE)
+
+    v_image = random_grads(expected)
+    v_expected = reference.composite_bwd(splats, bins, expected, v_image)
+    v = backward(device64, compositor, splats, bins, expected, v_image)
+    for name, array in v_expected._asdict().items():
+        assert_matches(f"v_{name}", getattr(v, name), array, DOUBLE)
+
+
+@pytest.mark.parametrize(("tile_size", "channels"), [(16, 3), (8, 4)])
+def test_float_matches_twin(device, compositor, tile_size, channels):
+    splats, width, height = make_splats(400, 3, width=97, height=71, channels=channels)
+    bins = reference.bin_splats(splats, width, height, tile_size)
+    background = BACKGROUND[:channels]
+    expected = reference.composite_fwd(splats, bins, background)
+    image = forward(device, compositor, splats, bins, background)
+    band = ambiguous_pixels(splats, width, height, margin=1e-3)
+    assert 0 < band.mean() < 0.25, "a band this wide proves nothing"
+    assert_matches("image", image.image, expected.image, FLOAT, where=~band)
+    assert_matches("alpha", image.alpha, expected.alpha, FLOAT, where=~band)
+
+    # In the band one pair may flip: it moves a pixel by ALPHA_MIN or so of the splat's colour, either way.
+    flips = image.alpha[band] - expected.alpha[band]
+    assert np.abs(flips).max() < 1.1 * ALPHA_MIN
+    assert (np.abs(flips) > 1e-4).mean() < 0.01, "far fewer than the band's pixels flip"
+    assert abs(flips.sum()) < 4 * np.sqrt((flips**2).sum()) + 1e-5, "flips go one way"
+
+    # Pixels of the band pass no gradient, so that every other pair decides as the twin does.
+    v_image = random_grads(expected)
+    v_image.image[band], v_image.alpha[band] = 0, 0
+    v_expected = reference.composite_bwd(splats, bins, expected, v_image)
+    v = backward(device, compositor, splats, bins, image, v_image)
+    for name, array in v_expected._asdict().items():
+        assert_matches(f"v_{name}", getattr(v, name), array, FLOAT)
+
+
+def check_gradients(device, compositor, splats, width, height, tile_size=16):
+    """Central differences by everything that compositing reads, with gradients of the image and of alpha."""
+    channels = splats.colors.shape[1]
+    assert not ambiguous_pixels(splats, width, height, margin=1e-3).any()
+    bins = reference.bin_splats(splats, width, height, tile_size)
+    image = forward(device, compositor, splats, bins, BACKGROUND[:channels])
+    v_image = random_grads(image)
+
+    def scalar(**moved):
+        out = forward(device, compositor, splats._replace(**moved), bins, BACKGROUND[:channels])
+        return float(sum(((o - i) * v).sum() for o, i, v in zip(out, image, v_image, strict=True)))
+
+    v = backward(device, compositor, splats, bins, image, v_image)
+    gradcheck(scalar, {name: getattr(splats, name) for name in SplatGrads._fields}, v._asdict())
+    return image, v
+
+
+@pytest.mark.parametrize(("tile_size", "channels"), [(16, 3), (8, 4)])
+def test_central_differences(device64, compositor, tile_size, channels):
+    splats, width, height = make_splats(90, 4, channels=channels, margin=2e-3)
+    image, _ = check_gradients(device64, compositor, splats, width, height, tile_size)
+    assert image.alpha.max() > 0.95
+
+
+def clear_of_thresholds(draw, width, height):
+    """The first of the random splats that `draw` (seed) yields which keeps away from every threshold."""
+    for seed in range(1000):
+        splats = draw(np.random.default_rng(seed))
+        if not ambiguous_pixels(splats, width, height, margin=1e-3).any():
+            return splats
+    raise AssertionError("no seed keeps away from every threshold")
+
+
+def test_central_differences_where_alpha_saturates(device64, compositor):
+    """Splats with opacity exp(-sigma) > ALPHA_MAX around their centres: the clamp passes no gradient."""
+    width, height, opacities = 23, 19, [0.9999, 0.8, 1.0, 0.995]
+
+    def draw(rng):
+        means2d = rng.uniform(0.2, 0.8, (4, 2)) * [width, height]
+        return handmade(means2d, [[40, 8], [8, 30]], opacities, rng.uniform(size=(4, 4)))
+
+    splats = clear_of_thresholds(draw, width, height)
+    j, i = np.floor(splats.means2d[2]).astype(int)
+    d = np.array([j, i]) + 0.5 - splats.means2d[2]
+    a, b, c = splats.conics[2]
+    assert np.exp(-0.5 * d @ [[a, b], [b, c]] @ d) > ALPHA_MAX, "no pixel is saturated"
+    check_gradients(device64, compositor, splats, width, height)
+
+
+def test_central_differences_where_pixels_stop(device64, compositor):
+    width, height = 23, 19
+
+    def draw(rng):
+        means2d, opacities = rng.uniform(0.3, 0.7, (31, 2)) * [width, height], rng.uniform(0.6, 0.95, 31)
+        means2d[30] = width / 2, height / 2
+        splats = handmade(means2d, [[40, 4], [4, 30]], opacities, rng.uniform(size=(31, 4)))
+        splats.conics[30] = 1, 0, 1
+        return with_extents(splats)
+
+    splats = clear_of_thresholds(draw, width, height)
+    image, v = check_gradients(device64, compositor, splats, width, height)
+    assert (image.alpha > 1 - 2 * TRANSMITTANCE_MIN).any()
+    assert (v.colors[30] == 0).all(), "the last splat lies wholly behind pixels that stopped"
+
+
+def test_stop_and_skip_in_numbers(any_device, compositor):
+    """By hand: 0.95 leaves T = 1.25e-4 after three splats; the next would undercut 1e-4 and ends the pixel.
+
+    The splat between them is centred 40 px away, where its alpha is 3e-4.
+    """
+    splats = handmade(
+        [(0.5, 0.5), (0.5, 0.5), (40.5, 0.5), (0.5, 0.5), (0.5, 0.5), (0.5, 0.5)],
+        np.eye(2) * 100,
+        [0.95, 0.95, 0.95, 0.95, 0.95, 0.01],
+        [[1, 0, 0], [0, 1, 0], [9, 9, 9], [0, 0, 1], [9, 9, 9], [9, 9, 9]],
+    )
+    order = np.arange(6)
+    bins = Bins(order, np.array([[0, 6]]), order, np.arange(7), order, 16, 1, 1)
+    image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
+    weights = 0.95 * np.array([1, 0.05, 0.0025])
+    np.testing.assert_allclose(image.image[0, 0], weights, rtol=1e-5)
+    np.testing.assert_allclose(image.alpha, 1 - 1.25e-4, rtol=1e-6)
+    ones = Image(np.ones((1, 1, 3)), np.zeros((1, 1)))
+    v = backward(any_device, compositor, splats, bins, image, ones)
+    np.testing.assert_allclose(v.colors[:, 0], [*weights[:2], 0, weights[2], 0, 0], rtol=1e-5)
+    assert (v.opacities[[2, 4, 5]] == 0).all() and (v.means2d[[2, 4, 5]] == 0).all()
+
+
+def test_alpha_is_clamped(any_device, compositor):
+    splats = handmade([(0.5, 0.5)], np.eye(2), [1.0], [[1, 1, 1]])
+    one = np.zeros(1)
+    bins = Bins(one, np.array([[0, 1]]), one, np.arange(2), one, 16, 1, 1)
+    image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(image.alpha, ALPHA_MAX, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (4099, 3), (3, 1025), (17, 16)])
+def test_image_sizes(device64, compositor, width, height):
+    rng = np.random.default_rng(0)
+    n = 60
+    splats = handmade(
+        rng.uniform(0, 1, (n, 2)) * [width, height],
+        [[9, 2], [2, 4]],
+        rng.uniform(0.2, 0.9, n),
+        rng.uniform(size=(n, 4)),
+    )
+    bins = reference.bin_splats(splats, width, height, 16)
+    expected = reference.composite_fwd(splats, bins, BACKGROUND)
+    image = forward(device64, compositor, splats, bins, BACKGROUND)
+    assert_matches("image", image.image, expected.image, DOUBLE)
+    v_image = random_grads(expected)
+    v_expected = reference.composite_bwd(splats, bins, expected, v_image)
+    v = backward(device64, compositor, splats, bins, expected, v_image)
+    for name, array in v_expected._asdict().items():
+        assert_matches(f"v_{name}", getattr(v, name), array, DOUBLE)
+
+
+def test_nothing_visible(any_device, compositor):
+    splats = Splats(*(np.zeros(s) for s in ((5, 2), (5, 3), (5,), (5, 2), (5,), (5, 4))))
+    uploaded = Splats(*(any_device.upload("splats", a) for a in splats))
+    bins = ops.bin_splats(any_device, uploaded, 20, 10, 16)
+    image = ops.composite_fwd(any_device, uploaded, bins, BACKGROUND, compositor=compositor)
+    np.testing.assert_array_equal(image.image.get(), np.tile(np.array(BACKGROUND, any_device.real), (10, 20, 1)))
+    np.testing.assert_array_equal(image.alpha.get(), np.zeros((10, 20)))
+    v = ops.composite_bwd(any_device, uploaded, bins, image, image, compositor=compositor)
+    for name, array in v._asdict().items():
+        assert (array.get() == 0).all(), name
+
+
+def test_negative_sigma_is_skipped(any_device, compositor):
+    """A conic that rounding made indefinite: exp(-sigma) would grow without bound along its axis."""
+    splats = handmade([(8.0, 8.0)], np.eye(2), [0.5], [[1, 1, 1]])._replace(conics=np.array([[1.0, 1.5, 1.0]]))
+    one = np.zeros(1)
+    bins = Bins(one, np.array([[0, 1]]), one, np.arange(2), one, 16, 16, 16)
+    image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
+    i, j = np.indices((16, 16)) + 0.5 - 8
+    assert (image.alpha[i * j < 0][np.abs(i + j)[i * j < 0] < 1] == 0).all()
+    assert 0 < image.alpha.max() <= 0.5
+    v = backward(any_device, compositor, splats, bins, image, random_grads(image))
+    assert all(np.isfinite(a).all() for a in v)
+
+
+def test_same_bits_twice_and_for_every_tiling(device, compositor):
+    """Centres on a grid of 1/256 px make every distance to a pixel exact, whichever tile it is counted from."""
+    splats, width, height = make_splats(200, 6)
+    splats = splats._replace(means2d=np.round(splats.means2d * 256) / 256)
+    bins = {t: reference.bin_splats(splats, width, height, t) for t in (8, 16)}
+    images = [forward(device, compositor, splats, bins[t], BACKGROUND) for t in (16, 16, 8)]
+    for image in images[1:]:
+        np.testing.assert_array_equal(image.image, images[0].image)
+        np.testing.assert_array_equal(image.alpha, images[0].alpha)
+    v_image = random_grads(images[0])
+    v = [backward(device, compositor, splats, bins[16], images[0], v_image) for _ in range(2)]
+    for name in SplatGrads._fields:
+        np.testing.assert_array_equal(getattr(v[0], name), getattr(v[1], name), err_msg=name)
