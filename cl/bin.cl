@@ -37,9 +37,10 @@ inline uint walk_tiles(uint g, int width, int height, const __global real *means
     const int2 rows = pixels_between(centre.y - extent.y, centre.y + extent.y, height);
     uint count = 0;
     for (int ty = rows.x / TILE; ty * TILE <= rows.y; ++ty) {
-        // Distances of the first and the last row of pixel centres in this row of tiles.
+        // Distances of the first and the last row of pixel centres in this row of tiles; the image may cut it off.
         const real lo = ty * TILE + (real)0.5 - centre.y;
-        const real2 range = ellipse_range(conic, r2, extent, lo, lo + TILE - 1);
+        const real hi = min((ty + 1) * TILE, height) - (real)0.5 - centre.y;
+        const real2 range = ellipse_range(conic, r2, extent, lo, hi);
         const int2 columns = pixels_between(centre.x + range.x, centre.x + range.y, width);
         if (range.x > range.y || columns.x > columns.y)
             continue;

@@ -40,7 +40,7 @@ def _tiles_of(splats: Splats, g: int, width: int, height: int, tile_size: int) -
     cells = []
     for ty in range(rows[0] // tile_size, rows[1] // tile_size + 1):
         lo = max(ty * tile_size + 0.5 - my, -ey)
-        hi = min(ty * tile_size + 0.5 - my + tile_size - 1, ey)
+        hi = min(min((ty + 1) * tile_size, height) - 0.5 - my, ey)
         if lo > hi:
             continue
         # dx is extreme at dy = -+(b/c) ex, or at the nearer end of [lo, hi].
