@@ -52,8 +52,9 @@ def constants_table() -> str:
     body = ast.parse(inspect.getsource(constants)).body
     rows, names = [_row("constant", "value", "reason and source"), HEADER_RULE * 3 + "|"], []
     for statement, following in zip(body, [*body[1:], None], strict=True):
-        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
-            name = statement.targets[0].id
+        target = statement.targets[0] if isinstance(statement, ast.Assign) else getattr(statement, "target", None)
+        if isinstance(target, ast.Name):
+            name = target.id
             if not name.startswith("_"):
                 names.append(name)
                 text = _docstring(following)
