@@ -125,7 +125,7 @@ class Device:
         self.queue = cl.CommandQueue(self.context)
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self.queue))
         self._kernels: dict[tuple[Any, ...], cl.Kernel] = {}
-        self._scratch: dict[tuple[str, int], cl.array.Array] = {}
+        self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}
 
     @property
     def label(self) -> str:
@@ -163,12 +163,18 @@ class Device:
                 "use fewer Gaussians or a smaller image (--downscale)"
             ) from error
 
-    def scratch(self, what: str, size: int) -> cl.array.Array:
-        """Flat array of reals that lives as long as the device; zero where no kernel has written since."""
-        if (what, size) not in self._scratch:
-            self._scratch[what, size] = self.empty(what, size)
-            self._scratch[what, size].fill(0)
-        return self._scratch[what, size]
+    def scratch(self, what: str, size: int, layout: Any = None) -> cl.array.Array:
+        """The flat array of reals named `what`, kept between calls.
+
+        Zero where no kernel has written since `size` or `layout` last changed.
+        """
+        key, array = self._scratch.get(what, (None, None))
+        if key != (size, layout):
+            self._scratch.pop(what, None)  # before its successor is allocated
+            array = self.empty(what, size)
+            array.fill(0)
+            self._scratch[what] = (size, layout), array
+        return array
 
     def upload(self, what: str, array: Any, dtype: DTypeLike | None = None) -> cl.array.Array:
         """Copy of a host array on the device, converted to `dtype` (default: real)."""

@@ -40,13 +40,11 @@ def l1_ssim(
         "RADIUS": RADIUS,
     }
     plane = 3 * (height + 2 * RADIUS) * (segments + 2) * SEGMENT
-    # The planes' margins stand for the window's zero padding: no kernel writes them.
-    x, y = device.scratch("loss image", plane), device.scratch("loss photo", plane)
-    moments, derivatives = (
-        device.scratch("loss moments", 5 * plane),
-        device.scratch("loss derivatives", 3 * plane),
+    # The planes' margins stand for the window's zero padding: no kernel writes them, for this size of image.
+    x, y, moments, derivatives, blurred = (
+        device.scratch(f"loss {what}", planes * plane, (width, height))
+        for what, planes in (("image", 1), ("photo", 1), ("moments", 5), ("derivatives", 3), ("blurred", 3))
     )
-    blurred = device.scratch("loss derivatives, blurred", 3 * plane)
     ssim_sums, l1_sums = (device.empty("loss sums", (3, height, segments)) for _ in range(2))
     v_image = device.empty("v_image", (height, width, 3))
     masked = [int(mask is not None), photo if mask is None else mask]
