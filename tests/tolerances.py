@@ -51,3 +51,12 @@ FLOAT |= {
     "v_opacities": Tolerance(1e-3, 1e-5, "float32"),
     "v_colors": Tolerance(1e-3, 1e-5, "float32"),
 }
+
+DOUBLE |= {
+    "loss": Tolerance(1e-12, 0, _REORDERED),
+    "v_image": Tolerance(1e-10, 1e-12, _REORDERED),
+}
+FLOAT |= {
+    "loss": Tolerance(1e-5, 0, "float32"),
+    "v_image": Tolerance(1e-3, 1e-4, "float32"),
+}
