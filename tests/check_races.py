@@ -1,0 +1,159 @@
+"""The kernels under Oclgrind, which reports data races, divergent barriers and accesses out of bounds.
+
+Run by `make check-races`; plain pytest leaves this file out, since a simulator is slow and few have it. Each case
+runs in a process of its own under Oclgrind and checks its results against the twin: what was not run proves nothing.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clsplat
+from clsplat import ops, reference
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig
+from clsplat.device import Device
+from clsplat.gaussians import Gaussians
+from clsplat.render import render
+
+RACES = """
+__kernel void race(__global int *x) {
+    __local int last;
+    last = get_local_id(0);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    x[get_global_id(0)] = last;
+}
+__kernel void beyond(__global int *x) {
+    x[get_global_id(0) + 1] = 0;
+}
+__kernel void divergent(__global int *x) {
+    if (get_local_id(0) < 3)
+        barrier(CLK_LOCAL_MEM_FENCE);
+    x[get_global_id(0)] = 0;
+}
+"""
+
+
+def device_like_a_gpu():
+    """Oclgrind's device in double, configured like a GPU.
+
+    Double, because Oclgrind ignores -cl-single-precision-constant: float's literals would not be of type real.
+    """
+    device = Device(real=np.float64)
+    assert "oclgrind" in device.label.lower(), f"expected Oclgrind's device, found {device.label}"
+    device.is_cpu = False  # Oclgrind says that it is of every type
+    # Memory pools round sizes up, and what lies beyond an array but within its block would not be reported.
+    device._pool = cl.tools.ImmediateAllocator(device.queue)
+    return device
+
+
+def control(device):
+    """Kernels with the three faults, so that silence means something."""
+    program = cl.Program(device.context, RACES).build()
+    x = device.empty("x", 8, np.int32)
+    for kernel in program.all_kernels():
+        kernel(device.queue, (8,), (8,), x.data)
+    device.queue.finish()
+
+
+def sort(device):
+    rng = np.random.default_rng(0)
+    for n, dtype, method in [(1000, np.uint32, "bitonic"), (77, np.uint64, "bitonic"), (1500, np.uint32, "radix")]:
+        keys = rng.integers(0, 200, n).astype(dtype)
+        _, order = ops.argsort(device, device.upload("keys", keys, dtype), 8, method)
+        np.testing.assert_array_equal(order.get(), np.argsort(keys, kind="stable"))
+
+
+def scan(device):
+    # 9000 values exceed the 8192 chunks: these have two or none.
+    for n in (1, 63, 9000):
+        values = np.random.default_rng(n).integers(0, 9, n).astype(np.uint32)
+        sums, total = ops.exclusive_scan(device, device.upload("values", values, np.uint32))
+        np.testing.assert_array_equal(sums.get(), np.concatenate([[0], np.cumsum(values)]))
+        assert total == values.sum()
+
+
+def loss(device):
+    rng = np.random.default_rng(0)
+    image, photo = rng.uniform(0, 1, (23, 35, 3)), rng.integers(0, 256, (23, 35, 3), dtype=np.uint8)
+    mask = rng.integers(0, 2, (23, 35), dtype=np.uint8)
+    arrays = [device.upload("image", a, a.dtype) for a in (image, photo, mask)]
+    value, v_image = ops.l1_ssim(device, *arrays[:2], 0.2, arrays[2])
+    expected_value, expected_v_image = reference.l1_ssim(image, photo, 0.2, mask)
+    np.testing.assert_allclose(value, expected_value, rtol=1e-12)
+    np.testing.assert_allclose(v_image.get(), expected_v_image, atol=1e-12 * np.abs(expected_v_image).max())
+
+
+def scene(n, opacity_logit, scale):
+    rng = np.random.default_rng(n)
+    return Gaussians(
+        rng.normal([0, 0, 4], 0.5, (n, 3)),
+        np.log(scale * rng.uniform(0.03, 0.2, (n, 3))),
+        rng.normal(size=(n, 4)),
+        rng.normal(opacity_logit, 1, n),
+        rng.normal(0, 0.3, (n, 4, 3)),
+    ).astype(np.float32)
+
+
+def pipeline(device, compositor, tile_size):
+    """Every stage, forward and backward: translucent splats, and opaque ones that stop early; lists of none to over
+    100, the longest in tiles that the image cuts off."""
+    camera = Camera(np.eye(4), 20, 20, 34, 18, 37, 21)
+    config = RenderConfig(tile_size=tile_size, compositor=compositor)
+    rng = np.random.default_rng(0)
+    v = rng.normal(size=(21, 37, 3))
+    for opacity_logit, scale in ((-2, 1), (5, 3)):
+        gaussians = scene(160, opacity_logit, scale)
+        found, expected = (render(gaussians, camera, config, d, background=(0.1, 0.5, 0.9)) for d in (device, None))
+        np.testing.assert_allclose(found.rgb, expected.rgb, atol=1e-12)
+        v_found, v_expected = (r.backward(v, viewmat_grad=True) for r in (found, expected))
+        for name, array in v_expected.gaussians.arrays().items():
+            atol = 1e-10 * np.abs(array).max()
+            np.testing.assert_allclose(v_found.gaussians.arrays()[name], array, atol=atol, rtol=1e-9)
+        np.testing.assert_allclose(v_found.viewmat, v_expected.viewmat, rtol=1e-7)
+
+
+CASES = {
+    "control": control,
+    "sort": sort,
+    "scan": scan,
+    "loss": loss,
+    "gpu-8": lambda device: pipeline(device, "gpu", 8),
+    "gpu-16": lambda device: pipeline(device, "gpu", 16),
+    "cpu-16": lambda device: pipeline(device, "cpu", 16),
+}
+
+
+def run_under_oclgrind(case, log):
+    """What Oclgrind reports about a case."""
+    oclgrind = shutil.which("oclgrind")
+    if oclgrind is None:
+        pytest.skip("oclgrind is missing: install it (Debian: apt install oclgrind) to check the kernels for races")
+    package = str(Path(clsplat.__file__).resolve().parents[1])
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([package, os.environ.get("PYTHONPATH", "")])}
+    command = [oclgrind, "--data-races", "--log", str(log), sys.executable, __file__, case]
+    result = subprocess.run(command, env=env, capture_output=True, text=True, timeout=600)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return log.read_text() if log.exists() else ""
+
+
+def test_oclgrind_finds_planted_faults(tmp_path):
+    report = run_under_oclgrind("control", tmp_path / "log")
+    for fault in ("data race at local memory", "Invalid write", "Work-group divergence"):
+        assert fault in report
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case != "control"])
+def test_no_faults(case, tmp_path):
+    report = run_under_oclgrind(case, tmp_path / "log")
+    assert not report.strip(), report[:4000]
+
+
+if __name__ == "__main__":
+    CASES[sys.argv[1]](device_like_a_gpu())
