@@ -36,9 +36,10 @@ class Moments:
         return moved
 
 
-def sh_degree_at(iteration: int, config: OptimConfig, stored: int) -> int:
-    """Degree of the spherical harmonics that is rendered and trained in an iteration, counted from 1."""
-    return min(stored, (iteration - 1) // config.sh_degree_every)
+def sh_degree_at(iteration: int, every: int, stored: int) -> int:
+    """Degree of the spherical harmonics that is rendered and trained in an iteration, counted from 1: one more after
+    `every` iterations, up to the degree that is stored."""
+    return min(stored, (iteration - 1) // every)
 
 
 def learning_rates(iteration: int, iterations: int, extent: float, config: OptimConfig) -> dict[str, float]:

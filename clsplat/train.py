@@ -139,7 +139,7 @@ def train(
 def step(state: State, iteration: int, view: View, photos: _Photos, config: TrainConfig, device: "Device") -> float:
     """One iteration: render, compare, differentiate, update, densify. Changes `state`, returns the loss."""
     gaussians, camera = state.gaussians, view.camera
-    sh_degree = sh_degree_at(iteration, config.optim, gaussians.sh_degree)
+    sh_degree = sh_degree_at(iteration, config.shortened(config.optim.sh_degree_every), gaussians.sh_degree)
     photo, mask = photos(view)
 
     run = forward(

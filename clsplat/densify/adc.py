@@ -27,6 +27,7 @@ class Adc:
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         self.config, self.seed, self.extent = config.adc, config.seed, extent
+        self.start = config.shortened(config.adc.start)
         self.stop = round(config.adc.stop_fraction * config.iterations)
         self.statistics: dict[str, Array] = {}
         self._clear(n)
@@ -46,7 +47,7 @@ class Adc:
         if iteration >= self.stop:
             return None
         edit = None
-        if iteration >= c.start and iteration % c.every == 0:
+        if iteration >= self.start and iteration % c.every == 0:
             edit = self._densify(iteration, gaussians)
             edit = self._prune(iteration, edit)
             self._clear(len(edit.rows))

@@ -1,0 +1,147 @@
+"""Every strategy keeps rows, moments and statistics in step; ADC does what the paper says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.config import AdcConfig, TrainConfig
+from clsplat.densify import STRATEGIES
+from clsplat.densify.adc import CHILD_SHRINK, Adc
+from clsplat.gaussians import Gaussians, logit
+from clsplat.testing import synthetic_scene
+
+N = 200
+CONFIG = TrainConfig(iterations=2000, adc=AdcConfig(start=350))
+SIZE = (64, 48)
+
+
+def scene() -> Gaussians:
+    gaussians = synthetic_scene(N, seed=5)[0].astype(np.float32)
+    gaussians.log_scales[: N // 2] = np.log(0.001)
+    gaussians.log_scales[N // 2 :] = np.log([0.5, 0.1, 0.05])
+    gaussians.logit_opacities[:] = logit(np.float32(0.5))
+    return gaussians
+
+
+def observed(config: TrainConfig = CONFIG, rows: slice = slice(0, N), strategy: str = "adc") -> tuple[Adc, Gaussians]:
+    """A strategy that has seen a gradient of twice the threshold on `rows` of the scene."""
+    result = STRATEGIES[strategy](config, 1.0, N)
+    v_means2d = np.zeros((N, 2), np.float32)
+    v_means2d[rows, 0] = 2 * config.adc.grad_threshold / (SIZE[0] / 2)
+    result.observe(v_means2d, np.ones(N, bool), *SIZE)
+    return result, scene()
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("iteration", [100, 600, 900])
+def test_edits_are_consistent_capped_and_repeatable(strategy: str, iteration: int) -> None:
+    cap = N + 37
+    config = replace(CONFIG, adc=replace(CONFIG.adc, max_gaussians=cap, reset_every=300), strategy=strategy)
+    runs = []
+    for _ in range(2):
+        instance, gaussians = observed(config, strategy=strategy)
+        before = gaussians.astype(np.float32)
+        edit = instance.edit(iteration, gaussians)
+        assert edit is not None
+        assert all((a == b).all() for a, b in zip(before.arrays().values(), gaussians.arrays().values(), strict=True))
+        m = len(edit.gaussians.validate())
+        assert 0 < m <= cap
+        assert edit.rows.shape == edit.fresh.shape == (m,)
+        assert all(len(s) == m for s in instance.statistics.values())
+        assert all(np.isfinite(a).all() and a.dtype == np.float32 for a in edit.gaussians.arrays().values())
+        runs.append(edit)
+    assert all(
+        (a == b).all()
+        for a, b in zip(runs[0].gaussians.arrays().values(), runs[1].gaussians.arrays().values(), strict=True)
+    )
+
+
+def test_small_gaussians_are_cloned_and_large_ones_split() -> None:
+    strategy, gaussians = observed(rows=slice(N // 2 - 1, N // 2 + 1))
+    edit = strategy.edit(100, gaussians)
+    assert edit is not None
+    assert len(edit.rows) == N + 2
+    small, large = N // 2 - 1, N // 2
+    clones = np.flatnonzero(edit.rows == small)
+    assert len(clones) == 2
+    assert (edit.gaussians.means[clones] == gaussians.means[small]).all()
+    assert edit.fresh[clones].tolist() == [False, True]
+    children = np.flatnonzero(edit.rows == large)
+    assert len(children) == 2
+    assert edit.fresh[children].all()
+    np.testing.assert_allclose(
+        edit.gaussians.scales[children], gaussians.scales[[large] * 2] / CHILD_SHRINK, rtol=1e-6
+    )
+    # Positions are drawn from the parent: different from it, and within 6 standard deviations of the largest axis.
+    offsets = edit.gaussians.means[children] - gaussians.means[large]
+    assert (np.abs(offsets) > 0).any(axis=1).all()
+    assert np.abs(offsets).max() < 6 * 0.5
+
+
+def test_splits_are_distributed_as_the_parent() -> None:
+    gaussians = scene().take(np.full(4000, N - 1))
+    gaussians.quats[:] = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]  # a quarter turn about z: x goes to y
+    strategy = Adc(CONFIG, 1.0, len(gaussians))
+    strategy.observe(np.full((4000, 2), 1.0), np.ones(4000, bool), *SIZE)
+    edit = strategy.edit(100, gaussians)
+    assert edit is not None
+    spread = (edit.gaussians.means - gaussians.means[0]).std(axis=0)
+    # 8000 draws: the standard deviation is known to 1/sqrt(16000) = 0.8 %, four of which are 3 %.
+    np.testing.assert_allclose(spread, [0.1, 0.5, 0.05], rtol=0.03)
+
+
+def test_transparent_gaussians_go_but_never_all() -> None:
+    strategy, gaussians = observed(rows=slice(0, 0))
+    gaussians.logit_opacities[:3] = logit(np.float32(0.004))
+    edit = strategy.edit(100, gaussians)
+    assert edit is not None
+    assert edit.rows.tolist() == list(range(3, N))
+    strategy, gaussians = observed(rows=slice(0, 0))
+    gaussians.logit_opacities[:] = logit(np.float32(0.001)) + np.linspace(0, 1, N, dtype=np.float32)
+    edit = strategy.edit(100, gaussians)
+    assert edit is not None
+    assert edit.rows.tolist() == list(range(N - CONFIG.adc.min_gaussians, N))
+
+
+def test_huge_gaussians_go_only_after_a_reset() -> None:
+    for iteration, remaining in ((100, N), (400, N // 2)):
+        config = replace(CONFIG, adc=replace(CONFIG.adc, reset_every=300))
+        strategy, gaussians = observed(config, rows=slice(0, 0))
+        edit = strategy.edit(iteration, gaussians)
+        assert edit is not None
+        assert len(edit.rows) == remaining
+
+
+def test_the_cap_takes_the_largest_gradients_first() -> None:
+    config = replace(CONFIG, adc=replace(CONFIG.adc, max_gaussians=N + 2))
+    strategy, gaussians = observed(config)
+    strategy.statistics["grad_sum"][[7, 11]] *= 3
+    edit = strategy.edit(100, gaussians)
+    assert edit is not None
+    assert sorted(edit.rows[edit.fresh].tolist()) == [7, 11]
+
+
+def test_reset_lowers_opacities_and_clears_their_moments() -> None:
+    config = replace(CONFIG, adc=replace(CONFIG.adc, reset_every=150))
+    strategy, gaussians = observed(config)
+    edit = strategy.edit(150, gaussians)
+    assert edit is not None
+    assert edit.reset_opacities
+    np.testing.assert_allclose(edit.gaussians.opacities, config.adc.reset_opacity, rtol=1e-5)
+    # Nothing else changed: 150 is no multiple of `every`.
+    assert (edit.rows == np.arange(N)).all()
+
+
+def test_nothing_changes_outside_its_time() -> None:
+    strategy, gaussians = observed()
+    assert strategy.edit(99, gaussians) is None
+    assert strategy.edit(50, gaussians) is None
+    assert strategy.edit(1000, gaussians) is None  # half of the iterations
+
+
+def test_gradients_count_in_normalised_device_coordinates() -> None:
+    strategy = Adc(CONFIG, 1.0, 2)
+    strategy.observe(np.array([[3.0, 0.0], [0.0, 4.0]]), np.array([True, False]), 20, 10)
+    assert strategy.statistics["grad_sum"].tolist() == [30, 20]
+    assert strategy.statistics["seen"].tolist() == [1, 0]

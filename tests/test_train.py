@@ -1,0 +1,170 @@
+"""Training on a tiny scene: it learns, repeats to the bit, and resumes to the same bits."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.camera import Camera
+from clsplat.checkpoint import load_arrays, log_file, save_arrays
+from clsplat.config import AdcConfig, InitConfig, OptimConfig, TrainConfig
+from clsplat.device import Device
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.io import save_gaussians
+from clsplat.metrics import psnr, to_uint8
+from clsplat.render import render
+from clsplat.scene import Scene, View
+from clsplat.testing import synthetic_scene
+from clsplat.train import train, view_at
+
+SIZE = (40, 32)
+CONFIG = TrainConfig(
+    iterations=60,
+    checkpoint_every=25,
+    init=InitConfig(sh_degree=1),
+    optim=OptimConfig(sh_degree_every=2333),
+    # Small enough to see a clone, a split and a reset within 60 iterations.
+    adc=AdcConfig(every=10, reset_every=30, stop_fraction=0.8, grad_threshold=1e-5),
+)
+
+
+def cameras(count: int) -> list[Camera]:
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return [
+        Camera.look_at([3 * np.sin(a), -1 + 0.3 * np.sin(3 * a), 3 * np.cos(a)], [0, 0, 0], [0, -1, 0], 45, *SIZE)
+        for a in angles
+    ]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """Photos of known Gaussians, rendered by the twins."""
+    rng = np.random.default_rng(0)
+    truth = synthetic_scene(40, seed=4)[0]
+    truth.means[:] = rng.uniform(-0.6, 0.6, truth.means.shape)
+    truth.log_scales[:] = np.log(0.15)
+    truth.logit_opacities[:] = 1.5
+    truth.sh[:, 0] = rng.uniform(-1, 1.5, (40, 3))
+    views = [View(f"{i}.png", c, to_uint8(render(truth, c).rgb)) for i, c in enumerate(cameras(7))]
+    points = truth.means + rng.normal(0, 0.05, truth.means.shape)
+    return Scene(views[:6], views[6:], points.astype(np.float64), np.full(points.shape, 128, np.uint8))
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    return all(x.tobytes() == y.tobytes() for x, y in zip(a.arrays().values(), b.arrays().values(), strict=True))
+
+
+def held_out(gaussians: Gaussians, scene: Scene, device: Device) -> float:
+    view = scene.test[0]
+    return psnr(render(gaussians, view.camera, device=device).rgb, view.image)
+
+
+def test_it_learns_an_unseen_view(scene: Scene, device: Device, tmp_path: Path) -> None:
+    config = replace(CONFIG, iterations=300, adc=replace(CONFIG.adc, grad_threshold=2e-4, reset_every=1000))
+    before = held_out(train(scene, replace(config, iterations=1), device, tmp_path), scene, device)
+    after = held_out(train(scene, config, device, tmp_path), scene, device)
+    # Measured: 15.6 dB before, 27.5 dB after; without the gradient of any one field it stays below 23 dB.
+    assert after > 25
+    assert after - before > 8
+
+
+def test_two_runs_are_the_same_file(scene: Scene, device: Device, tmp_path: Path) -> None:
+    for name in ("a.ply", "b.ply"):
+        save_gaussians(tmp_path / name, train(scene, CONFIG, device, tmp_path))
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    other = train(scene, replace(CONFIG, seed=1), device, tmp_path)
+    save_gaussians(tmp_path / "c.ply", other)
+    assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "c.ply").read_bytes()
+
+
+@pytest.mark.parametrize("killed_at", [26, 49, 51])
+def test_a_killed_run_resumes_to_the_same_bits(scene: Scene, device: Device, tmp_path: Path, killed_at: int) -> None:
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    whole.mkdir()
+    broken.mkdir()
+    expected = train(scene, CONFIG, device, whole)
+
+    class Killed(Exception):
+        pass
+
+    def kill(record: dict[str, object]) -> None:
+        if record["iteration"] == killed_at:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(scene, CONFIG, device, broken, progress=kill)
+    first: list[object] = []
+    resumed = train(scene, CONFIG, device, broken, resume=True, progress=lambda r: first.append(r["iteration"]))
+    assert first[0] == 25 * (killed_at // 25) + 1
+    assert same(resumed, expected)
+
+    def lines(folder: Path) -> list[dict[str, float]]:
+        records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+        return [{k: v for k, v in record.items() if k in ("iteration", "num_gaussians")} for record in records]
+
+    assert lines(broken) == lines(whole)
+
+
+def test_resume_refuses_what_would_not_continue(scene: Scene, device: Device, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"checkpoint\.npz: expected a checkpoint to resume from, found none"):
+        train(scene, CONFIG, device, tmp_path, resume=True)
+    train(scene, CONFIG, device, tmp_path)
+    with pytest.raises(InputError, match="found other optim"):
+        train(scene, replace(CONFIG, optim=OptimConfig(means_lr=1.0)), device, tmp_path, resume=True)
+    data = (tmp_path / "checkpoint.npz").read_bytes()
+    (tmp_path / "checkpoint.npz").write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match=r"checkpoint\.npz: .* found a damaged file"):
+        train(scene, CONFIG, device, tmp_path, resume=True)
+
+
+def test_masked_pixels_do_not_matter(scene: Scene, device: Device, tmp_path: Path) -> None:
+    mask = np.ones((SIZE[1], SIZE[0]), bool)
+    mask[:, :20] = False
+
+    def masked(fill: int) -> Scene:
+        views = [
+            replace(v, image=np.where(mask[:, :, None], v.image, fill).astype(np.uint8), mask=mask)
+            for v in scene.train
+        ]
+        return replace(scene, train=views)
+
+    config = replace(CONFIG, iterations=12)
+    results = [train(masked(fill), config, device, tmp_path) for fill in (0, 255)]
+    assert same(*results)
+    assert not same(results[0], train(scene, config, device, tmp_path))
+
+
+def test_every_epoch_takes_every_view_once(scene: Scene) -> None:
+    names = [view_at(i, scene.train, seed=3).name for i in range(1, 13)]
+    assert sorted(names[:6]) == sorted(names[6:]) == [v.name for v in scene.train]
+    assert names[:6] != names[6:]
+
+
+def test_a_failed_write_leaves_the_last_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "checkpoint.npz"
+    save_arrays(path, {"x": np.arange(3)})
+
+    def full(file: object, **arrays: object) -> None:
+        file.write(b"half")  # type: ignore[attr-defined]
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(InputError, match="No space left"):
+        save_arrays(path, {"x": np.arange(4)})
+    assert load_arrays(path)["x"].tolist() == [0, 1, 2]
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.npz"]
+
+
+def test_the_log_drops_what_a_resumed_run_repeats(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_text('{"iteration": 10}\n{"iteration": 20}\n{"iteration": 30}\n{"iter')
+    with log_file(path, 20) as append:
+        append({"iteration": 30, "again": 1})
+    assert [json.loads(line) for line in path.read_text().splitlines()] == [
+        {"iteration": 10},
+        {"iteration": 20},
+        {"iteration": 30, "again": 1},
+    ]
