@@ -118,13 +118,13 @@ class Device:
 
     def __init__(self, cl_device: cl.Device | None = None, real: DTypeLike = np.float32):
         self.cl_device = cl_device if cl_device is not None else select_device()
-        self.real = np.dtype(real)
+        self.real: np.dtype[Any] = np.dtype(real)
         if self.real == np.float64 and "cl_khr_fp64" not in self.cl_device.extensions:
             raise DeviceError(f"{self.label}: expected a device with double precision (cl_khr_fp64) for float64")
         self.context = cl.Context([self.cl_device])
         self.queue = cl.CommandQueue(self.context)
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self.queue))
-        self._kernels: dict[tuple[Any, ...], cl.Kernel] = {}
+        self._kernels: dict[tuple[str, tuple[Any, ...]], cl.Kernel] = {}
         self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}
 
     @property
@@ -168,13 +168,12 @@ class Device:
 
         Zero where no kernel has written since `size` or `layout` last changed.
         """
-        key, array = self._scratch.get(what, (None, None))
-        if key != (size, layout):
-            self._scratch.pop(what, None)  # before its successor is allocated
-            array = self.empty(what, size)
-            array.fill(0)
-            self._scratch[what] = (size, layout), array
-        return array
+        if what in self._scratch and self._scratch[what][0] != (size, layout):
+            del self._scratch[what]
+        if what not in self._scratch:
+            self._scratch[what] = (size, layout), self.empty(what, size)
+            self._scratch[what][1].fill(0)
+        return self._scratch[what][1]
 
     def upload(self, what: str, array: Any, dtype: DTypeLike | None = None) -> cl.array.Array:
         """Copy of a host array on the device, converted to `dtype` (default: real)."""
@@ -197,13 +196,12 @@ class Device:
 
         Arguments are device arrays, Python ints (passed as 32 bits), floats (as real) or NumPy scalars and structs.
         """
-        key = (stage, kernel, *sorted((defines or {}).items()))
-        if key not in self._kernels:
-            program = self._build(stage, defines or {})
-            for built in program.all_kernels():
-                self._kernels[(stage, built.function_name, *key[2:])] = built
+        program = (stage, *sorted((defines or {}).items()))
+        if (kernel, program) not in self._kernels:
+            for built in self.program(stage, defines or {}).all_kernels():
+                self._kernels[built.function_name, program] = built
         converted = [self._argument(a) for a in arguments]
-        self._kernels[key](self.queue, global_size, group, *converted)
+        self._kernels[kernel, program](self.queue, global_size, group, *converted)
 
     def _argument(self, value: Any) -> Any:
         if isinstance(value, cl.array.Array):
@@ -214,7 +212,8 @@ class Device:
             return self.real.type(value)
         return value
 
-    def _build(self, stage: str, defines: dict[str, Any]) -> cl.Program:
+    def program(self, stage: str, defines: dict[str, Any]) -> cl.Program:
+        """Build cl/`stage`.cl with `defines`, the model's constants and the device's real type."""
         options = list(BUILD_OPTIONS)
         if self.real == np.float64:
             options.append("-DUSE_DOUBLE")

@@ -103,7 +103,8 @@ def upload(device: "Device | None", gaussians: Gaussians) -> Gaussians:
     """The Gaussians on the device; as float64 for None."""
     if device is None:
         return gaussians.astype(np.float64)
-    return Gaussians(**{name: device.upload(name, array) for name, array in gaussians.arrays().items()})
+    arrays: dict[str, Any] = {name: device.upload(name, array) for name, array in gaussians.arrays().items()}
+    return Gaussians(**arrays)
 
 
 def download(array: Any) -> Array:

@@ -90,13 +90,8 @@ def project_bwd(
         Gradient with respect to each entry of the viewmat as an independent variable, its last row 0.
     """
     n, g = len(gaussians), gaussians
-    v = Gaussians(
-        device.empty("v_means", (n, 3)),
-        device.empty("v_log_scales", (n, 3)),
-        device.empty("v_quats", (n, 4)),
-        device.empty("v_logit_opacities", n),
-        device.empty("v_sh", g.sh.shape),
-    )
+    empty: dict[str, Any] = {name: device.empty(f"v_{name}", array.shape) for name, array in g.arrays().items()}
+    v = Gaussians(**empty)
     arguments = [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree]
     arguments += [
         g.means,
