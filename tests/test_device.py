@@ -1,0 +1,179 @@
+"""Device: selection, buffers, programs, and errors that a user can act on."""
+
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clsplat.device
+from clsplat.device import Device, device_label, inline_includes, kernel_folder, list_devices, select_device
+from clsplat.errors import DeviceError
+
+
+@pytest.fixture
+def kernels(tmp_path, monkeypatch):
+    """A folder of sources of our own in the place of cl/."""
+    shutil.copytree(kernel_folder(), tmp_path / "cl")
+    monkeypatch.setattr(clsplat.device, "kernel_folder", lambda: tmp_path / "cl")
+    return tmp_path / "cl"
+
+
+def fake(name, kind=cl.device_type.CPU, extensions=""):
+    return SimpleNamespace(name=name, platform=SimpleNamespace(name="Fake"), type=kind, extensions=extensions)
+
+
+class TestSelection:
+    @pytest.fixture(autouse=True)
+    def no_choice(self, monkeypatch):
+        monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+
+    def test_by_part_of_the_label(self, monkeypatch):
+        devices = [fake("one"), fake("two")]
+        monkeypatch.setattr(clsplat.device, "list_devices", lambda: devices)
+        assert select_device("TW") is devices[1]
+        assert select_device("fake: one") is devices[0]
+
+    def test_unknown_name(self):
+        with pytest.raises(DeviceError, match="--device 'no such device': expected part of one of these names: .+"):
+            select_device("no such device")
+
+    def test_gpu_before_cpu(self, monkeypatch):
+        devices = [fake("c"), fake("g", cl.device_type.GPU), fake("a", cl.device_type.ACCELERATOR)]
+        monkeypatch.setattr(clsplat.device, "list_devices", lambda: devices)
+        assert select_device() is devices[1]
+        del devices[1]
+        assert select_device().name == "a"
+
+    def test_no_driver(self, monkeypatch):
+        def no_platform():
+            raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+        monkeypatch.setattr(cl, "get_platforms", no_platform)
+        assert list_devices() == []
+        with pytest.raises(
+            DeviceError, match=r"no OpenCL device found: install one, .*pip install 'clsplat\[pocl\]'"
+        ):
+            select_device()
+
+    def test_platform_without_devices(self, monkeypatch, device):
+        def no_devices():
+            raise cl.RuntimeError("clGetDeviceIDs failed: DEVICE_NOT_FOUND")
+
+        platforms = [SimpleNamespace(get_devices=no_devices), device.cl_device.platform]
+        monkeypatch.setattr(cl, "get_platforms", lambda: platforms)
+        assert list_devices() == device.cl_device.platform.get_devices()
+
+    def test_pyopencl_ctx(self, monkeypatch, device):
+        monkeypatch.setenv("PYOPENCL_CTX", device.cl_device.platform.name.strip())
+        assert select_device().platform.name == device.cl_device.platform.name
+        monkeypatch.setenv("PYOPENCL_CTX", "no such device")
+        with pytest.raises(DeviceError, match="PYOPENCL_CTX='no such device' selects no OpenCL device"):
+            select_device()
+
+    def test_no_double_precision(self):
+        with pytest.raises(DeviceError, match=r"Fake: half: expected a device with double precision \(cl_khr_fp64\)"):
+            Device(fake("half"), real=np.float64)
+
+    def test_label(self, device):
+        assert device.label == device_label(device.cl_device)
+        assert device.cl_device.name.strip() in device.label and "\n" not in device.label
+
+
+class TestBuffers:
+    def test_upload_converts(self, any_device):
+        array = any_device.upload("x", np.arange(6, dtype=np.int64).reshape(2, 3)[:, ::-1])
+        assert array.dtype == any_device.real
+        np.testing.assert_array_equal(array.get(), [[2, 1, 0], [5, 4, 3]])
+
+    def test_too_large_for_a_buffer(self, device):
+        size = device.cl_device.max_mem_alloc_size // 4 + 1
+        with pytest.raises(DeviceError, match=r"^splats: needs a buffer of \d+ MiB, but .* allows at most \d+ MiB"):
+            device.empty("splats", size)
+
+    def test_no_memory_left(self, device, monkeypatch):
+        def allocate(*arguments, **options):
+            raise cl.MemoryError("clCreateBuffer failed: MEM_OBJECT_ALLOCATION_FAILURE")
+
+        monkeypatch.setattr(cl.array, "Array", allocate)
+        with pytest.raises(DeviceError, match="splats: .* has no memory left for 4 MiB; use fewer Gaussians"):
+            device.empty("splats", (1024, 1024))
+
+    def test_scratch_is_zero_and_kept(self, device):
+        first = device.scratch("test", 100, "a")
+        assert (first.get() == 0).all()
+        first.fill(1)
+        assert device.scratch("test", 100, "a") is first
+        for size, layout in ((100, "b"), (101, "b"), (100, "a")):
+            again = device.scratch("test", size, layout)
+            assert again.shape == (size,) and (again.get() == 0).all()
+            again.fill(1)
+
+
+class TestPrograms:
+    def test_arguments(self, any_device, kernels):
+        (kernels / "echo.cl").write_text(
+            '#include "common.h"\n'
+            "__kernel void echo(const int i, const uint u, const real r, const __global real *x, __global real *out) {\n"
+            "    out[0] = i; out[1] = u; out[2] = r; out[3] = x[1]; out[4] = SCALE * r;\n}\n"
+        )
+        x, out = any_device.upload("x", [3, 4]), any_device.empty("out", 5)
+        any_device.launch("echo", "echo", (1,), [-7, 2**31, 0.1, x, out], defines={"SCALE": 0.5})
+        expected = np.array([-7, 2**31, 0.1, 4, 0.5 * any_device.real.type(0.1)])
+        np.testing.assert_array_equal(out.get(), expected.astype(any_device.real))
+
+    def test_built_once_for_each_set_of_defines(self, device, kernels, monkeypatch):
+        (kernels / "fill.cl").write_text(
+            "__kernel void one(__global float *x) { x[0] = VALUE; }\n"
+            "__kernel void two(__global float *x) { x[0] = 2 * VALUE; }\n"
+        )
+        builds = []
+        program = Device.program
+        monkeypatch.setattr(Device, "program", lambda *a: builds.append(a) or program(*a))
+        out = device.empty("out", 1)
+        for kernel, value, expected in [("one", 3, 3), ("two", 3, 6), ("one", 4, 4), ("one", 3, 3)]:
+            device.launch("fill", kernel, (1,), [out], defines={"VALUE": value})
+            assert out.get()[0] == expected
+        assert len(builds) == 2
+
+    def test_errors_name_file_and_line(self, device, kernels):
+        (kernels / "broken.h").write_text("\n\n\nint broken( {\n")
+        (kernels / "broken.cl").write_text('#include "broken.h"\n__kernel void k() {}\n')
+        with pytest.raises(cl.RuntimeError, match=r"cl/broken\.h:4"):
+            device.program("broken", {})
+        (kernels / "broken.cl").write_text('#include "common.h"\n#include "linalg.h"\n\n__kernel void k() { x; }\n')
+        with pytest.raises(cl.RuntimeError, match=r"cl/broken\.cl:4"):
+            device.program("broken", {})
+
+    def test_includes_are_inlined(self, kernels):
+        (kernels / "inner.h").write_text("inner\n")
+        (kernels / "outer.h").write_text('before\n  #include "inner.h"\nafter\n')
+        (kernels / "main.cl").write_text('#include "outer.h"\nlast\n')
+        assert inline_includes("main.cl", kernels).splitlines() == [
+            '#line 1 "cl/main.cl"',
+            '#line 1 "cl/outer.h"',
+            "before",
+            '#line 1 "cl/inner.h"',
+            "inner",
+            '#line 3 "cl/outer.h"',
+            "after",
+            '#line 2 "cl/main.cl"',
+            "last",
+        ]
+
+    def test_sources_are_missing(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(clsplat.device, "__file__", str(tmp_path / "clsplat" / "device.py"))
+        with pytest.raises(DeviceError, match=r"cl/common\.h: expected the kernel sources in .*; reinstall clsplat"):
+            kernel_folder()
+
+    def test_constants_reach_the_kernels(self, any_device, kernels):
+        names = clsplat.device.MODEL_CONSTANTS
+        body = " ".join(f"out[{i}] = {name};" for i, name in enumerate(names))
+        (kernels / "constants.cl").write_text(
+            f'#include "common.h"\n__kernel void read(__global real *out) {{ {body} }}\n'
+        )
+        out = any_device.empty("out", len(names))
+        any_device.launch("constants", "read", (1,), [out])
+        expected = [getattr(clsplat.constants, name) for name in names]
+        np.testing.assert_array_equal(out.get(), np.array(expected, any_device.real))
