@@ -1,7 +1,5 @@
 """The point the cameras look at, and the path around it."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -129,12 +127,10 @@ def test_cameras_upside_down_to_each_other():
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", ["fox_pinhole", "bonsai", "fern", "sceaux", "castle_p30"])
-def test_real_scenes_are_seen_from_the_orbit(name):
-    model = Path(__file__).parents[2] / "shared" / "data" / name / "sparse" / "0"
-    if not model.is_dir():
-        pytest.skip(f"{name} is not there")
-    pycolmap = pytest.importorskip("pycolmap")
-    reconstruction = pycolmap.Reconstruction(model)
+def test_real_scenes_are_seen_from_the_orbit(shared, name):
+    import pycolmap
+
+    reconstruction = pycolmap.Reconstruction(shared / "data" / name / "sparse" / "0")
     (intrinsics,) = reconstruction.cameras.values()
     cameras = []
     for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
