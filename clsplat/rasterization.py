@@ -88,6 +88,8 @@ def rasterization(
     means, viewmats, Ks = (np.asarray(a, dtype=np.float64) for a in (means, viewmats, Ks))
     colors = np.asarray(colors, dtype=np.float64)
     n, cameras = len(means), len(viewmats)
+    if n == 0 or cameras == 0:
+        raise InputError(f"means, viewmats: expected at least one Gaussian and one camera, found {n} and {cameras}")
     _check_shape("viewmats", viewmats, (cameras, 4, 4))
     _check_shape("Ks", Ks, (cameras, 3, 3))
     if sh_degree is None:
@@ -113,11 +115,9 @@ def rasterization(
     _check_shape("backgrounds", behind, (cameras, channels))
 
     stage = stage_functions(device)
-    parameters = upload(device, gaussians) if n else gaussians
+    parameters = upload(device, gaussians)
     renders, alphas, metas = [], [], []
     for i in range(cameras):
-        if n == 0:
-            raise InputError("means: expected at least one Gaussian, found none")
         camera = Camera(viewmats[i], Ks[i, 0, 0], Ks[i, 1, 1], Ks[i, 0, 2], Ks[i, 1, 2], width, height)
         splats = stage.project_fwd(parameters, camera, sh_degree or 0, antialiased=rasterize_mode == "antialiased")
         bins = stage.bin_splats(splats, width, height, max(width, height) if device is None else tile_size)

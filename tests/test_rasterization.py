@@ -1,0 +1,137 @@
+"""rasterization means what gsplat's function means, and agrees with render."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig
+from clsplat.device import Device
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.rasterization import rasterization
+from clsplat.render import render
+from clsplat.testing import synthetic_scene
+
+BACKGROUND = (0.2, 0.5, 0.9)
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[Gaussians, list[Camera]]:
+    gaussians, camera = synthetic_scene(60, seed=7)
+    return gaussians.astype(np.float64), [camera, camera.translated(np.array([0.1, -0.05, 0.0]))]
+
+
+def arguments(gaussians: Gaussians, cameras: list[Camera]) -> dict[str, Any]:
+    return {
+        "means": gaussians.means,
+        "quats": gaussians.quats,
+        "scales": gaussians.scales,
+        "opacities": gaussians.opacities,
+        "colors": gaussians.sh,
+        "viewmats": np.stack([c.viewmat for c in cameras]),
+        "Ks": np.stack([c.K for c in cameras]),
+        "width": cameras[0].width,
+        "height": cameras[0].height,
+    }
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_it_agrees_with_render(scene: tuple[Gaussians, list[Camera]], device64: Device, mode: Any) -> None:
+    gaussians, cameras = scene
+    image, alpha, meta = rasterization(
+        **arguments(gaussians, cameras),
+        sh_degree=gaussians.sh_degree,
+        backgrounds=[BACKGROUND] * 2,
+        render_mode="RGB+ED",
+        rasterize_mode=mode,
+        device=device64,
+    )
+    assert meta["n_cameras"] == 2
+    for i, camera in enumerate(cameras):
+        expected = render(gaussians, camera, RenderConfig(mode=mode), device64, background=BACKGROUND, depth=True)
+        # Logarithm and logit undo the activation to rounding.
+        np.testing.assert_allclose(image[i, :, :, :3], expected.rgb, atol=1e-10)
+        np.testing.assert_allclose(image[i, :, :, 3], expected.depth, atol=1e-9)
+        np.testing.assert_allclose(alpha[i, :, :, 0], expected.alpha, atol=1e-10)
+
+
+def test_every_render_mode(scene: tuple[Gaussians, list[Camera]]) -> None:
+    given = arguments(scene[0], scene[1][:1]) | {"sh_degree": 0, "colors": scene[0].sh[:, :1]}
+    images = {mode: rasterization(**given, render_mode=mode)[0] for mode in ("RGB", "D", "ED", "RGB+D", "RGB+ED")}
+    alpha = rasterization(**given)[1]
+    assert [images[m].shape[-1] for m in images] == [3, 1, 1, 4, 4]
+    np.testing.assert_array_equal(images["RGB+D"][..., :3], images["RGB"])
+    np.testing.assert_array_equal(images["RGB+D"][..., 3:], images["D"])
+    covered = alpha > 0
+    assert covered.any()
+    np.testing.assert_allclose(images["ED"][covered], images["D"][covered] / alpha[covered])
+
+
+@pytest.mark.parametrize("channels", [1, 2, 5])
+def test_values_of_any_number_of_channels(
+    scene: tuple[Gaussians, list[Camera]], device64: Device, channels: int
+) -> None:
+    gaussians, cameras = scene
+    colors = np.random.default_rng(0).uniform(-1, 1, (len(gaussians), channels))
+    given = arguments(gaussians, cameras) | {"colors": colors}
+    image = rasterization(**given, device=device64)[0]
+    assert image.shape[-1] == channels
+    assert image.min() < 0  # values are not clamped as colours of spherical harmonics are
+    np.testing.assert_allclose(image, rasterization(**given)[0], atol=1e-10)
+    per_camera = np.stack([colors, 2 * colors])
+    np.testing.assert_allclose(
+        rasterization(**(given | {"colors": per_camera}), device=device64)[0], image * [[[[1]]], [[[2]]]], atol=1e-12
+    )
+
+
+def test_meta_counts_and_places(scene: tuple[Gaussians, list[Camera]], device: Device) -> None:
+    gaussians, cameras = scene
+    given = arguments(gaussians, cameras) | {"colors": np.zeros((len(gaussians), 3))}
+    given["means"] = gaussians.means.copy()
+    given["means"][0] = cameras[0].position - 5 * cameras[0].viewmat[2, :3]  # behind both cameras
+    meta = rasterization(**given, device=device)[2]
+    assert (meta["tiles_per_gauss"][:, 0] == 0).all()
+    assert (meta["radii"][:, 0] == 0).all()
+    shown = meta["tiles_per_gauss"][0] > 0
+    assert shown.sum() > 10
+    homogeneous = given["means"] @ cameras[0].viewmat[:3, :3].T + cameras[0].viewmat[:3, 3]
+    pixels = homogeneous @ cameras[0].K.T
+    np.testing.assert_allclose(meta["means2d"][0][shown], (pixels[:, :2] / pixels[:, 2:])[shown], rtol=1e-4)
+    np.testing.assert_allclose(meta["depths"][0][shown], homogeneous[shown, 2], rtol=1e-5)
+
+
+def test_opacities_and_scales_at_their_bounds(scene: tuple[Gaussians, list[Camera]], device: Device) -> None:
+    gaussians, cameras = scene
+    given = arguments(gaussians, cameras) | {"colors": np.ones((len(gaussians), 3))}
+    given["opacities"] = np.where(np.arange(len(gaussians)) % 2, 1.0, 0.0)
+    given["scales"] = gaussians.scales.copy()
+    given["scales"][1] = 0
+    image, alpha, meta = rasterization(**given, device=device)
+    assert np.isfinite(image).all()
+    assert np.isfinite(alpha).all()
+    assert (meta["tiles_per_gauss"][:, ::2] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"means": np.zeros((0, 3))},
+            "means, viewmats: expected at least one Gaussian and one camera, found 0 and 2",
+        ),
+        ({"Ks": np.eye(3)}, r"Ks: expected shape \(2, 3, 3\)"),
+        ({"quats": np.ones((3, 4))}, r"quats: expected shape \(60, 4\)"),
+        ({"colors": np.ones((59, 3))}, r"colors: expected shape \(2, 60, 3\)"),
+        ({"backgrounds": np.ones(3)}, r"backgrounds: expected shape \(2, 3\)"),
+        ({"render_mode": "rgb"}, "render_mode: expected RGB"),
+        ({"sh_degree": 4, "colors": np.zeros((60, 16, 3))}, "sh_degree: expected 0 to 3"),
+    ],
+)
+def test_errors_name_the_argument(
+    scene: tuple[Gaussians, list[Camera]], change: dict[str, Any], message: str
+) -> None:
+    given = arguments(*scene) | {"colors": np.ones((60, 3))} | change
+    with pytest.raises(InputError, match=message):
+        rasterization(**given)
