@@ -59,14 +59,14 @@ class Camera:
             )
 
     @property
-    def K(self) -> NDArray[np.float64]:  # noqa: N802 (the field's name for it)
+    def K(self) -> NDArray[np.float64]:
         """Intrinsic matrix, (3, 3), in pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
     def position(self) -> NDArray[np.float64]:
         """Camera centre in world units, (3,)."""
-        return -np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3])
+        return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), dtype=np.float64)
 
     @classmethod
     def look_at(

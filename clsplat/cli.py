@@ -3,6 +3,7 @@
 import json
 import sys
 import time
+import warnings
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from clsplat.scene import Scene
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-Positional = tyro.conf.Positional
 
 
 def say(text: str) -> None:
@@ -78,7 +78,7 @@ class Devices:
 class Sfm:
     """Recover the cameras of a folder of photos (pycolmap); `train` does so by itself where it is needed."""
 
-    photos: Positional[Path]
+    photos: tyro.conf.Positional[Path]
     """Folder of photos."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Folder for the model; default: beside the photos."""
@@ -95,7 +95,7 @@ class Sfm:
 class Train:
     """Train Gaussians on photos: a folder of photos, a COLMAP model with its photos, or a transforms.json."""
 
-    data: Positional[Path]
+    data: tyro.conf.Positional[Path]
     """Folder of the dataset, or of photos alone."""
     out: Out
     """Folder for the scene, its evaluation, checkpoint and log."""
@@ -126,8 +126,9 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
     """Train with a progress bar; write scene.ply, the evaluation and the training curve to `out`."""
     from tqdm import tqdm
 
-    from clsplat.evaluate import evaluate, score, training_curve
+    from clsplat.evaluate import evaluate, mean_metrics
     from clsplat.io import save_gaussians
+    from clsplat.report import training_curve
     from clsplat.train import train
 
     background = BACKGROUNDS[config.data.background]
@@ -138,7 +139,7 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
             bar.set_postfix(loss=f"{record['loss']:.4f}", N=record["num_gaussians"], refresh=False)
 
         def held_out(gaussians: "Gaussians") -> dict[str, float]:
-            return score(gaussians, scene.test, config.render, device, background)
+            return mean_metrics(gaussians, scene.test, config.render, device, background)
 
         gaussians = train(
             scene, config, device, out, resume=resume, evaluate=held_out if scene.test else None, progress=progress
@@ -162,9 +163,9 @@ def say_scores(report: dict[str, Any], out: Path) -> None:
 class Eval:
     """Compare renders of a scene with the held-out photos: metrics as JSON, and a page of pictures."""
 
-    scene: Positional[Path]
+    scene: tyro.conf.Positional[Path]
     """File of Gaussians."""
-    data: Positional[Path]
+    data: tyro.conf.Positional[Path]
     """Dataset, as given to `train`."""
     out: Out
     """Folder for metrics.json, index.html and the renders."""
@@ -199,9 +200,9 @@ def moved(gaussians: "Gaussians", by: Any) -> "Gaussians":
 class Render:
     """Render a scene as PNG files: the held-out views of its dataset, or an orbit around what its photos show."""
 
-    scene: Positional[Path]
+    scene: tyro.conf.Positional[Path]
     """File of Gaussians."""
-    data: Positional[Path]
+    data: tyro.conf.Positional[Path]
     """Dataset, as given to `train`; its cameras are the views or lead the orbit."""
     out: Out
     """Folder for the pictures."""
@@ -261,7 +262,7 @@ class Render:
 class Export:
     """Convert a file of Gaussians; formats are told by the suffix."""
 
-    scene: Positional[Path]
+    scene: tyro.conf.Positional[Path]
     """File of Gaussians."""
     out: Out
     """File to write."""
@@ -289,8 +290,9 @@ class Demo:
     def run(self) -> None:
         """Run the command."""
         from clsplat.demo import make_photos
-        from clsplat.evaluate import side_by_side
         from clsplat.io import load_scene
+        from clsplat.render import render
+        from clsplat.report import side_by_side
 
         if self.out.exists() and any(self.out.iterdir()):
             raise InputError(f"{self.out}: expected an empty or new folder for the demo; choose another with -o")
@@ -301,12 +303,13 @@ class Demo:
         say("photos: ray tracing a still life")
         make_photos(photos)
         say("cameras: structure from motion on the photos alone")
-        config = TrainConfig(iterations=self.iterations, device=self.device)
+        config = TrainConfig(iterations=self.iterations, eval_every=max(1, self.iterations // 7), device=self.device)
         scene = load_scene(photos, config.data)
         say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
         write_json(self.out / "config.json", asdict(config))
         gaussians = train_and_report(scene, config, device, self.out, resume=False)
-        side_by_side(gaussians, scene.test, self.out / "side_by_side.png", config.render, device)
+        pairs = [(view.image, render(gaussians, view.camera, config.render, device).rgb) for view in scene.test]
+        side_by_side(self.out / "side_by_side.png", pairs)
         say(
             f"done in {time.perf_counter() - started:.0f} s. Look at {self.out / 'side_by_side.png'} (photo and "
             f"render), {self.out / 'training_curve.png'} and {self.out / 'eval' / 'index.html'}; "
@@ -326,6 +329,9 @@ def main(arguments: list[str] | None = None) -> None:
         command.run()
     except ClsplatError as error:
         say(f"clsplat: {error}")
+        sys.exit(2)
+    except OSError as error:  # what no reader or writer has put in words: a disk that fills up under a log, say
+        say(f"clsplat: {error.filename or 'input or output'}: {error.strerror or error}")
         sys.exit(2)
     except KeyboardInterrupt:
         say("clsplat: interrupted")

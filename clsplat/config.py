@@ -143,8 +143,8 @@ class TrainConfig:
     """Densification strategy: a name of clsplat.densify.STRATEGIES."""
     checkpoint_every: int = 1000
     """Iterations between two checkpoints, from which an interrupted run resumes."""
-    eval_every: int = 0
-    """Iterations between two evaluations on the held-out photos (0: only at the end)."""
+    eval_every: int = 500
+    """Iterations between two evaluations on the held-out photos for the training curve (0: none before the end)."""
     device: str | None = None
     """Part of the platform's or device's name; PYOPENCL_CTX is honoured where this is not given."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)

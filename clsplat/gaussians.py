@@ -21,13 +21,13 @@ SHAPES: dict[str, tuple[int | None, ...]] = {
 }
 
 
-def sigmoid(x: Array) -> Array:
+def sigmoid(x: Any) -> Any:
     """1/(1 + exp(-x)), without overflow."""
     e = np.exp(-np.abs(x))
     return np.where(x >= 0, 1, e) / (1 + e)
 
 
-def logit(p: Array) -> Array:
+def logit(p: Any) -> Any:
     """Inverse of `sigmoid`; p in (0, 1)."""
     return np.log(p) - np.log1p(-p)
 

@@ -32,10 +32,11 @@ PHOTO_SHARE = 0.25
 
 @dataclass
 class State:
-    """All that training changes: what a checkpoint holds."""
+    """All that training changes, which is what a checkpoint holds, and the scene's extent in world units."""
 
     iteration: int
     seconds: float
+    extent: float
     gaussians: Gaussians
     moments: Moments
     strategy: Strategy
@@ -152,7 +153,7 @@ def step(state: State, iteration: int, view: View, photos: _Photos, config: Trai
 
     visible = download(run.splats.extents)[:, 0] > 0
     state.strategy.observe(download(gradients.means2d), visible, camera.width, camera.height)
-    rates = learning_rates(iteration, config.iterations, state.strategy.extent, config.optim)
+    rates = learning_rates(iteration, config.iterations, state.extent, config.optim)
     v_gaussians = Gaussians(**{name: download(array) for name, array in gradients.gaussians.arrays().items()})
     adam_step(gaussians, v_gaussians, state.moments, rates, iteration, sh_degree, config.optim)
 
@@ -170,7 +171,7 @@ def initial_state(scene: Scene, config: TrainConfig) -> State:
     """The state before the first iteration."""
     gaussians = initialize(scene, config.init, config.seed)
     strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
-    return State(0, 0.0, gaussians, Moments.zeros(gaussians), strategy)
+    return State(0, 0.0, scene.extent, gaussians, Moments.zeros(gaussians), strategy)
 
 
 def save_state(out: Path, state: State, config: TrainConfig) -> None:
@@ -208,4 +209,4 @@ def load_state(out: Path, scene: Scene, config: TrainConfig) -> State:
     strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
     strategy.statistics = {k: arrays[f"statistics.{k}"] for k in strategy.statistics}
     moments = Moments(part("first"), part("second"))
-    return State(int(arrays["iteration"]), float(arrays["seconds"]), gaussians, moments, strategy)
+    return State(int(arrays["iteration"]), float(arrays["seconds"]), scene.extent, gaussians, moments, strategy)

@@ -54,7 +54,7 @@ class Adc:
         if iteration % c.reset_every == 0:
             edit = edit or Edit(gaussians, np.arange(len(gaussians)), np.zeros(len(gaussians), bool))
             lowered = Gaussians(**edit.gaussians.arrays())
-            lowered.logit_opacities = np.minimum(lowered.logit_opacities, np.float32(logit(c.reset_opacity)))
+            lowered.logit_opacities = np.minimum(lowered.logit_opacities, logit(np.float32(c.reset_opacity)))
             edit = edit._replace(gaussians=lowered, reset_opacities=True)
         return edit
 
