@@ -36,7 +36,7 @@ class TestSelection:
         assert select_device("fake: one") is devices[0]
 
     def test_unknown_name(self):
-        with pytest.raises(DeviceError, match="--device 'no such device': expected part of one of these names: .+"):
+        with pytest.raises(DeviceError, match="--device 'no such device': expected part of one of"):
             select_device("no such device")
 
     def test_gpu_before_cpu(self, monkeypatch):
@@ -53,7 +53,7 @@ class TestSelection:
         monkeypatch.setattr(cl, "get_platforms", no_platform)
         assert list_devices() == []
         with pytest.raises(
-            DeviceError, match=r"no OpenCL device found: install one, .*pip install 'clsplat\[pocl\]'"
+            DeviceError, match=r"no OpenCL device found: .*pip install 'clsplat\[pocl\]'"
         ):
             select_device()
 
@@ -97,7 +97,7 @@ class TestBuffers:
             raise cl.MemoryError("clCreateBuffer failed: MEM_OBJECT_ALLOCATION_FAILURE")
 
         monkeypatch.setattr(cl.array, "Array", allocate)
-        with pytest.raises(DeviceError, match="splats: .* has no memory left for 4 MiB; use fewer Gaussians"):
+        with pytest.raises(DeviceError, match=r"splats: .* has no memory left for 4 MiB; use fewer Gaussians"):
             device.empty("splats", (1024, 1024))
 
     def test_scratch_is_zero_and_kept(self, device):
@@ -115,7 +115,7 @@ class TestPrograms:
     def test_arguments(self, any_device, kernels):
         (kernels / "echo.cl").write_text(
             '#include "common.h"\n'
-            "__kernel void echo(const int i, const uint u, const real r, const __global real *x, __global real *out) {\n"
+            "__kernel void echo(int i, uint u, real r, const __global real *x, __global real *out) {\n"
             "    out[0] = i; out[1] = u; out[2] = r; out[3] = x[1]; out[4] = SCALE * r;\n}\n"
         )
         x, out = any_device.upload("x", [3, 4]), any_device.empty("out", 5)
