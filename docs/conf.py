@@ -20,7 +20,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx-mathjax-offline",
     "matplotlib.sphinxext.plot_directive",
-    "tables",
+    "from_package",
 ]
 exclude_patterns = ["_build"]
 default_role = "py:obj"

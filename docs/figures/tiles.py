@@ -2,6 +2,7 @@
 
 import matplotlib.pyplot as plt
 import numpy as np
+
 from clsplat.constants import ALPHA_MIN, TILE
 from clsplat.reference import bin_splats
 from clsplat.stages import Splats

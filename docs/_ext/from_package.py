@@ -1,20 +1,25 @@
-"""Tables made from the package while the pages are built, so that they cannot disagree with it.
+"""Parts of pages made from the package while they are built, so that they cannot disagree with it.
 
-``{constants}`` lists clsplat/constants.py; ``{config} NAME`` a dataclass of clsplat/config.py.
+``{constants}`` lists clsplat/constants.py; ``{config} NAME`` a dataclass of clsplat/config.py; ``{command} NAME``
+is what ``clsplat NAME --help`` prints.
 """
 
 import ast
+import contextlib
 import dataclasses
 import inspect
+import io
+import os
 import re
 import typing
 from types import ModuleType
 from typing import Any
 
-from clsplat import config, constants
 from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
+
+from clsplat import cli, config, constants
 
 HEADER_RULE = "|---"
 
@@ -97,6 +102,19 @@ def config_table(name: str) -> str:
     return f"{_prose(cls.__doc__ or '')}\n\n" + "\n".join(rows)
 
 
+def help_text(command: str) -> str:
+    """What ``clsplat COMMAND --help`` prints on a terminal of 100 columns without colours."""
+    text = io.StringIO()
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "100"
+    try:
+        with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+            cli.main([command, "--help"])
+    finally:
+        os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
+    return re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue())
+
+
 class Table(SphinxDirective):
     """Base: parses Markdown that is made from a module."""
 
@@ -121,7 +139,20 @@ class Config(Table):
         return self.parse(config_table(self.arguments[0]), config)
 
 
+class Command(SphinxDirective):
+    """``{command} NAME``"""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        self.env.note_dependency(cli.__file__)
+        self.env.note_dependency(config.__file__)
+        text = help_text(self.arguments[0])
+        return [nodes.literal_block(text, text, language="text")]
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("constants", Constants)
     app.add_directive("config", Config)
+    app.add_directive("command", Command)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

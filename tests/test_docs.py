@@ -1,0 +1,87 @@
+"""The documentation: its Python examples run, and nothing that exists is left out of it."""
+
+import ast
+import dataclasses
+import re
+import typing
+from pathlib import Path
+
+import pytest
+
+from clsplat import cli, config, constants, densify, ops
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/howto/python.md"])
+def test_python_examples_run(page, device, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYOPENCL_NO_CACHE", "1")
+    examples = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), flags=re.M | re.S)
+    assert examples, f"{page} has no example"
+    names: dict[str, object] = {}
+    for example in examples:
+        exec(compile(example, page, "exec"), names)
+
+
+def test_every_configuration_has_a_table():
+    page = (DOCS / "configuration.md").read_text()
+    for name, cls in vars(config).items():
+        if dataclasses.is_dataclass(cls):
+            assert f"```{{config}} {name}\n" in page, name
+
+
+def test_every_command_has_its_help():
+    page = (DOCS / "cli.md").read_text()
+    for command in typing.get_args(cli.COMMANDS):
+        assert f"```{{command}} {command.__name__.lower()}\n" in page, command.__name__
+
+
+def test_every_constant_says_why():
+    source = Path(constants.__file__).read_text()
+    for name in vars(constants):
+        if re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
+            # Neighbours may share a docstring.
+            assert re.search(rf'^{name}\b.*\n(?:[A-Z].* = .*\n)*"""', source, flags=re.M), name
+
+
+def test_every_stage_has_a_page_with_twin_and_kernel():
+    stages = {getattr(ops, name).__module__.rsplit(".", 1)[1] for name in ops.__all__}
+    for stage in stages:
+        page = (DOCS / "stages" / f"{stage}.md").read_text()
+        assert f"literalinclude}} ../../clsplat/reference/{stage}.py" in page, stage
+        kernels = [p.name for p in (ROOT / "cl").glob(f"{stage}*.cl")]
+        assert kernels and all(f"literalinclude}} ../../cl/{name}" in page for name in kernels), stage
+
+
+def test_every_header_is_on_a_page():
+    pages = "".join(page.read_text() for page in (DOCS / "stages").glob("*.md"))
+    for header in (ROOT / "cl").glob("*.h"):
+        assert f"../../cl/{header.name}" in pages, header.name
+
+
+def test_every_strategy_is_described():
+    page = (DOCS / "howto" / "photos.md").read_text()
+    for name in densify.STRATEGIES:
+        assert f"`{name}`" in page, name
+
+
+def messages():
+    """Every text in the package as its author meant it: parts joined, … for what is filled in."""
+    for path in (ROOT / "clsplat").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.JoinedStr):
+                yield "".join(v.value if isinstance(v, ast.Constant) else "…" for v in node.values)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                yield node.value
+
+
+def test_every_message_under_troubleshooting_exists():
+    page = (DOCS / "howto" / "troubleshooting.md").read_text()
+    headings = re.findall(r"^### `(.*)`$", page, flags=re.M)
+    assert len(headings) > 20
+    known = list(messages())
+    for heading in headings:
+        pattern = re.compile(".*".join(map(re.escape, heading.split("…"))))
+        assert any(pattern.match(text) for text in known), heading
