@@ -349,3 +349,30 @@ def test_impossible_photos_are_refused(tmp_path, bad):
     with pytest.raises(InputError, match=next(iter(bad))):
         demo.make_photos(tmp_path / "photos", **bad)
     assert not (tmp_path / "photos").exists()
+
+
+@pytest.mark.slow
+def test_poses_are_recovered_from_the_photos_alone(tmp_path):
+    import pycolmap
+
+    from clsplat.config import SfmConfig
+    from clsplat.sfm import reconstruct
+
+    cameras = demo.make_photos(tmp_path / "images")
+    model = pycolmap.Reconstruction(reconstruct(tmp_path, SfmConfig()))
+    assert model.num_reg_images() == len(cameras)
+    assert model.compute_mean_reprojection_error() < 0.5  # pixels: 0.3 was seen
+    poses = {int(image.name[:3]): image.cam_from_world().matrix() for image in model.images.values()}
+    found = np.array([-poses[k][:, :3].T @ poses[k][:, 3] for k in range(len(cameras))])
+    true = np.array([camera.position for camera in cameras])
+    found, true = found - found.mean(0), true - true.mean(0)
+    # Similarity alignment: Umeyama 1991, doi:10.1109/34.88573.
+    u, s, vt = np.linalg.svd(true.T @ found)
+    sign = np.array([1, 1, np.linalg.det(u @ vt)])
+    rotation = u * sign @ vt
+    found = (s @ sign) / (found**2).sum() * found @ rotation.T
+    radius = np.linalg.norm(true, axis=1).mean()
+    assert np.linalg.norm(found - true, axis=1).max() < 0.005 * radius  # 0.0012 was seen
+    for k, camera in enumerate(cameras):
+        turn = poses[k][:, :3] @ rotation.T @ camera.viewmat[:3, :3].T
+        assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 0.2  # 0.06 was seen
