@@ -60,3 +60,13 @@ FLOAT |= {
     "loss": Tolerance(1e-5, 0, "float32"),
     "v_image": Tolerance(1e-3, 1e-4, "float32"),
 }
+
+DOUBLE |= {
+    "rgb": DOUBLE["image"],
+    "depth": Tolerance(1e-9, 1e-12, _REORDERED),
+    "moved world": Tolerance(1e-9, 1e-11, "float64; translations of 10 units and scales of 40 cost three digits"),
+}
+FLOAT |= {
+    "rgb": FLOAT["image"],
+    "depth": Tolerance(1e-4, 1e-5, "float32: a quotient by alpha, which is at least 0.01 where depths are compared"),
+}
