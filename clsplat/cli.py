@@ -322,6 +322,7 @@ COMMANDS = Devices | Sfm | Train | Eval | Render | Export | Demo
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``clsplat``: errors that are the user's to mend print one sentence and exit with 2."""
+    warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
     command = tyro.cli(
         COMMANDS, prog="clsplat", args=arguments, description="3D Gaussian Splatting on any OpenCL device."
     )
