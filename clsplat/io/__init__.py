@@ -9,7 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from clsplat.config import Mode
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.io.dataset import load_scene
 from clsplat.io.ply import load_ply, save_ply
+
+__all__ = ["FORMATS", "load_gaussians", "load_scene", "save_gaussians"]
 
 Loader = Callable[[str | Path], tuple[Gaussians, Mode, NDArray[np.float64]]]
 Saver = Callable[[str | Path, Gaussians, Mode, ArrayLike | None], None]

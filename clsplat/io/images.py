@@ -1,0 +1,336 @@
+"""From a dataset's photos and cameras to views: files found, cameras made pinholes, pixels decoded and resampled."""
+
+import os
+import warnings
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from math import floor
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config import BACKGROUNDS, DataConfig
+from clsplat.errors import InputError
+from clsplat.photos import SUFFIXES, orientation, photo_size, read_mask, read_photo
+from clsplat.scene import View
+from clsplat.sfm import Intrinsics, is_pinhole, project, undistorted
+
+ASPECT_TOLERANCE = 0.01
+"""By how much a photo's aspect ratio may differ from its camera's; a smaller copy is off by up to a pixel besides."""
+
+
+class PhotosMissing(InputError):
+    """None of a dataset's photos was found."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedPhoto:
+    """A photo as a dataset declares it.
+
+    Parameters
+    ----------
+    name : str
+        Path of the photo inside its folder, with forward slashes.
+    path : Path
+        The file to decode.
+    viewmat : (4, 4) float64
+        World to camera, in world units.
+    intrinsics : Intrinsics
+        With distortion, at the size the dataset declares.
+    mask : Path, optional
+        File of its mask.
+    held_out : bool, optional
+        Whether the dataset keeps it for testing; None where it does not say.
+    """
+
+    name: str
+    path: Path
+    viewmat: NDArray[np.float64]
+    intrinsics: Intrinsics
+    mask: Path | None = None
+    held_out: bool | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """What a reader finds out before any photo is decoded.
+
+    Parameters
+    ----------
+    photos : list of PosedPhoto
+        At least one.
+    points : (P, 3) float64
+        Sparse points, in world units; P may be 0.
+    colors : (P, 3) uint8
+        Their colours.
+    reduce : int
+        Edge of the squares of pixels that are averaged into one; 1 where the files have the size asked for.
+    upright : bool
+        The cameras describe the photos turned as their EXIF orientation says, not as they are stored.
+    """
+
+    photos: list[PosedPhoto]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    reduce: int = 1
+    upright: bool = False
+
+
+def checked_name(name: str, source: Path) -> str:
+    """A path inside a dataset with forward slashes and without ``./``.
+
+    Raises
+    ------
+    InputError
+        If it is empty, absolute, or climbs out of the dataset; the message names the file `source` that has it.
+    """
+    path = PurePosixPath(name.replace("\\", "/"))
+    if not path.parts or path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts or "\0" in name:
+        raise InputError(f"{source}: expected the names of photos inside the dataset's folder, found {name!r}")
+    return path.as_posix()
+
+
+def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path | None], int]:
+    """Find the files of photos, in the size asked for where the dataset has it.
+
+    Parameters
+    ----------
+    root : Path
+        The dataset's folder.
+    names : sequence of str
+        Paths inside it, checked; the ending may be missing or another one.
+    downscale : int
+        For 2, 4 or 8, ``images_2/a.jpg`` is preferred to ``images/a.jpg``, unless it exists for fewer photos.
+
+    Returns
+    -------
+    files : list of Path or None
+        Per name; None where there is no file. At least one is not None.
+    reduce : int
+        What remains of `downscale` after the choice of the folder.
+
+    Raises
+    ------
+    PhotosMissing
+        If none is found; the message says which sizes exist.
+    """
+    full = [_find(root, name) for name in names]
+    found = sum(file is not None for file in full)
+    if downscale > 1:
+        small = [_find(root, name, downscale) for name in names]
+        found_small = sum(file is not None for file in small)
+        if found_small >= max(found, 1):
+            return small, 1
+        if found_small:
+            warnings.warn(
+                f"{root}: copies {downscale} times smaller exist for {found_small} of {found} photos only; all are "
+                "resampled from the full size instead",
+                stacklevel=2,
+            )
+    if found:
+        return full, downscale
+    sizes = [d for d in (2, 4, 8) if any(_find(root, name, d) is not None for name in names)]
+    raise PhotosMissing(
+        f"{root / names[0]}: expected this photo and {len(names) - 1} others, found none of them"
+        + (f" but copies in smaller sizes: use downscale {' or '.join(map(str, sizes))}" if sizes else "")
+    )
+
+
+def warn_of_missing(source: Path, names: Sequence[str], files: Sequence[Path | None]) -> None:
+    """Warn once of all the photos that `source` names and that have no file."""
+    missing = [name for name, file in zip(names, files, strict=True) if file is None]
+    if missing:
+        warnings.warn(
+            f"{source}: {len(missing)} of {len(names)} photos have no file and are left out (first: {missing[0]})",
+            stacklevel=3,
+        )
+
+
+def _find(root: Path, name: str, downscale: int = 1) -> Path | None:
+    folder, slash, rest = name.partition("/")
+    if downscale > 1 and not slash:
+        return None
+    path = root / (name if downscale == 1 else f"{folder}_{downscale}/{rest}")
+    if path.is_file():
+        return path
+    # Smaller copies often have another ending, and Blender's transforms leave it out.
+    stem = path.with_suffix("") if path.suffix.lower() in SUFFIXES else path
+    candidates = (stem.with_name(stem.name + case) for suffix in SUFFIXES for case in (suffix, suffix.upper()))
+    return next((file for file in candidates if file.is_file()), None)
+
+
+def find_mask(folder: Path, name: str) -> Path:
+    """File of the mask of the photo `name` in `folder`: ``NAME.png``, or ``NAME.jpg.png``.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    plain = folder / name
+    candidates = [plain.with_suffix(".png"), plain.with_name(plain.name + ".png")]
+    for file in candidates:
+        if file.is_file():
+            return file
+    raise InputError(
+        f"{candidates[0]}: expected the mask of photo {name} there or in {candidates[1].name}, found none"
+    )
+
+
+def mask_folder(root: Path, masks: str) -> Path:
+    """The folder of masks: `masks` inside the dataset `root` where that exists, otherwise from where we are.
+
+    Raises
+    ------
+    InputError
+        If it does not exist.
+    """
+    for folder in (root / masks, Path(masks)):
+        if folder.is_dir():
+            return folder
+    raise InputError(f"masks: expected a folder, found none at {root / masks} nor at {Path(masks)}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """How a photo becomes a view, known from the files' headers."""
+
+    photo: PosedPhoto
+    camera: Camera
+    size: tuple[int, int]
+    upright: bool
+
+
+def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
+    """Decode a dataset's photos on several threads.
+
+    All cameras and the headers of all files are checked before the first photo is decoded.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        From a reader.
+    config : DataConfig
+        Its background is put behind transparent photos.
+
+    Returns
+    -------
+    list of View
+        In the order of the dataset's photos: undistorted, reduced.
+
+    Raises
+    ------
+    InputError
+        If a pose is no rigid motion, a photo or mask cannot be decoded, or its shape is not its camera's; the message
+        names it.
+    """
+    from tqdm import tqdm
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        plans = list(pool.map(lambda photo: _plan(photo, dataset), dataset.photos))
+        views = pool.map(lambda plan: _view(plan, dataset.reduce, BACKGROUNDS[config.background]), plans)
+        return list(tqdm(views, "photos", len(plans), unit="photo", dynamic_ncols=True, leave=False))
+
+
+def _plan(photo: PosedPhoto, dataset: Dataset) -> _Plan:
+    declared = photo.intrinsics
+    width, height = photo_size(photo.path)
+    turned = orientation(photo.path) >= 5 if dataset.upright else False
+    upright = dataset.upright
+    if not upright and not _fits((width, height), declared) and _fits((height, width), declared):
+        # The pixels as stored have the other aspect: the cameras were found on photos that a program had turned.
+        upright = turned = orientation(photo.path) >= 5
+    if turned:
+        width, height = height, width
+    if not _fits((width, height), declared):
+        raise InputError(
+            f"{photo.path}: expected a photo of {declared.width}x{declared.height} pixels or a smaller copy of it, "
+            f"as its camera says, found {width}x{height}"
+        )
+    pinhole = undistorted(declared)
+    sx, sy = width / declared.width, height / declared.height
+    fx, fy, cx, cy = (value * s / dataset.reduce for value, s in zip(pinhole.params, (sx, sy, sx, sy), strict=True))
+    # An undistorted photo loses the last fraction of a pixel, one that is reduced what does not fill a square.
+    across, down = floor(pinhole.width * sx + 1e-6), floor(pinhole.height * sy + 1e-6)
+    if min(across, down) < dataset.reduce:
+        raise InputError(f"{photo.path}: expected at least {dataset.reduce} pixels per edge, found {across}x{down}")
+    try:
+        camera = Camera(photo.viewmat, fx, fy, cx, cy, across // dataset.reduce, down // dataset.reduce)
+    except InputError as error:
+        raise InputError(f"photo {photo.name}: {error}") from error
+    return _Plan(photo, camera, (width, height), upright)
+
+
+def _fits(size: tuple[int, int], declared: Intrinsics) -> bool:
+    sx, sy = size[0] / declared.width, size[1] / declared.height
+    # Rounding a smaller copy's size moves one edge by less than a pixel.
+    return abs(sx - sy) <= max(ASPECT_TOLERANCE * max(sx, sy), 1 / min(declared.width, declared.height))
+
+
+def _view(plan: _Plan, reduce: int, background: tuple[float, float, float]) -> View:
+    photo, camera = plan.photo, plan.camera
+    image = read_photo(photo.path, background, plan.upright)
+    mask = None if photo.mask is None else _fitted_mask(photo.mask, image.shape[1], image.shape[0])
+    if not is_pinhole(photo.intrinsics):
+        rows, columns = camera.height * reduce, camera.width * reduce
+        positions = _positions(photo.intrinsics, plan.size, (rows, columns))
+        image = np.stack([_resample(image[..., channel], positions, 1) for channel in range(3)], axis=-1)
+        mask = None if mask is None else _resample(mask, positions, 0)
+    if reduce > 1:
+        image = np.rint(_squares(image, camera, reduce).mean(axis=(1, 3))).astype(np.uint8)
+        # A pixel that is averaged from a masked one does not count either.
+        mask = None if mask is None else np.asarray(_squares(mask, camera, reduce).all(axis=(1, 3)))
+    return View(photo.name, camera, np.ascontiguousarray(image), mask)
+
+
+def _squares(pixels: NDArray[Any], camera: Camera, edge: int) -> NDArray[Any]:
+    inside = pixels[: camera.height * edge, : camera.width * edge]
+    return inside.reshape(camera.height, edge, camera.width, edge, *pixels.shape[2:])
+
+
+def _fitted_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
+    """The mask at the photo's size: the nearest of its pixels where it has another one."""
+    mask = read_mask(path)
+    if not _fits((mask.shape[1], mask.shape[0]), Intrinsics("PINHOLE", (), width, height)):
+        raise InputError(
+            f"{path}: expected a mask of the photo's shape, {width}x{height} pixels or another size of it, found "
+            f"{mask.shape[1]}x{mask.shape[0]}"
+        )
+    rows = ((np.arange(height) + 0.5) * mask.shape[0] / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * mask.shape[1] / width).astype(int)
+    return mask[np.ix_(rows, columns)]
+
+
+# Photos of one camera share it; photos with cameras of their own do not pile up.
+@lru_cache(maxsize=2)
+def _positions(intrinsics: Intrinsics, size: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Row and column indices, (2, H, W), at which an undistorted image's pixels lie in the distorted photo.
+
+    `size` is the photo's width and height, `shape` the undistorted image's (H, W), in the same pixels.
+    """
+    sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
+    fx, fy, cx, cy = undistorted(intrinsics).params
+    x = ((np.arange(shape[1]) + 0.5) / sx - cx) / fx
+    y = ((np.arange(shape[0]) + 0.5) / sy - cy) / fy
+    positions = np.empty((2, *shape), dtype=np.float32)
+    for row in range(shape[0]):
+        rays = np.stack([x, np.full_like(x, y[row]), np.ones_like(x)], axis=-1)
+        positions[1, row], positions[0, row] = (project(intrinsics, rays) * (sx, sy)).T
+    if not np.isfinite(positions).all():
+        raise InputError(
+            f"camera model {intrinsics.model}: expected a distortion that can be undone over the whole photo, found "
+            f"parameters {intrinsics.params}"
+        )
+    return positions - np.float32(0.5)  # indices count from pixel centres
+
+
+def _resample(channel: NDArray[Any], positions: NDArray[np.float32], order: int) -> NDArray[Any]:
+    from scipy.ndimage import map_coordinates
+
+    resampled: NDArray[Any] = map_coordinates(channel, positions, order=order, mode="nearest")
+    return resampled

@@ -1,0 +1,168 @@
+"""Photos as files: which there are, how large they are, and their pixels as 8-bit RGB."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, ImageOps
+
+from clsplat.errors import InputError
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+"""Endings, in lower case, of the files that count as photos."""
+
+
+def photo_folder(path: Path) -> Path:
+    """Where the photos of the dataset `path` are: its folder ``images``, or `path` itself where there is none."""
+    return path / "images" if (path / "images").is_dir() else path
+
+
+def list_photos(path: Path) -> list[str]:
+    """Names of the photos of the dataset `path`, sorted, relative to `photo_folder`, with forward slashes.
+
+    Sub-folders count inside ``images`` only: elsewhere they may hold masks, smaller copies and results.
+    """
+    folder = photo_folder(path)
+    files = folder.glob("*") if folder == path else folder.rglob("*")
+    return sorted(
+        file.relative_to(folder).as_posix()
+        for file in files
+        if file.suffix.lower() in SUFFIXES and not file.name.startswith(".") and file.is_file()
+    )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    try:
+        with Image.open(path) as image:
+            yield image
+    except InputError:
+        raise
+    except Exception as error:  # damaged files make decoders raise anything: OSError, SyntaxError, zlib.error ...
+        raise InputError(
+            f"{path}: expected an image that can be decoded, found {error or type(error).__name__}"
+        ) from error
+
+
+def photo_size(path: Path) -> tuple[int, int]:
+    """Width and height of the pixels as stored; reads the file's header only.
+
+    Raises
+    ------
+    InputError
+        If the file is no image.
+    """
+    with _opened(path) as image:
+        return image.size
+
+
+def orientation(path: Path) -> int:
+    """EXIF orientation, 1 to 8; 1 where the file names none or an unknown one. A PNG is decoded for it.
+
+    Raises
+    ------
+    InputError
+        If the file is no image.
+    """
+    with _opened(path) as image:
+        tag = image.getexif().get(ExifTags.Base.Orientation, 1)
+        return int(tag) if tag in range(1, 9) else 1
+
+
+def upright_size(path: Path) -> tuple[int, int]:
+    """Width and height after the EXIF orientation; see `photo_size` and `orientation`."""
+    width, height = photo_size(path)
+    return (height, width) if orientation(path) >= 5 else (width, height)
+
+
+def is_plain(path: Path) -> bool:
+    """Whether every reader sees these pixels alike: an upright JPEG or PNG, 8-bit RGB or grey.
+
+    Raises
+    ------
+    InputError
+        If the file is no image.
+    """
+    with _opened(path) as image:
+        # An MPO is a JPEG with further pictures behind the first, as some phones and 3D cameras write it.
+        plain = image.format in ("JPEG", "MPO", "PNG") and image.mode in ("RGB", "L")
+        transparent = "transparency" in image.info
+    return plain and not transparent and orientation(path) == 1
+
+
+def write_upright_png(source: Path, target: Path) -> None:
+    """Write the photo `source` as an upright 8-bit RGB PNG, whatever the ending of `target`.
+
+    EXIF data other than the orientation go along: structure from motion finds the focal length there.
+
+    Raises
+    ------
+    InputError
+        If `source` cannot be decoded.
+    """
+    with _opened(source) as image:
+        upright = ImageOps.exif_transpose(image)
+        exif = upright.getexif()
+        rgb = Image.fromarray(_rgb(upright, (0.0, 0.0, 0.0), source))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    rgb.save(target, format="PNG", exif=exif, compress_level=1)  # read once, then deleted: speed before size
+
+
+def read_photo(path: Path, background: tuple[float, float, float], upright: bool) -> NDArray[np.uint8]:
+    """Decode a photo.
+
+    Parameters
+    ----------
+    path : Path
+        Any kind of file in `SUFFIXES`: grey, palette, CMYK, transparent, 16 bits (of which the upper 8 count).
+    background : (3,) float
+        RGB in [0, 1] behind transparent pixels.
+    upright : bool
+        Turn the pixels as the EXIF orientation says; otherwise they stay as they are stored.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        RGB.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, no image, or has floating-point or 32-bit pixels; the message names it.
+    """
+    with _opened(path) as image:
+        return _rgb(ImageOps.exif_transpose(image) if upright else image, background, path)
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """Decode a mask: (H, W) bool, True where the image is white.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be decoded, or has no white but greys: a mask of 0 and 1 would hide everything.
+    """
+    with _opened(path) as image:
+        values = _rgb(image, (0.0, 0.0, 0.0), path).max(axis=2)
+    mask: NDArray[np.bool_] = values >= 128
+    if values.any() and not mask.any():
+        raise InputError(f"{path}: expected a mask of black (0) and white (255), found values up to {values.max()}")
+    return mask
+
+
+def _rgb(image: Image.Image, background: tuple[float, float, float], path: Path) -> NDArray[np.uint8]:
+    if image.mode.startswith("I") or image.mode == "F":  # one channel of 16 or 32 bits
+        grey = np.asarray(image)
+        if image.mode == "F" or grey.min() < 0 or grey.max() > 0xFFFF:
+            raise InputError(
+                f"{path}: expected 8 or 16 bits per channel, found 32 (mode {image.mode}); convert the photo"
+            )
+        return np.repeat((grey.astype(np.uint16) >> 8).astype(np.uint8)[..., None], 3, axis=2)
+    if image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info:
+        rgba = np.asarray(image.convert("RGBA"), dtype=np.float32)
+        alpha = rgba[..., 3:] / 255
+        blended = rgba[..., :3] * alpha + 255 * np.asarray(background, dtype=np.float32) * (1 - alpha)
+        return np.rint(blended).astype(np.uint8)
+    return np.array(image.convert("RGB"))

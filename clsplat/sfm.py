@@ -1,0 +1,414 @@
+"""Cameras from photos, and distorted cameras made pinholes: all that is asked of COLMAP (through pycolmap).
+
+Structure from motion is SIFT on the CPU, matching, incremental mapping: Schoenberger and Frahm 2016,
+doi:10.1109/CVPR.2016.445.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import sqlite3
+import tempfile
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config import SfmConfig
+from clsplat.errors import InputError
+
+# Not only for these names: a Pillow that is loaded after pycolmap 4.2.1 takes over some of the zlib inside it and
+# crashes when it writes a PNG. Loaded first, it keeps its own.
+from clsplat.photos import is_plain, list_photos, photo_folder, photo_size, read_photo, write_upright_png
+
+RECORD = "clsplat_sfm.json"
+"""File beside the model's folder ``0``: of which photos and with which options the model was made."""
+
+SEED = 0
+"""Of RANSAC and of the mapper. With it two runs on one machine gave the same bytes; COLMAP promises no more where
+its bundle adjustment runs on several threads (beyond 50 000 residuals)."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A camera as COLMAP describes it, without its pose.
+
+    Parameters
+    ----------
+    model : str
+        Name of a COLMAP camera model.
+    params : tuple of float
+        Its parameters in COLMAP's order, focal lengths and principal point in pixels.
+    width, height : int
+        Image size in pixels.
+    """
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+
+def undistorted(intrinsics: Intrinsics) -> Intrinsics:
+    """The pinhole camera that COLMAP's undistorter makes of a camera.
+
+    Parameters
+    ----------
+    intrinsics : Intrinsics
+        Any perspective or fisheye model.
+
+    Returns
+    -------
+    Intrinsics
+        Of model PINHOLE. Where the camera is one already, its size stays; otherwise it sees the largest centred
+        rectangle that holds no pixel from outside the photo (COLMAP's blank_pixels = 0).
+
+    Raises
+    ------
+    InputError
+        If the model does not exist, has another number of parameters, or cannot become a pinhole.
+    """
+    if intrinsics.model == "PINHOLE":
+        return intrinsics
+    if intrinsics.model == "SIMPLE_PINHOLE":
+        f, cx, cy = intrinsics.params
+        return replace(intrinsics, model="PINHOLE", params=(f, f, cx, cy))
+    pycolmap = _pycolmap()
+    camera = _camera(intrinsics)
+    if is_pinhole(intrinsics):
+        params = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
+        return replace(intrinsics, model="PINHOLE", params=params)
+    if not camera.is_perspective():
+        raise InputError(
+            f"camera model {intrinsics.model}: expected a perspective or fisheye camera, which can become a pinhole"
+        )
+    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(blank_pixels=0.0), camera)
+    return Intrinsics("PINHOLE", tuple(map(float, pinhole.params)), pinhole.width, pinhole.height)
+
+
+def is_pinhole(intrinsics: Intrinsics) -> bool:
+    """Whether the camera maps straight lines to straight lines: no distortion coefficient is set.
+
+    Fisheye models are none even with all coefficients zero, since their radius grows with the angle.
+    """
+    if intrinsics.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return True
+    camera = _camera(intrinsics)
+    return bool(camera.is_perspective_pinhole() and camera.is_undistorted())
+
+
+def project(intrinsics: Intrinsics, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where points appear in the distorted photo.
+
+    Parameters
+    ----------
+    intrinsics : Intrinsics
+        Of any model.
+    points : (N, 3) float64
+        In camera coordinates (x right, y down, z forward).
+
+    Returns
+    -------
+    (N, 2) float64
+        In pixels, from the upper left corner of the photo; NaN behind the camera.
+    """
+    pixels: NDArray[np.float64] = _camera(intrinsics).img_from_cam(points)
+    return pixels
+
+
+def _camera(intrinsics: Intrinsics) -> Any:
+    pycolmap = _pycolmap()
+    try:
+        camera = pycolmap.Camera.create_from_model_name(1, intrinsics.model, 1.0, intrinsics.width, intrinsics.height)
+    except ValueError as error:
+        raise InputError(
+            f"camera model: expected one of {', '.join(_models())}, found {intrinsics.model!r}"
+        ) from error
+    if len(camera.params) != len(intrinsics.params):
+        raise InputError(
+            f"camera model {intrinsics.model}: expected {len(camera.params)} parameters ({camera.params_info}), "
+            f"found {len(intrinsics.params)}"
+        )
+    camera.params = intrinsics.params
+    return camera
+
+
+def _models() -> list[str]:
+    """Camera models that can become a pinhole."""
+    return [name for name in _pycolmap().CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
+
+
+def _pycolmap() -> ModuleType:
+    import pycolmap
+
+    return pycolmap
+
+
+def read_record(folder: Path) -> dict[str, Any] | None:
+    """What `reconstruct` noted about the model in `folder`.
+
+    Returns
+    -------
+    dict or None
+        ``photos``: path of the photos' dataset, relative to `folder` or absolute; ``hashes``: BLAKE2 of each photo by
+        name; ``options``: fields of the `SfmConfig`; ``registered``: number of photos with a pose. None where
+        `folder` has no model of ours.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged.
+    """
+    path = folder / "sparse" / RECORD
+    if not path.is_file():
+        return None
+    try:
+        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        SfmConfig(**record["options"])
+        if not isinstance(record["hashes"], dict) or not isinstance(record["registered"], int):
+            raise TypeError("hashes or registered of another type")
+        return {**record, "photos": str(record["photos"])}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: expected the record of a structure from motion, found {error!r}; to redo it, "
+            f"delete {path.parent}"
+        ) from error
+
+
+def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, verbose: bool = False) -> Path:
+    """Recover cameras and sparse points from photos; reuse the model where photos and options are unchanged.
+
+    Parameters
+    ----------
+    photos : Path
+        Folder with photos, or whose folder ``images`` has them (with sub-folders). At least 3 that overlap.
+    config : SfmConfig
+        Options.
+    output : Path, optional
+        Folder in which the model is put; it then refers to `photos`, and `clsplat.io.load_scene` loads it. Default:
+        `photos`.
+    verbose : bool
+        Show COLMAP's own messages.
+
+    Returns
+    -------
+    Path
+        ``sparse/0`` in `output`: the largest model, in COLMAP's binary format. It describes the photos upright, as
+        their EXIF orientation says.
+
+    Raises
+    ------
+    InputError
+        If there are no photos, one is damaged, too few can be registered, the folder cannot be written or holds a
+        model that is not ours.
+    """
+    photos = Path(photos)
+    output = photos if output is None else Path(output)
+    if not photos.is_dir():
+        raise InputError(f"{photos}: expected a folder of photos, found {'a file' if photos.exists() else 'nothing'}")
+    names = list_photos(photos)
+    if len(names) < max(config.min_registered, 2):
+        raise InputError(
+            f"{photo_folder(photos)}: expected at least {max(config.min_registered, 2)} photos, found {len(names)}"
+        )
+    _check_options(config)
+    model = output / "sparse" / "0"
+    hashes = _hashes(photo_folder(photos), names)
+    record = read_record(output)
+    if record is None and (output / "sparse").exists():
+        raise InputError(
+            f"{output / 'sparse'}: expected no such folder or a model of ours, found one of others; remove it, or "
+            "choose another folder with -o"
+        )
+    if record is not None and (model / "images.bin").is_file() and _is_fresh(record, hashes, config):
+        _check_registered(record["registered"], len(names), photos, config)
+        return model
+
+    folder = photo_folder(photos)
+    with _workspace(output) as work, _quiet(verbose):
+        found = _largest_model(_readable(folder, names, work), names, work, config)
+        registered = 0 if found is None else int(found.num_reg_images())
+        _check_registered(registered, len(names), photos, config)
+        (work / "sparse" / "0").mkdir(parents=True)
+        found.write_binary(work / "sparse" / "0")
+        where = "." if output.resolve() == photos.resolve() else str(photos.resolve())
+        record = {"photos": where, "registered": registered, "options": asdict(config), "hashes": hashes}
+        (work / "sparse" / RECORD).write_text(json.dumps(record, indent=1), encoding="utf-8")
+        if (output / "sparse").exists():
+            os.replace(output / "sparse", work / "stale")
+        os.replace(work / "sparse", output / "sparse")
+    return model
+
+
+def _check_options(config: SfmConfig) -> None:
+    if config.matching not in ("exhaustive", "sequential"):
+        raise InputError(f"matching: expected exhaustive or sequential, found {config.matching!r}")
+    if config.camera_model not in _models():
+        raise InputError(f"camera_model: expected one of {', '.join(_models())}, found {config.camera_model!r}")
+    if config.max_image_size < 1:
+        raise InputError(f"max_image_size: expected a number of pixels, found {config.max_image_size}")
+
+
+def _check_registered(registered: int, count: int, photos: Path, config: SfmConfig) -> None:
+    if registered < max(config.min_registered, 2):
+        raise InputError(
+            f"{photos}: expected structure from motion to find the poses of at least {max(config.min_registered, 2)} "
+            f"photos, found those of {registered} of {count}; take more photos that overlap by two thirds, sharp, of "
+            "a scene with texture, from places that differ"
+        )
+
+
+def _hashes(folder: Path, names: list[str]) -> dict[str, str]:
+    return {name: hashlib.blake2b((folder / name).read_bytes(), digest_size=16).hexdigest() for name in names}
+
+
+def _is_fresh(record: dict[str, Any], hashes: dict[str, str], config: SfmConfig) -> bool:
+    # How many photos must be registered changes nothing in the model: it is checked against it afterwards.
+    options = replace(SfmConfig(**record["options"]), min_registered=config.min_registered)
+    return record["hashes"] == hashes and options == config
+
+
+@contextmanager
+def _workspace(output: Path) -> Iterator[Path]:
+    """Temporary folder inside `output`, so that what is made in it can be renamed to its place."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=".clsplat_sfm_", dir=output))
+    except OSError as error:
+        raise InputError(
+            f"{output}: expected a folder in which the cameras found can be kept, found: {error.strerror}; copy the "
+            "photos to a folder that can be written, or put the cameras elsewhere by `clsplat sfm PHOTOS -o DIR` and "
+            "give DIR instead of the photos"
+        ) from error
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+@contextmanager
+def _quiet(verbose: bool) -> Iterator[None]:
+    logging = _pycolmap().logging
+    before = logging.minloglevel
+    logging.minloglevel = before if verbose else int(logging.ERROR)
+    try:
+        yield
+    finally:
+        logging.minloglevel = before
+
+
+def _readable(folder: Path, names: list[str], work: Path) -> Path:
+    """Folder in which COLMAP reads the pixels that training reads: `folder`, or a copy of it where it would not.
+
+    COLMAP ignores the EXIF orientation, and skips files that it cannot decode without an error; hence every photo is
+    decoded here first.
+    """
+    from tqdm import tqdm
+
+    def check(name: str) -> bool:
+        read_photo(folder / name, (0.0, 0.0, 0.0), upright=False)
+        return is_plain(folder / name)
+
+    def copy(name: str, plain: bool) -> None:
+        if not plain:
+            return write_upright_png(folder / name, work / "photos" / name)
+        (work / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(folder / name, work / "photos" / name)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        plain = list(tqdm(pool.map(check, names), "check photos", len(names), unit="photo", dynamic_ncols=True))
+        if all(plain):
+            return folder
+        list(tqdm(pool.map(copy, names, plain), "turn photos", len(names), unit="photo", dynamic_ncols=True))
+    return work / "photos"
+
+
+def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig) -> Any:
+    """Run the three stages; None where no two photos make a start."""
+    from tqdm import tqdm
+
+    pycolmap = _pycolmap()
+    database = work / "database.db"
+    pycolmap.Database.open(database).close()
+
+    by_size: dict[tuple[int, int], list[str]] = {}
+    for name in names:
+        by_size.setdefault(photo_size(folder / name), []).append(name)
+    reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
+    extraction = pycolmap.FeatureExtractionOptions(max_image_size=config.max_image_size, use_gpu=False)
+    with _progress(database, "keypoints", len(names), "features", "photo"):
+        for group in by_size.values():  # COLMAP's single camera has one size: upright photos need a second one
+            pycolmap.set_random_seed(SEED)
+            pycolmap.extract_features(
+                database,
+                folder,
+                image_names=group,
+                camera_mode=pycolmap.CameraMode.SINGLE if config.single_camera else pycolmap.CameraMode.PER_IMAGE,
+                reader_options=reader,
+                extraction_options=extraction,
+                device=pycolmap.Device.cpu,
+            )
+
+    exhaustive = config.matching == "exhaustive"
+    match = pycolmap.match_exhaustive if exhaustive else pycolmap.match_sequential
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    pairs = len(names) * (len(names) - 1) // 2 if exhaustive else None
+    with _progress(database, "two_view_geometries", pairs, "matches", "pair"):
+        pycolmap.set_random_seed(SEED)
+        match(database, verification_options=verification, device=pycolmap.Device.cpu)
+
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=max(config.min_registered, 2), random_seed=SEED)
+    (work / "models").mkdir()
+    with tqdm(total=len(names), desc="poses", unit="photo", dynamic_ncols=True) as bar:
+
+        def start() -> None:  # of a model: COLMAP begins anew where photos are left that do not fit the first
+            bar.n = 2
+            bar.refresh()
+
+        pycolmap.set_random_seed(SEED)
+        models = pycolmap.incremental_mapping(
+            database,
+            folder,
+            work / "models",
+            options=options,
+            initial_image_pair_callback=start,
+            next_image_callback=bar.update,
+        )
+    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+
+
+@contextmanager
+def _progress(database: Path, table: str, total: int | None, label: str, unit: str) -> Iterator[None]:
+    """Progress bar that counts the rows of a table of COLMAP's database while COLMAP fills it and says nothing."""
+    from tqdm import tqdm
+
+    ended = threading.Event()
+
+    def follow() -> None:
+        while not ended.wait(0.5):
+            # Read-only, and the database is in WAL mode: COLMAP never waits for this.
+            with (
+                suppress(sqlite3.Error),
+                closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as rows,
+            ):
+                bar.n = rows.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
+                bar.refresh()
+
+    with tqdm(total=total, desc=label, unit=unit, dynamic_ncols=True) as bar:
+        thread = threading.Thread(target=follow, daemon=True)
+        thread.start()
+        try:
+            yield
+            bar.n = total or bar.n
+        finally:
+            ended.set()
+            thread.join()
