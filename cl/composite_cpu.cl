@@ -1,7 +1,6 @@
 // Stage composite, variant for CPUs: splats to pixels, front to back, and gradients back.
 //
-//   image = sum_i colour_i alpha_i T_i + T_end background,  alpha = 1 - T_end     (Kerbl et al. 2023,
-//   equation 3)
+//   image = sum_i colour_i alpha_i T_i + T_end background,  alpha = 1 - T_end   (Kerbl et al. 2023, equation 3)
 // A pixel skips pairs with alpha < ALPHA_MIN and stops before T would fall to TRANSMITTANCE_MIN or below.
 // composite.h holds the mathematics, composite_gpu.cl the variant for GPUs, clsplat/reference/composite.py
 // the twin.

@@ -1,20 +1,19 @@
 // Stage loss: (1 - lambda) L1 + lambda (1 - SSIM) of an image against a photo, and its gradient.
 //
-//   SSIM = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sxx + syy + C2))          (Wang et al. 2004,
-//   equation 13)
+//   SSIM = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sxx + syy + C2))   (Wang et al. 2004, equation 13)
 // with Gaussian-weighted moments over an 11x11 window, zero padding and population variances; both terms are
 // means over all pixels and channels (Kerbl et al. 2023, equation 7). A mask weights image and photo alike
 // before either term. docs/stages/loss.md derives the gradient; clsplat/reference/loss.py is the twin.
 //
 // How does it work? The window is separable. Planes with margins of zeros wide enough for the window need no
 // borders.
-//   loss_planes      image and photo, masked, to planes                                             one item
-//   per pixel loss_blur_rows   the five moments x, y, xx, yy, xy blurred along rows one item per segment
-//   loss_ssim        the same along columns; SSIM's sum; its derivatives by mx, E[xx] and E[xy]     one item
-//   per segment loss_blur_rows3  the derivatives blurred along rows (the window is symmetric: its own
-//   adjoint)  one item per segment loss_grad        the same along columns, combined to v_image; L1's sum one
-//   item per segment
-// A segment is SEGMENT neighbouring pixels of a row: one vector.
+//   loss_planes      image and photo, masked, to planes
+//   loss_blur_rows   the five moments x, y, xx, yy, xy blurred along rows
+//   loss_ssim        the same along columns; SSIM's sum; its derivatives by mx, E[xx] and E[xy]
+//   loss_blur_rows3  the derivatives blurred along rows (the window is symmetric: its own adjoint)
+//   loss_grad        the same along columns, combined to v_image; L1's sum
+// Mapping: one work-item per pixel (loss_planes) or per segment (the others): SEGMENT neighbouring pixels of a row,
+// one vector.
 //
 // Buffers: image[H,W,3], photo[H,W,3] u8, mask[H,W] u8 (0 or 1; not read where masked is 0), v_image[H,W,3];
 //   a plane is [3, HEIGHT + 2 RADIUS, pitch] with its pixel (0, 0) at row RADIUS, column SEGMENT;

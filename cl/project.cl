@@ -5,16 +5,14 @@
 // alpha < ALPHA_MIN, its opacity and its colour:
 //   cov2d = J W Sigma W^T J^T + BLUR I,  Sigma = R S S^T R^T          (Kerbl et al. 2023, equations 5 and 6)
 //   colour = max(SH(direction) + 1/2, 0)                               (original code)
-//   antialiased: opacity * sqrt(det(cov2d - BLUR I)/det(cov2d))        (Yu et al. 2024, "Mip-Splatting",
-//   equation 10)
+//   antialiased: opacity * sqrt(det(cov2d - BLUR I)/det(cov2d))        (Yu et al. 2024, "Mip-Splatting", equation 10)
 // docs/stages/project.md derives the gradients; clsplat/reference/project.py is the float64 twin.
 //
 // Mapping: one work-item per Gaussian, no local memory except for VIEWMAT_GRAD.
 //
 // Buffers, N Gaussians with K = (degree + 1)^2 coefficients stored, C = CHANNELS:
-//   in   means[N,3] world, log_scales[N,3] ln(world), quats[N,4] wxyz of any norm, logit_opacities[N],
-//   sh[N,K,3] out  means2d[N,2] px, conics[N,3] px^-2 (xx, xy, yy), depths[N] world, extents[N,2] px,
-//   opacities[N],
+//   in   means[N,3] world, log_scales[N,3] ln(world), quats[N,4] wxyz of any norm, logit_opacities[N], sh[N,K,3]
+//   out  means2d[N,2] px, conics[N,3] px^-2 (xx, xy, yy), depths[N] world, extents[N,2] px, opacities[N],
 //        colors[N,C] (RGB, then the depth if C is 4)
 //        An invisible Gaussian has extents 0 and all its other outputs 0.
 //   v_x  is the gradient with respect to x; v_viewmat[groups,12] holds a partial sum per work-group of the

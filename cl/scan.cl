@@ -5,10 +5,9 @@
 //
 // How does it work? Reduce, then scan (OpenCL promises no forward progress between work-groups, so no
 // look-back): work-item p of P owns the contiguous chunk [p ceil(n/P), (p+1) ceil(n/P)).
-//   scan_reduce  work-item p writes the sum of its chunk to sums[p]                        (P work-items)
-//   scan_spine   one work-group turns sums into exclusive prefix sums, the total in sums[P]  (GROUP
-//   work-items) scan_down    work-item p rewrites its chunk as prefix sums that start at sums[p]       (P
-//   work-items)
+//   scan_reduce  work-item p writes the sum of its chunk to sums[p]                          (P work-items)
+//   scan_spine   one work-group turns sums into exclusive prefix sums, the total in sums[P]  (GROUP work-items)
+//   scan_down    work-item p rewrites its chunk as prefix sums that start at sums[p]         (P work-items)
 // P is small on a CPU (a few chunks per core) and thousands on a GPU; it changes nothing in the result.
 //
 // Buffers: in[n] u32, sums[P + 1] u64, out[n + 1] u32.

@@ -9,8 +9,7 @@
 //   sort_count    each work-item counts the digits of its run in local memory; the block's totals go to
 //                 histogram[digit][g]
 //   (stage scan)  turns the histogram, digit-major, into the position of each block's first key of each digit
-//   sort_scatter  counts again, turns the counts of the runs into positions, and writes keys and values in
-//   order
+//   sort_scatter  counts again, turns the counts of the runs into positions, and writes keys and values in order
 // With GROUP = 1 a block is a sequential counting sort, which is what a CPU core does best; on a GPU a block
 // is a work-group. Runs are in the order of work-items, blocks in the order of groups: stable.
 //
