@@ -19,8 +19,8 @@
 #include "common.h"
 #include "ellipse.h"
 
-#ifndef TILE
-#error "-DTILE must give the edge of a tile in pixels"
+#if !defined(TILE) || TILE < 1
+#error "-DTILE must give the edge of a tile in pixels, 1 or more"
 #endif
 
 // Walks the tiles of splat g; writes them from slot first on, if emitting. Returns their number.

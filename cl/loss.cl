@@ -28,8 +28,8 @@
 #endif
 
 #define SEGMENT 16
-#if RADIUS > SEGMENT
-#error "-DRADIUS must be at most 16, the margin of a plane"
+#if RADIUS < 0 || RADIUS > SEGMENT
+#error "-DRADIUS must be 0 to 16, the margin of a plane"
 #endif
 
 __constant real taps[2 * RADIUS + 1] = {SSIM_TAPS};

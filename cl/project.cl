@@ -30,10 +30,10 @@
 #if !defined(CHANNELS) || (CHANNELS != 3 && CHANNELS != 4)
 #error "-DCHANNELS must be 3 (RGB) or 4 (RGB and depth)"
 #endif
-#if !defined(ANTIALIASED) || !defined(VIEWMAT_GRAD)
+#if !defined(ANTIALIASED) || !defined(VIEWMAT_GRAD) || ANTIALIASED & ~1 || VIEWMAT_GRAD & ~1
 #error "-DANTIALIASED and -DVIEWMAT_GRAD must be 0 or 1"
 #endif
-#if VIEWMAT_GRAD && !defined(GROUP)
+#if VIEWMAT_GRAD && (!defined(GROUP) || GROUP < 1)
 #error "-DVIEWMAT_GRAD=1 needs -DGROUP, the work-group size of project_bwd"
 #endif
 

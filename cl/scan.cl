@@ -14,7 +14,7 @@
 // -DGROUP   work-group size of scan_spine, at least 1
 #include "common.h"
 
-#ifndef GROUP
+#if !defined(GROUP) || GROUP < 1
 #error "-DGROUP must give the work-group size of scan_spine, at least 1"
 #endif
 

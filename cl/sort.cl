@@ -21,8 +21,8 @@
 // -DKEY_BITS=32|64   width of a key
 // -DDIGIT_BITS       bits per pass, 1 to 16
 // -DGROUP            work-group size of the radix kernels, at least 1
-// -DBITONIC          capacity of the bitonic sort, a power of two
-// -DBITONIC_GROUP    its work-group size, at most BITONIC / 2
+// -DBITONIC          capacity of the bitonic sort, a power of two, at least 2
+// -DBITONIC_GROUP    its work-group size, 1 to BITONIC / 2
 #include "common.h"
 
 #if KEY_BITS == 32
@@ -34,11 +34,17 @@ typedef ulong sort_key;
 #else
 #error "-DKEY_BITS must be 32 or 64"
 #endif
-#if !defined(DIGIT_BITS) || !defined(GROUP) || !defined(BITONIC) || !defined(BITONIC_GROUP)
-#error "-DDIGIT_BITS, -DGROUP, -DBITONIC and -DBITONIC_GROUP must be given"
+#if !defined(DIGIT_BITS) || DIGIT_BITS < 1 || DIGIT_BITS > 16
+#error "-DDIGIT_BITS must be 1 to 16"
 #endif
-#if BITONIC & (BITONIC - 1)
-#error "-DBITONIC must be a power of two"
+#if !defined(GROUP) || GROUP < 1
+#error "-DGROUP must give the work-group size of the radix kernels, at least 1"
+#endif
+#if !defined(BITONIC) || BITONIC < 2 || BITONIC & (BITONIC - 1)
+#error "-DBITONIC must be a power of two, at least 2"
+#endif
+#if !defined(BITONIC_GROUP) || BITONIC_GROUP < 1 || BITONIC_GROUP > BITONIC / 2
+#error "-DBITONIC_GROUP must be 1 to BITONIC / 2"
 #endif
 
 #define DIGITS (1u << DIGIT_BITS)

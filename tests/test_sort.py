@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat import ops, reference
+from clsplat.errors import InputError
 from clsplat.ops.sort import BITONIC_MAX
 
 # Around runs of 16 keys, work-groups of 64, the bitonic sort's capacity, and blocks of 64 x 16 keys.
@@ -52,6 +53,12 @@ def test_bitonic(configured_device, n, width, kind):
 @pytest.mark.parametrize("n", [BITONIC_MAX, BITONIC_MAX + 1])
 def test_automatic_choice(device, n):
     check(device, keys_of("few", n, 32, np.uint32), 32, "auto")
+
+
+def test_too_many_for_a_bitonic_sort(device):
+    keys = device.upload("keys", np.zeros(BITONIC_MAX + 1), np.uint32)
+    with pytest.raises(InputError, match="keys: expected at most 1024 for a bitonic sort, found 1025"):
+        ops.argsort(device, keys, 32, "bitonic")
 
 
 @pytest.mark.parametrize("bits", [1, 4, 5, 11, 12, 23])

@@ -4,6 +4,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from clsplat.device import Device
+from clsplat.errors import InputError
 from clsplat.ops.scan import exclusive_scan
 
 # Longest list that one work-group sorts in local memory: 12 KiB with 64-bit keys, within the 16 KiB of the smallest
@@ -28,8 +29,15 @@ def argsort(device: Device, keys: Array, bits: int, method: str = "auto") -> tup
     sorted_keys : (n,) of the keys' type
     order : (n,) uint32
         sorted_keys = keys[order]; equal keys keep their order.
+
+    Raises
+    ------
+    InputError
+        If there are more keys than a bitonic sort that was asked for can hold.
     """
     n = keys.shape[0]
+    if method == "bitonic" and n > BITONIC_MAX:
+        raise InputError(f"keys: expected at most {BITONIC_MAX} for a bitonic sort, found {n}; use the radix sort")
     defines = {
         "KEY_BITS": 8 * keys.dtype.itemsize,
         # A core counts 2048 digits in its L1 cache; a GPU's work-item keeps 16 counters in local memory.

@@ -1,0 +1,195 @@
+"""The promises of the design: five files for a stage, imports one way, kernels that are OpenCL C by themselves."""
+
+import ast
+import inspect
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pyopencl as cl
+import pytest
+
+from clsplat import ops, reference
+from clsplat.device import MODEL_CONSTANTS, inline_includes, kernel_folder
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "clsplat"
+STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__init__")
+
+# A module imports from rows above its own only; a package is one unit.
+LAYERS = """
+    constants errors stages randomness
+    config photos
+    camera gaussians sfm
+    scene structs device reference metrics raytrace orbit
+    ops io testing still_life
+    render optim densify initialize checkpoint report demo
+    train rasterization
+    evaluate
+    bench viewer
+    cli
+""".strip().splitlines()
+LAYER = {unit: depth for depth, row in enumerate(LAYERS) for unit in row.split()}
+
+# Where a foreign package may be imported at all, whose absence or weight the rest must not feel.
+ONLY_IN = {"pyopencl": {"device", "ops"}, "pycolmap": {"sfm"}}
+
+
+def imports_of(path):
+    """Dotted names that a module imports, wherever in it."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path.name}: relative import"
+            # `from clsplat import x` imports the module clsplat.x.
+            names |= {f"clsplat.{a.name}" for a in node.names} if node.module == "clsplat" else {str(node.module)}
+    return names
+
+
+def unit_of(path):
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+MODULES = [p for p in sorted(PACKAGE.rglob("*.py")) if p != PACKAGE / "__init__.py"]
+EACH_MODULE = pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_five_files_for_each_stage(stage):
+    assert (PACKAGE / "reference" / f"{stage}.py").is_file()
+    assert (ROOT / "tests" / f"test_{stage}.py").is_file()
+    assert (ROOT / "docs" / "stages" / f"{stage}.md").is_file()
+    kernels = [p.name for p in kernel_folder().glob(f"{stage}*.cl")]
+    assert kernels == [f"{stage}.cl"] or sorted(kernels) == [f"{stage}_cpu.cl", f"{stage}_gpu.cl"]
+
+
+def test_no_kernel_without_a_stage():
+    assert {p.stem.split("_")[0] for p in kernel_folder().glob("*.cl")} == set(STAGES)
+
+
+def test_ops_and_reference_have_the_same_names():
+    assert sorted(ops.__all__) == sorted(reference.__all__)
+
+
+@pytest.mark.parametrize("name", ops.__all__)
+def test_ops_and_reference_have_the_same_signatures(name):
+    device, *launched = inspect.signature(getattr(ops, name)).parameters.values()
+    twin = inspect.signature(getattr(reference, name)).parameters.values()
+    assert device.name == "device"
+    assert [(p.name, p.kind, p.default) for p in launched] == [(p.name, p.kind, p.default) for p in twin]
+
+
+@EACH_MODULE
+def test_imports_go_one_way(path):
+    unit = unit_of(path)
+    assert unit in LAYER, f"give {unit} a place in LAYERS"
+    for name in imports_of(path):
+        root, *rest = name.split(".")
+        if root == "clsplat" and rest and rest[0] != unit:
+            assert LAYER[rest[0]] < LAYER[unit], f"{path.name} imports {name}"
+        elif root in ONLY_IN:
+            assert unit in ONLY_IN[root], f"{path.name} imports {name}"
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if unit_of(p) == "reference"], ids=lambda p: p.stem)
+def test_twins_import_numpy_only(path):
+    ours = {f"clsplat.{unit}" for unit in ("camera", "constants", "gaussians", "stages")}
+    for name in imports_of(path):
+        allowed = name in ours or name.startswith("clsplat.reference.") or name.split(".")[0] == "numpy"
+        assert allowed or name.split(".")[0] in sys.stdlib_module_names, name
+
+
+def test_import_is_light():
+    heavy = {"pyopencl", "scipy", "matplotlib", "skimage", "pycolmap", "plyfile", "PIL"}
+    code = "import clsplat, sys; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert not heavy & {name.split(".")[0] for name in loaded.stdout.split()}
+
+
+def test_no_path_of_a_machine():
+    if not (ROOT / ".git").exists() or shutil.which("git") is None:
+        pytest.skip("not a git checkout: what belongs to the project cannot be told from what lies beside it")
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    pattern = re.compile(r"(?<![\w./:~-])/(?:home|root|Users|work|mnt|media|srv)/\w|\b[A-Z]:\\\w")
+    found = []
+    for name in filter(None, listed.split("\0")):
+        try:
+            text = (ROOT / name).read_text(encoding="utf-8")
+        except (UnicodeDecodeError, FileNotFoundError):  # a picture; deleted, but not committed yet
+            continue
+        found += [f"{name}: {match[0]}" for match in pattern.finditer(text)]
+    assert not found, found
+
+
+# What each file's header documents, with values it allows.
+DEFINES = {
+    "bin": {"TILE": 16},
+    "composite_cpu": {"TILE": 8, "CHANNELS": 1},
+    "composite_gpu": {"TILE": 8, "CHANNELS": 1, "BATCH": 16},
+    "loss": {"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
+    "project": {"CHANNELS": 4, "ANTIALIASED": 1, "VIEWMAT_GRAD": 1, "GROUP": 32},
+    "scan": {"GROUP": 32},
+    "sort": {"KEY_BITS": 64, "DIGIT_BITS": 4, "GROUP": 32, "BITONIC": 64, "BITONIC_GROUP": 32},
+}
+FORBIDDEN = [
+    ("bin", "TILE", 0),
+    ("composite_cpu", "TILE", 12),
+    ("composite_cpu", "CHANNELS", 0),
+    ("composite_gpu", "TILE", 32),
+    ("composite_gpu", "CHANNELS", 0),
+    ("composite_gpu", "BATCH", 0),
+    ("loss", "RADIUS", 17),
+    ("project", "CHANNELS", 5),
+    ("project", "ANTIALIASED", 2),
+    ("project", "VIEWMAT_GRAD", 2),
+    ("project", "GROUP", 0),
+    ("scan", "GROUP", 0),
+    ("sort", "KEY_BITS", 16),
+    ("sort", "DIGIT_BITS", 17),
+    ("sort", "GROUP", 0),
+    ("sort", "BITONIC", 100),
+    ("sort", "BITONIC_GROUP", 64),
+]
+EACH_KERNEL = pytest.mark.parametrize("name", sorted(p.stem for p in kernel_folder().glob("*.cl")))
+
+
+@EACH_KERNEL
+def test_kernels_build_as_documented(any_device, name):
+    header = (kernel_folder() / f"{name}.cl").read_text().split("#include")[0]
+    assert set(re.findall(r"-D([A-Z0-9_]+)", header)) == set(DEFINES[name])
+    assert any_device.program(name, DEFINES[name]).all_kernels()
+
+
+@EACH_KERNEL
+def test_a_missing_define_is_a_sentence(device, name):
+    for missing in DEFINES[name]:
+        defines = {key: value for key, value in DEFINES[name].items() if key != missing}
+        with pytest.raises(cl.RuntimeError, match=f"error: .*-D{missing}\\b"):
+            device.program(name, defines)
+
+
+@pytest.mark.parametrize(("name", "define", "value"), FORBIDDEN)
+def test_a_forbidden_define_is_a_sentence(device, name, define, value):
+    with pytest.raises(cl.RuntimeError, match=f"error: .*-D{define}\\b"):
+        device.program(name, DEFINES[name] | {define: value})
+
+
+def test_missing_constants_are_a_sentence(device):
+    source = inline_includes("scan.cl", kernel_folder())
+    constants = [f"-D{name}=1" for name in MODEL_CONSTANTS]
+    for k in range(len(constants)):
+        with pytest.raises(cl.RuntimeError, match=r"the constants of .* must be passed as -D"):
+            cl.Program(device.context, source).build(["-DGROUP=1", *constants[:k], *constants[k + 1 :]])
+
+
+def test_kernels_are_formatted():
+    if shutil.which("clang-format") is None:
+        pytest.skip("clang-format is missing: install it to check the kernels' format")
+    files = sorted(kernel_folder().glob("*.cl")) + sorted(kernel_folder().glob("*.h"))
+    command = ["clang-format", "--dry-run", "--Werror", *map(str, files)]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
