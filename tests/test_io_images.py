@@ -13,13 +13,14 @@ from clsplat.io.images import (
     Dataset,
     PhotosMissing,
     PosedPhoto,
+    _positions,
     checked_name,
     find_mask,
     load_views,
     locate,
     mask_folder,
 )
-from clsplat.sfm import Intrinsics
+from clsplat.sfm import Intrinsics, undistorted
 
 RNG = np.random.default_rng(11)
 PINHOLE = Intrinsics("PINHOLE", (50.0, 60.0, 30.0, 25.0), 64, 48)
@@ -279,6 +280,36 @@ def test_distortion_is_undone(tmp_path, model, size):
     # Two roundings to 8 bits are 1; bilinear interpolation of 100 sin(12 x) in steps h is 100 * 12^2/8 * h^2, with
     # h = 1/120 (1/60 at half size), and up to 3 times that where a fisheye shrinks. Half a pixel off gives 5 (10).
     assert error.max() < 1.5 + 3 * 1800 * (160 / size[0] / 120) ** 2
+
+
+@pytest.mark.parametrize("model", DISTORTED)
+def test_undistortion_agrees_with_colmaps(tmp_path, model):
+    import pycolmap
+
+    intrinsics = Intrinsics(model, DISTORTED[model], 160, 120)
+    camera = pycolmap.Camera.create_from_model_name(1, model, 1.0, 160, 120)
+    camera.params = intrinsics.params
+    photo = distorted_photo(intrinsics, 160, 120)
+    options = pycolmap.UndistortCameraOptions(blank_pixels=0.0)
+    theirs, pinhole = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(photo), camera)
+    (view,) = load(posed(save(tmp_path / "a.png", photo), intrinsics))
+    ours = view.camera
+    assert (ours.width, ours.height) == (pinhole.width, pinhole.height)
+    np.testing.assert_allclose((ours.fx, ours.fy, ours.cx, ours.cy), pinhole.params, rtol=1e-12)
+    inner = np.s_[1:-1, 1:-1]  # at the border COLMAP paints black what lies half a pixel outside
+    # Both are bilinear and rounded once.
+    np.testing.assert_allclose(view.image[inner].astype(int), theirs.to_array()[inner], atol=1)
+
+
+def test_positions_are_the_distortion_of_the_pinholes_rays():
+    """One pixel by hand: SIMPLE_RADIAL is x (1 + k r^2)."""
+    intrinsics = Intrinsics("SIMPLE_RADIAL", (100.0, 60.0, 40.0, 0.1), 120, 80)
+    fx, fy, cx, cy = undistorted(intrinsics).params
+    row, column = 10, 90
+    x, y = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
+    scale = 100 * (1 + 0.1 * (x * x + y * y))
+    positions = _positions(intrinsics, (120, 80), (80, 120))
+    np.testing.assert_allclose(positions[:, row, column], [40 + scale * y - 0.5, 60 + scale * x - 0.5], atol=1e-4)
 
 
 def test_reduction_comes_after_undistortion(tmp_path):

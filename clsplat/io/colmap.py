@@ -273,8 +273,9 @@ def _images_txt(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple
     for number, line in lines:
         if line and not line.startswith("#"):
             try:
-                _, *pose, camera, name = line.split(maxsplit=9)
-                row = name, int(camera), tuple(map(float, pose[:4])), tuple(map(float, pose[4:]))
+                _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
+                quat, translation = map(float, (qw, qx, qy, qz)), map(float, (tx, ty, tz))
+                row = name, int(camera), tuple(quat), tuple(translation)
             except ValueError as error:
                 raise _damaged(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from error
             yield row
