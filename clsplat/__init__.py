@@ -1,1 +1,49 @@
-"""3D Gaussian Splatting on any OpenCL device, without CUDA and without torch."""
+"""3D Gaussian Splatting on any OpenCL device, without CUDA and without torch.
+
+>>> import clsplat
+>>> gaussians, mode, offset = clsplat.load_gaussians("scene.ply")              # doctest: +SKIP
+>>> rendering = clsplat.render(gaussians, camera, device=clsplat.Device())    # doctest: +SKIP
+>>> gradients = rendering.backward(rendering.rgb - photo)                     # doctest: +SKIP
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig, TrainConfig
+from clsplat.errors import ClsplatError
+from clsplat.gaussians import Gaussians
+from clsplat.io import load_gaussians, load_scene, save_gaussians
+from clsplat.rasterization import rasterization
+from clsplat.render import Rendering, render
+from clsplat.scene import Scene, View
+from clsplat.train import train
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+__all__ = [
+    "Camera",
+    "ClsplatError",
+    "Device",
+    "Gaussians",
+    "RenderConfig",
+    "Rendering",
+    "Scene",
+    "TrainConfig",
+    "View",
+    "load_gaussians",
+    "load_scene",
+    "rasterization",
+    "render",
+    "save_gaussians",
+    "train",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # pyopencl takes longer to import than all of this package, and not every use needs it.
+    if name == "Device":
+        from clsplat.device import Device
+
+        return Device
+    raise AttributeError(f"module 'clsplat' has no attribute {name!r}")

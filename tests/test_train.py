@@ -48,9 +48,9 @@ def scene() -> Scene:
     truth.log_scales[:] = np.log(0.15)
     truth.logit_opacities[:] = 1.5
     truth.sh[:, 0] = rng.uniform(-1, 1.5, (40, 3))
-    views = [View(f"{i}.png", c, to_uint8(render(truth, c).rgb)) for i, c in enumerate(cameras(7))]
+    views = [View(f"{i}.png", c, to_uint8(render(truth, c).rgb)) for i, c in enumerate(cameras(13))]
     points = truth.means + rng.normal(0, 0.05, truth.means.shape)
-    return Scene(views[:6], views[6:], points.astype(np.float64), np.full(points.shape, 128, np.uint8))
+    return Scene(views[:12], views[12:], points.astype(np.float64), np.full(points.shape, 128, np.uint8))
 
 
 def same(a: Gaussians, b: Gaussians) -> bool:
@@ -63,12 +63,16 @@ def held_out(gaussians: Gaussians, scene: Scene, device: Device) -> float:
 
 
 def test_it_learns_an_unseen_view(scene: Scene, device: Device, tmp_path: Path) -> None:
-    config = replace(CONFIG, iterations=300, adc=replace(CONFIG.adc, grad_threshold=2e-4, reset_every=1000))
+    optim = replace(
+        CONFIG.optim, means_lr=1.6e-3, means_lr_final=1e-4
+    )  # points are 0.05 off, 600 times the default step
+    adc = replace(CONFIG.adc, max_gaussians=80, reset_every=1000, every=50)
+    config = replace(CONFIG, iterations=300, optim=optim, adc=adc)
     before = held_out(train(scene, replace(config, iterations=1), device, tmp_path), scene, device)
     after = held_out(train(scene, config, device, tmp_path), scene, device)
-    # Measured: 15.6 dB before, 27.5 dB after; without the gradient of any one field it stays below 23 dB.
-    assert after > 25
-    assert after - before > 8
+    # Measured: 16.8 dB before, 25.2 dB after; 24.2 dB or less where means, scales, opacities or colours do not learn.
+    assert before < 18
+    assert after > 24.7
 
 
 def test_two_runs_are_the_same_file(scene: Scene, device: Device, tmp_path: Path) -> None:
@@ -138,9 +142,9 @@ def test_masked_pixels_do_not_matter(scene: Scene, device: Device, tmp_path: Pat
 
 
 def test_every_epoch_takes_every_view_once(scene: Scene) -> None:
-    names = [view_at(i, scene.train, seed=3).name for i in range(1, 13)]
-    assert sorted(names[:6]) == sorted(names[6:]) == [v.name for v in scene.train]
-    assert names[:6] != names[6:]
+    names = [view_at(i, scene.train, seed=3).name for i in range(1, 25)]
+    assert sorted(names[:12]) == sorted(names[12:]) == sorted(v.name for v in scene.train)
+    assert names[:12] != names[12:]
 
 
 def test_a_failed_write_leaves_the_last_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

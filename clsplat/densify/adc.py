@@ -28,6 +28,10 @@ class Adc:
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         self.config, self.seed, self.extent = config.adc, config.seed, extent
         self.start = config.shortened(config.adc.start)
+        # On white, Gaussians in empty space turn white instead of transparent: a reset at the first round of
+        # densification leaves those without use to be pruned (original).
+        self.white = config.data.background == "white"
+        self.first_edit = -(-self.start // config.adc.every) * config.adc.every
         self.stop = round(config.adc.stop_fraction * config.iterations)
         self.statistics: dict[str, Array] = {}
         self._clear(n)
@@ -51,7 +55,7 @@ class Adc:
             edit = self._densify(iteration, gaussians)
             edit = self._prune(iteration, edit)
             self._clear(len(edit.rows))
-        if iteration % c.reset_every == 0:
+        if iteration % c.reset_every == 0 or (self.white and iteration == self.first_edit):
             edit = edit or Edit(gaussians, np.arange(len(gaussians)), np.zeros(len(gaussians), bool))
             lowered = Gaussians(**edit.gaussians.arrays())
             lowered.logit_opacities = np.minimum(lowered.logit_opacities, logit(np.float32(c.reset_opacity)))
