@@ -195,9 +195,9 @@ def _read_points(root: Path, meta: Json, source: Path) -> tuple[NDArray[np.float
 
     path = root / checked_name(str(meta["ply_file_path"]), source)
     try:
-        vertices = PlyData.read(path, mmap=False)["vertex"].data
+        vertices = PlyData.read(path)["vertex"].data
         points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
+    except (OSError, PlyParseError, KeyError, ValueError, MemoryError) as error:
         raise InputError(f"{path}: expected a PLY file of points x, y, z, as {source.name} says: {error}") from error
     if not np.isfinite(points).all():
         raise InputError(f"{path}: expected finite points, found NaN or infinity")
