@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import clsplat
 from clsplat import cli, config, constants, densify, ops
 
 ROOT = Path(__file__).parents[1]
@@ -23,6 +24,12 @@ def test_python_examples_run(page, device, monkeypatch, tmp_path):
     names: dict[str, object] = {}
     for example in examples:
         exec(compile(example, page, "exec"), names)
+
+
+def test_every_public_name_is_listed():
+    page = (DOCS / "api" / "index.rst").read_text()
+    for name in clsplat.__all__:
+        assert re.search(rf"^   ~clsplat\.\w+\.{name}$", page, flags=re.M), name
 
 
 def test_every_configuration_has_a_table():
