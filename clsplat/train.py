@@ -106,7 +106,7 @@ def train(
         If the loss stops being finite.
     """
     if not scene.train:
-        raise InputError("scene: expected at least one photo to train on, found none; lower --data.test-every")
+        raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
     state = load_state(out, scene, config) if resume else initial_state(scene, config)
     photos = _Photos(device, scene.train)
     losses: list[float] = []
