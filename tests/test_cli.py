@@ -201,7 +201,7 @@ def test_a_buffer_beyond_the_device_is_named(
     monkeypatch.setattr(
         Device,
         "_check_size",
-        lambda self, what, nbytes: check(self, what, nbytes << 50 if what == "gradients per intersection" else nbytes),
+        lambda self, what, nbytes: check(self, what, nbytes << (50 if what == "gradients per intersection" else 0)),
     )
     message = fails(capsys, "train", dataset, "-o", tmp_path / "out", *TRAIN)
     assert "gradients per intersection: needs a buffer of" in message
