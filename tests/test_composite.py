@@ -161,6 +161,9 @@ def check_gradients(device, compositor, splats, width, height, tile_size=16):
 
     v = backward(device, compositor, splats, bins, image, v_image)
     gradcheck(scalar, {name: getattr(splats, name) for name in SplatGrads._fields}, v._asdict())
+    v_twin = reference.composite_bwd(splats, bins, image, v_image)
+    for name, array in v_twin._asdict().items():
+        assert_matches(f"v_{name}", getattr(v, name), array, DOUBLE)
     return image, v
 
 

@@ -52,9 +52,7 @@ class TestSelection:
 
         monkeypatch.setattr(cl, "get_platforms", no_platform)
         assert list_devices() == []
-        with pytest.raises(
-            DeviceError, match=r"no OpenCL device found: .*pip install 'clsplat\[pocl\]'"
-        ):
+        with pytest.raises(DeviceError, match=r"no OpenCL device found: .*pip install 'clsplat\[pocl\]'"):
             select_device()
 
     def test_platform_without_devices(self, monkeypatch, device):
@@ -86,6 +84,11 @@ class TestBuffers:
         array = any_device.upload("x", np.arange(6, dtype=np.int64).reshape(2, 3)[:, ::-1])
         assert array.dtype == any_device.real
         np.testing.assert_array_equal(array.get(), [[2, 1, 0], [5, 4, 3]])
+
+    def test_upload_of_a_view(self, any_device):
+        host = np.arange(6, dtype=any_device.real).reshape(2, 3)
+        for view in (host[:, ::-1], host.T, host[:, ::2]):
+            np.testing.assert_array_equal(any_device.upload("x", view).get(), view)
 
     def test_too_large_for_a_buffer(self, device):
         size = device.cl_device.max_mem_alloc_size // 4 + 1

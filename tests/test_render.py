@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from tolerances import DOUBLE, FLOAT
 
-from clsplat import reference
+from clsplat import ops, reference
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.constants import NEAR
+from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations
@@ -260,6 +261,38 @@ class TestInvariances:
         for name in FIELDS:
             a, b = v.arrays()[name], w.arrays()[name]
             assert np.linalg.norm(a - b) < 1e-3 * np.linalg.norm(a), name
+
+
+@COMPOSITORS
+def test_nothing_depends_on_uninitialised_memory(configured_device, compositor, monkeypatch):
+    """Buffers that start as NaN give the same bits: tiles that stop early, empty tiles, invisible Gaussians."""
+    gaussians, camera = synthetic_scene(600, 11, width=53, height=38)
+    gaussians.means[:, 0] = 0.5 * gaussians.means[:, 0] - 0.5
+    gaussians.logit_opacities[:] += 3
+    gaussians.means[::7] = 2 * camera.position
+    config = RenderConfig("antialiased", compositor=compositor)
+    v_images = [np.random.default_rng(0).normal(size=s) for s in ((38, 53, 3), (38, 53))]
+
+    def everything():
+        rendering = render(gaussians, camera, config, configured_device, depth=True)
+        v = rendering.backward(*v_images, viewmat_grad=True)
+        photo = configured_device.upload("photo", np.full((38, 53, 3), 99), np.uint8)
+        image = configured_device.upload("image", rendering.rgb)
+        loss, v_image = ops.l1_ssim(configured_device, image, photo, 0.2)
+        return [*images(rendering), *v.gaussians.arrays().values(), v.means2d, v.viewmat, loss, v_image.get()]
+
+    expected = everything()
+    assert (expected[1] > 0.999).any() and (expected[1] == 0).any()
+    empty = Device.empty
+
+    def filled(self, what, shape, dtype=None):
+        array = empty(self, what, shape, dtype)
+        array.fill(np.nan if array.dtype.kind == "f" else np.iinfo(array.dtype).max)
+        return array
+
+    monkeypatch.setattr(Device, "empty", filled)
+    for a, b in zip(everything(), expected, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_depth_of_one_opaque_gaussian(any_device):
