@@ -69,9 +69,7 @@ class Camera:
         return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), dtype=np.float64)
 
     @classmethod
-    def look_at(
-        cls, position: object, target: object, up: object, fx: float, width: int, height: int
-    ) -> "Camera":
+    def look_at(cls, position: object, target: object, up: object, fx: float, width: int, height: int) -> "Camera":
         """Camera at `position` (3,) looking at `target` (3,), the image's upper edge towards `up` (3,).
 
         Square pixels of focal length `fx` in pixels, principal point in the middle of the image.
