@@ -16,7 +16,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -33,8 +32,8 @@ RECORD = "clsplat_sfm.json"
 """File beside the model's folder ``0``: of which photos and with which options the model was made."""
 
 SEED = 0
-"""Of RANSAC and of the mapper. With it two runs on one machine gave the same bytes; COLMAP promises no more where
-its bundle adjustment runs on several threads (beyond 50 000 residuals)."""
+"""Of RANSAC and of the mapper. The same photos then give the same bytes on one machine, provided that the mapper runs
+on one thread and photos enter the database in their order."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,8 @@ def undistorted(intrinsics: Intrinsics) -> Intrinsics:
     if intrinsics.model == "SIMPLE_PINHOLE":
         f, cx, cy = intrinsics.params
         return replace(intrinsics, model="PINHOLE", params=(f, f, cx, cy))
-    pycolmap = _pycolmap()
+    import pycolmap
+
     camera = _camera(intrinsics)
     if is_pinhole(intrinsics):
         params = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
@@ -125,7 +125,8 @@ def project(intrinsics: Intrinsics, points: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _camera(intrinsics: Intrinsics) -> Any:
-    pycolmap = _pycolmap()
+    import pycolmap
+
     try:
         camera = pycolmap.Camera.create_from_model_name(1, intrinsics.model, 1.0, intrinsics.width, intrinsics.height)
     except ValueError as error:
@@ -143,13 +144,9 @@ def _camera(intrinsics: Intrinsics) -> Any:
 
 def _models() -> list[str]:
     """Camera models that can become a pinhole."""
-    return [name for name in _pycolmap().CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
-
-
-def _pycolmap() -> ModuleType:
     import pycolmap
 
-    return pycolmap
+    return [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
@@ -178,8 +175,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         return {**record, "photos": str(record["photos"])}
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"{path}: expected the record of a structure from motion, found {error!r}; to redo it, "
-            f"delete {path.parent}"
+            f"{path}: expected our record of a structure from motion, found {error!r}; delete its folder to redo it"
         ) from error
 
 
@@ -214,25 +210,24 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
     output = photos if output is None else Path(output)
     if not photos.is_dir():
         raise InputError(f"{photos}: expected a folder of photos, found {'a file' if photos.exists() else 'nothing'}")
-    names = list_photos(photos)
+    folder, names = photo_folder(photos), list_photos(photos)
     if len(names) < max(config.min_registered, 2):
-        raise InputError(
-            f"{photo_folder(photos)}: expected at least {max(config.min_registered, 2)} photos, found {len(names)}"
-        )
+        raise InputError(f"{folder}: expected at least {max(config.min_registered, 2)} photos, found {len(names)}")
     _check_options(config)
-    model = output / "sparse" / "0"
-    hashes = _hashes(photo_folder(photos), names)
-    record = read_record(output)
+    hashes = {name: hashlib.blake2b((folder / name).read_bytes(), digest_size=16).hexdigest() for name in names}
+    model, record = output / "sparse" / "0", read_record(output)
     if record is None and (output / "sparse").exists():
         raise InputError(
             f"{output / 'sparse'}: expected no such folder or a model of ours, found one of others; remove it, or "
             "choose another folder with -o"
         )
-    if record is not None and (model / "images.bin").is_file() and _is_fresh(record, hashes, config):
-        _check_registered(record["registered"], len(names), photos, config)
-        return model
+    if record is not None and record["hashes"] == hashes and (model / "images.bin").is_file():
+        # How many photos must be registered changes nothing in the model: it is checked against it.
+        made_with = replace(SfmConfig(**record["options"]), min_registered=config.min_registered)
+        if made_with == config:
+            _check_registered(record["registered"], len(names), photos, config)
+            return model
 
-    folder = photo_folder(photos)
     with _workspace(output) as work, _quiet(verbose):
         found = _largest_model(_readable(folder, names, work), names, work, config)
         registered = 0 if found is None else int(found.num_reg_images())
@@ -266,16 +261,6 @@ def _check_registered(registered: int, count: int, photos: Path, config: SfmConf
         )
 
 
-def _hashes(folder: Path, names: list[str]) -> dict[str, str]:
-    return {name: hashlib.blake2b((folder / name).read_bytes(), digest_size=16).hexdigest() for name in names}
-
-
-def _is_fresh(record: dict[str, Any], hashes: dict[str, str], config: SfmConfig) -> bool:
-    # How many photos must be registered changes nothing in the model: it is checked against it afterwards.
-    options = replace(SfmConfig(**record["options"]), min_registered=config.min_registered)
-    return record["hashes"] == hashes and options == config
-
-
 @contextmanager
 def _workspace(output: Path) -> Iterator[Path]:
     """Temporary folder inside `output`, so that what is made in it can be renamed to its place."""
@@ -296,7 +281,8 @@ def _workspace(output: Path) -> Iterator[Path]:
 
 @contextmanager
 def _quiet(verbose: bool) -> Iterator[None]:
-    logging = _pycolmap().logging
+    from pycolmap import logging
+
     before = logging.minloglevel
     logging.minloglevel = before if verbose else int(logging.ERROR)
     try:
@@ -333,9 +319,9 @@ def _readable(folder: Path, names: list[str], work: Path) -> Path:
 
 def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig) -> Any:
     """Run the three stages; None where no two photos make a start."""
+    import pycolmap
     from tqdm import tqdm
 
-    pycolmap = _pycolmap()
     database = work / "database.db"
     pycolmap.Database.open(database).close()
 
@@ -344,18 +330,14 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
         by_size.setdefault(photo_size(folder / name), []).append(name)
     reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
     extraction = pycolmap.FeatureExtractionOptions(max_image_size=config.max_image_size, use_gpu=False)
+    mode = pycolmap.CameraMode.SINGLE if config.single_camera else pycolmap.CameraMode.PER_IMAGE
+    for group in by_size.values():  # COLMAP's single camera has one size, and it skips photos of another
+        pycolmap.import_images(database, folder, image_names=group, camera_mode=mode, options=reader)
     with _progress(database, "keypoints", len(names), "features", "photo"):
-        for group in by_size.values():  # COLMAP's single camera has one size: upright photos need a second one
-            pycolmap.set_random_seed(SEED)
-            pycolmap.extract_features(
-                database,
-                folder,
-                image_names=group,
-                camera_mode=pycolmap.CameraMode.SINGLE if config.single_camera else pycolmap.CameraMode.PER_IMAGE,
-                reader_options=reader,
-                extraction_options=extraction,
-                device=pycolmap.Device.cpu,
-            )
+        pycolmap.set_random_seed(SEED)
+        pycolmap.extract_features(
+            database, folder, image_names=names, extraction_options=extraction, device=pycolmap.Device.cpu
+        )
 
     exhaustive = config.matching == "exhaustive"
     match = pycolmap.match_exhaustive if exhaustive else pycolmap.match_sequential
@@ -366,7 +348,9 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
         pycolmap.set_random_seed(SEED)
         match(database, verification_options=verification, device=pycolmap.Device.cpu)
 
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=max(config.min_registered, 2), random_seed=SEED)
+    options = pycolmap.IncrementalPipelineOptions(
+        min_model_size=max(config.min_registered, 2), random_seed=SEED, num_threads=1
+    )
     (work / "models").mkdir()
     with tqdm(total=len(names), desc="poses", unit="photo", dynamic_ncols=True) as bar:
 
