@@ -313,7 +313,7 @@ class Demo:
         say(
             f"done in {time.perf_counter() - started:.0f} s. Look at {self.out / 'side_by_side.png'} (photo and "
             f"render), {self.out / 'training_curve.png'} and {self.out / 'eval' / 'index.html'}; "
-            f"{self.out / 'scene.ply'} opens in every splat viewer."
+            f"{self.out / 'scene.ply'} has the format that splat viewers read."
         )
 
 
