@@ -4,30 +4,72 @@ import json
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.config import TrainConfig
+from clsplat.densify import STRATEGIES, Strategy
 from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
+from clsplat.optim import Moments
 
 
-def save_arrays(path: Path, arrays: dict[str, Any]) -> None:
-    """Write named arrays to an uncompressed .npz file, whole or not at all."""
+@dataclass
+class State:
+    """All that training changes, which is what a checkpoint holds, and the scene's extent in world units."""
+
+    iteration: int
+    seconds: float
+    extent: float
+    gaussians: Gaussians
+    moments: Moments
+    strategy: Strategy
+
+
+def save_state(path: Path, state: State, config: TrainConfig) -> None:
+    """Write the state to an .npz file, whole or not at all."""
+    arrays: dict[str, Any] = {"iteration": state.iteration, "seconds": state.seconds}
+    arrays["config"] = json.dumps(asdict(config), sort_keys=True)
+    parts = {"gaussians": state.gaussians, "first": state.moments.first, "second": state.moments.second}
+    for part, gaussians in parts.items():
+        arrays |= {f"{part}.{name}": array for name, array in gaussians.arrays().items()}
+    arrays |= {f"statistics.{name}": array for name, array in state.strategy.statistics.items()}
     with replacing(path) as file:
         np.savez(file, **arrays)
 
 
-def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Read what `save_arrays` wrote.
+def load_state(path: Path, extent: float, config: TrainConfig) -> State:
+    """The state that `save_state` wrote, in a scene of the given extent in world units.
 
     Raises
     ------
     InputError
-        If the file is missing or damaged.
+        If the file is missing or damaged, or it was made with another configuration.
     """
+    arrays = _load_arrays(path)
+    saved, asked = json.loads(str(arrays["config"])), json.loads(json.dumps(asdict(config)))
+    for free in ("device", "checkpoint_every", "eval_every"):  # they do not change the result
+        saved.pop(free, None), asked.pop(free, None)
+    if saved != asked:
+        changed = sorted(k for k in asked if asked[k] != saved.get(k))
+        raise InputError(f"{path}: expected the configuration it was made with, found other {', '.join(changed)}")
+
+    def part(name: str) -> Gaussians:
+        return Gaussians(**{k: arrays[f"{name}.{k}"] for k in Gaussians.__dataclass_fields__})
+
+    gaussians = part("gaussians")
+    strategy = STRATEGIES[config.strategy](config, extent, len(gaussians))
+    strategy.statistics = {k: arrays[f"statistics.{k}"] for k in strategy.statistics}
+    moments = Moments(part("first"), part("second"))
+    return State(int(arrays["iteration"]), float(arrays["seconds"]), extent, gaussians, moments, strategy)
+
+
+def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             return dict(file)

@@ -1,17 +1,15 @@
 """Training: algorithm 1 of Kerbl et al. 2023."""
 
-import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clsplat.checkpoint import load_arrays, log_file, save_arrays
+from clsplat.checkpoint import State, load_state, log_file, save_state
 from clsplat.config import BACKGROUNDS, TrainConfig
-from clsplat.densify import STRATEGIES, Strategy
+from clsplat.densify import STRATEGIES
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.initialize import initialize
@@ -28,18 +26,6 @@ if TYPE_CHECKING:
 LOG_EVERY = 10
 # Photos stay on the device up to this share of its memory.
 PHOTO_SHARE = 0.25
-
-
-@dataclass
-class State:
-    """All that training changes, which is what a checkpoint holds, and the scene's extent in world units."""
-
-    iteration: int
-    seconds: float
-    extent: float
-    gaussians: Gaussians
-    moments: Moments
-    strategy: Strategy
 
 
 class _Photos:
@@ -107,7 +93,7 @@ def train(
     """
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
-    state = load_state(out, scene, config) if resume else initial_state(scene, config)
+    state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
     photos = _Photos(device, scene.train)
     losses: list[float] = []
     with log_file(out / "log.jsonl", state.iteration) as log:
@@ -133,7 +119,7 @@ def train(
                 about = {"iteration": iteration, "num_gaussians": len(state.gaussians), "seconds": state.seconds}
                 log(about | record)
             if iteration % config.checkpoint_every == 0 or iteration == config.iterations:
-                save_state(out, state, config)
+                save_state(out / "checkpoint.npz", state, config)
     return state.gaussians
 
 
@@ -172,41 +158,3 @@ def initial_state(scene: Scene, config: TrainConfig) -> State:
     gaussians = initialize(scene, config.init, config.seed)
     strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
     return State(0, 0.0, scene.extent, gaussians, Moments.zeros(gaussians), strategy)
-
-
-def save_state(out: Path, state: State, config: TrainConfig) -> None:
-    """Write the state to checkpoint.npz in `out`, whole or not at all."""
-    arrays: dict[str, Any] = {"iteration": state.iteration, "seconds": state.seconds}
-    arrays["config"] = json.dumps(asdict(config), sort_keys=True)
-    parts = {"gaussians": state.gaussians, "first": state.moments.first, "second": state.moments.second}
-    for part, gaussians in parts.items():
-        arrays |= {f"{part}.{name}": array for name, array in gaussians.arrays().items()}
-    arrays |= {f"statistics.{name}": array for name, array in state.strategy.statistics.items()}
-    save_arrays(out / "checkpoint.npz", arrays)
-
-
-def load_state(out: Path, scene: Scene, config: TrainConfig) -> State:
-    """The state saved in `out`.
-
-    Raises
-    ------
-    InputError
-        If there is no readable checkpoint, or it was made with another configuration.
-    """
-    path = out / "checkpoint.npz"
-    arrays = load_arrays(path)
-    saved, asked = json.loads(str(arrays["config"])), json.loads(json.dumps(asdict(config)))
-    for free in ("device", "checkpoint_every", "eval_every"):  # they do not change the result
-        saved.pop(free, None), asked.pop(free, None)
-    if saved != asked:
-        changed = sorted(k for k in asked if asked[k] != saved.get(k))
-        raise InputError(f"{path}: expected the configuration it was made with, found other {', '.join(changed)}")
-
-    def part(name: str) -> Gaussians:
-        return Gaussians(**{k: arrays[f"{name}.{k}"] for k in Gaussians.__dataclass_fields__})
-
-    gaussians = part("gaussians")
-    strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
-    strategy.statistics = {k: arrays[f"statistics.{k}"] for k in strategy.statistics}
-    moments = Moments(part("first"), part("second"))
-    return State(int(arrays["iteration"]), float(arrays["seconds"]), scene.extent, gaussians, moments, strategy)

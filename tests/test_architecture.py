@@ -25,11 +25,13 @@ LAYERS = """
     camera gaussians sfm
     scene structs device reference metrics raytrace orbit
     ops io testing still_life
-    render optim densify initialize checkpoint report demo
-    train rasterization
+    render optim densify initialize report demo
+    checkpoint rasterization
+    train
     evaluate
     bench viewer
     cli
+    __main__
 """.strip().splitlines()
 LAYER = {unit: depth for depth, row in enumerate(LAYERS) for unit in row.split()}
 

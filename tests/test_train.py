@@ -3,12 +3,13 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from clsplat.camera import Camera
-from clsplat.checkpoint import load_arrays, log_file, save_arrays
+from clsplat.checkpoint import load_state, log_file, save_state
 from clsplat.config import AdcConfig, InitConfig, OptimConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.errors import InputError
@@ -18,7 +19,7 @@ from clsplat.metrics import psnr, to_uint8
 from clsplat.render import render
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
-from clsplat.train import train, view_at
+from clsplat.train import initial_state, train, view_at
 
 SIZE = (40, 32)
 CONFIG = TrainConfig(
@@ -147,18 +148,24 @@ def test_every_epoch_takes_every_view_once(scene: Scene) -> None:
     assert names[:12] != names[12:]
 
 
-def test_a_failed_write_leaves_the_last_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_leaves_the_last_checkpoint(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "checkpoint.npz"
-    save_arrays(path, {"x": np.arange(3)})
+    state = initial_state(scene, CONFIG)
+    save_state(path, state, CONFIG)
 
-    def full(file: object, **arrays: object) -> None:
-        file.write(b"half")  # type: ignore[attr-defined]
+    def full(file: Any, **arrays: Any) -> None:
+        file.write(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(InputError, match="No space left"):
-        save_arrays(path, {"x": np.arange(4)})
-    assert load_arrays(path)["x"].tolist() == [0, 1, 2]
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez", full)
+        with pytest.raises(InputError, match="No space left"):
+            save_state(path, replace(state, iteration=7), CONFIG)
+    loaded = load_state(path, scene.extent, CONFIG)
+    assert loaded.iteration == 0
+    assert same(loaded.gaussians, state.gaussians)
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.npz"]
 
 

@@ -1,0 +1,5 @@
+"""``python -m clsplat``: the command line."""
+
+from clsplat.cli import main
+
+main()
