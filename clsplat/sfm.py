@@ -367,7 +367,9 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
             initial_image_pair_callback=start,
             next_image_callback=bar.update,
         )
-    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+        largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+        bar.n = 0 if largest is None else largest.num_reg_images()
+    return largest
 
 
 @contextmanager

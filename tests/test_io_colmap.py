@@ -19,7 +19,7 @@ S = 0.5**0.5
 IMAGES = [
     ("a.png", 1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0)),
     ("right hand/b.png", 7, (S, 0.0, S, 0.0), (1.0, 2.0, 3.0)),
-    ("c.png", 1, (2.0, 0.0, 0.0, 0.0), (0.5, 0.0, 2.0)),
+    ("c.png", 1, (0.0, 3.0, 0.0, 0.0), (0.5, 0.0, 2.0)),
 ]
 POINTS = [((0.0, 1.0, 2.0), (1, 2, 255)), ((-3.5, 1e-3, 4.0), (0, 128, 7))]
 
@@ -83,7 +83,7 @@ def test_both_encodings_say_the_same(tmp_path, ending):
     np.testing.assert_allclose(images[0][2], np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]))
     # A quarter turn about y takes z to x and x to -z.
     np.testing.assert_allclose(images[1][2], [[0, 0, 1, 1], [0, 1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]], atol=1e-15)
-    np.testing.assert_array_equal(images[2][2][:3, :3], np.eye(3))
+    np.testing.assert_array_equal(images[2][2][:3, :3], np.diag([1, -1, -1]))  # half a turn about x, norm 3
     np.testing.assert_array_equal(points, [xyz for xyz, _ in POINTS])
     np.testing.assert_array_equal(colors, [rgb for _, rgb in POINTS])
     assert colors.dtype == np.uint8

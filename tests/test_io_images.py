@@ -304,11 +304,13 @@ def test_undistortion_agrees_with_colmaps(tmp_path, model):
 def test_positions_are_the_distortion_of_the_pinholes_rays():
     """One pixel by hand: SIMPLE_RADIAL is x (1 + k r^2)."""
     intrinsics = Intrinsics("SIMPLE_RADIAL", (100.0, 60.0, 40.0, 0.1), 120, 80)
-    fx, fy, cx, cy = undistorted(intrinsics).params
-    row, column = 10, 90
+    pinhole = undistorted(intrinsics)
+    fx, fy, cx, cy = pinhole.params
+    row, column = 10, 70
     x, y = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
     scale = 100 * (1 + 0.1 * (x * x + y * y))
-    positions = _positions(intrinsics, (120, 80), (80, 120))
+    positions = _positions(intrinsics, (120, 80), (pinhole.height, pinhole.width))
+    # float32 positions of up to 120 pixels
     np.testing.assert_allclose(positions[:, row, column], [40 + scale * y - 0.5, 60 + scale * x - 0.5], atol=1e-4)
 
 
@@ -359,9 +361,14 @@ def test_a_fisheye_without_coefficients_is_no_pinhole(tmp_path):
 @pytest.mark.parametrize(
     ("intrinsics", "message"),
     [
-        (Intrinsics("EQUIRECTANGULAR", (64.0, 48.0), 64, 48), "EQUIRECTANGULAR"),
+        (Intrinsics("EQUIRECTANGULAR", (64.0, 48.0), 64, 48), "perspective or fisheye"),
         (Intrinsics("PINBALL", (64.0, 48.0), 64, 48), "PINBALL"),
         (Intrinsics("OPENCV", (64.0, 48.0), 64, 48), "8 parameters"),
+        (Intrinsics("DIVISION", (48.0, 48.0, 32.0, 24.0, 30.0), 64, 48), r"DIVISION.*undone"),  # NaN
+        (
+            Intrinsics("FULL_OPENCV", (48.0, 48.0, 32.0, 24.0, *5 * [0.0], -10.0, 0.0, 0.0), 64, 48),
+            "undone",
+        ),  # a pole
     ],
 )
 def test_cameras_that_cannot_become_pinholes_are_refused(tmp_path, intrinsics, message):

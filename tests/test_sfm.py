@@ -45,15 +45,20 @@ def corner(camera, textures):
     return np.rint(photo).astype(np.uint8)
 
 
-@pytest.fixture(scope="session")
-def photos():
-    """What the four cameras see, as arrays."""
-    rng = np.random.default_rng(0)
+def take_photos(seed):
+    """What the four cameras see of a corner with textures of its own."""
+    rng = np.random.default_rng(seed)
     textures = []
     for _ in range(3):
         layers = [s * gaussian_filter(rng.normal(size=(512, 512, 3)), (s, s, 0), mode="wrap") for s in (1.5, 4, 12)]
         textures.append(np.clip(127 + 60 * sum(layers) / np.std(sum(layers)), 0, 255))
     return [corner(camera, textures) for camera in cameras()]
+
+
+@pytest.fixture(scope="session")
+def photos():
+    """What the four cameras see, as arrays."""
+    return take_photos(0)
 
 
 @pytest.fixture(scope="session")
@@ -211,6 +216,15 @@ def test_a_cached_model_must_have_enough_poses_too(copy, runs):
     assert len(runs) == 1
 
 
+def test_of_two_models_the_larger_is_taken(photos, tmp_path):
+    for k, photo in enumerate(take_photos(1)[:3]):
+        Image.fromarray(photo).save(tmp_path / f"a{k}.png")
+    for k, photo in enumerate(photos):
+        Image.fromarray(photo).save(tmp_path / f"b{k}.png")
+    _, images, _, _ = read_model(reconstruct(tmp_path, CONFIG))
+    assert sorted(name for name, _, _ in images) == ["b0.png", "b1.png", "b2.png", "b3.png"]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -262,7 +276,7 @@ def test_damaged_records_are_refused_by_name(tmp_path, text):
 def test_portrait_and_landscape_are_two_cameras(tmp_path, photos):
     """COLMAP's one camera has one size and would drop the other photos without a word."""
     for k, photo in enumerate(photos):
-        Image.fromarray(photo[:, 40:280] if k == 1 else photo).save(tmp_path / f"{k}.png")
+        Image.fromarray(photo[:, 40:280] if k in (1, 2) else photo).save(tmp_path / f"{k}.png")
     cameras, images, _, _ = read_model(reconstruct(tmp_path, CONFIG))
     assert sorted((camera.width, camera.height) for camera in cameras.values()) == [(240, 240), (320, 240)]
     assert len(images) == 4

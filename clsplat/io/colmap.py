@@ -171,7 +171,7 @@ def _viewmat(quat: Any, translation: Any, name: str, path: Path) -> NDArray[np.f
 
 
 class _Bytes:
-    """A binary file, read from front to back; no count is believed that the rest of the file could not hold."""
+    """A binary file, read from front to back and never beyond its end, whatever its counts say."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.data, self.at = path, path.read_bytes(), 0
@@ -181,14 +181,10 @@ class _Bytes:
         self.at += layout.size
         return layout.unpack_from(self.data, self.at - layout.size)
 
-    def count(self, size: int) -> int:
-        """A count of records of at least `size` bytes."""
-        number = int(self.take(struct.Struct("<Q"))[0])
-        self._expect(number * size)
-        return number
+    def count(self) -> int:
+        return int(self.take(struct.Struct("<Q"))[0])
 
     def skip(self, size: int) -> None:
-        self._expect(size)
         self.at += size
 
     def text(self) -> str:
@@ -213,7 +209,7 @@ class _Bytes:
 def _cameras_bin(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
     file = _Bytes(path)
     head = struct.Struct("<IiQQ")
-    for _ in range(file.count(head.size)):
+    for _ in range(file.count()):
         number, model, width, height = file.take(head)
         if not 0 <= model < len(MODELS):
             raise InputError(
@@ -226,10 +222,10 @@ def _cameras_bin(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, 
 def _images_bin(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
     file = _Bytes(path)
     head = struct.Struct("<I7dI")
-    for _ in range(file.count(head.size + 9)):
+    for _ in range(file.count()):
         _, *pose, camera = file.take(head)
         name = file.text()
-        file.skip(24 * file.count(24))  # keypoints: x, y and the point's id
+        file.skip(24 * file.count())  # keypoints: x, y and the point's id
         yield name, camera, tuple(pose[:4]), tuple(pose[4:])
     file.end()
 
@@ -237,9 +233,9 @@ def _images_bin(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple
 def _points_bin(path: Path) -> Iterator[tuple[float, ...]]:
     file = _Bytes(path)
     head = struct.Struct("<Q3d3Bd")
-    for _ in range(file.count(head.size + 8)):
+    for _ in range(file.count()):
         row = file.take(head)
-        file.skip(8 * file.count(8))  # track: image id and index of the keypoint
+        file.skip(8 * file.count())  # track: image id and index of the keypoint
         yield row[1:7]
     file.end()
 

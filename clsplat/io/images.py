@@ -152,9 +152,7 @@ def warn_of_missing(source: Path, names: Sequence[str], files: Sequence[Path | N
 
 
 def _find(root: Path, name: str, downscale: int = 1) -> Path | None:
-    folder, slash, rest = name.partition("/")
-    if downscale > 1 and not slash:
-        return None
+    folder, _, rest = name.partition("/")
     path = root / (name if downscale == 1 else f"{folder}_{downscale}/{rest}")
     if path.is_file():
         return path
@@ -321,7 +319,9 @@ def _positions(intrinsics: Intrinsics, size: tuple[int, int], shape: tuple[int, 
     for row in range(shape[0]):
         rays = np.stack([x, np.full_like(x, y[row]), np.ones_like(x)], axis=-1)
         positions[1, row], positions[0, row] = (project(intrinsics, rays) * (sx, sy)).T
-    if not np.isfinite(positions).all():
+    # COLMAP looks at the photo's border alone; a pixel outside is more than the half that rounding may cost.
+    inside = (positions > -1) & (positions < np.array(size[::-1]).reshape(2, 1, 1) + 1)
+    if not inside.all():
         raise InputError(
             f"camera model {intrinsics.model}: expected a distortion that can be undone over the whole photo, found "
             f"parameters {intrinsics.params}"
