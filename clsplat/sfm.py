@@ -155,9 +155,8 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     Returns
     -------
     dict or None
-        ``photos``: path of the photos' dataset, relative to `folder` or absolute; ``hashes``: BLAKE2 of each photo by
-        name; ``options``: fields of the `SfmConfig`; ``registered``: number of photos with a pose. None where
-        `folder` has no model of ours.
+        ``photos``: their folder, relative to `folder` or absolute; ``hashes``: BLAKE2 of each photo by name;
+        ``options``: fields of the `SfmConfig`; ``registered``: number of poses. None: `folder` has no model of ours.
 
     Raises
     ------
