@@ -1,4 +1,4 @@
-"""Cameras from photos, and distorted cameras made pinholes: all that is asked of COLMAP (through pycolmap).
+"""Cameras from photos, by COLMAP through pycolmap.
 
 Structure from motion is SIFT on the CPU, matching, incremental mapping: Schoenberger and Frahm 2016,
 doi:10.1109/CVPR.2016.445.
@@ -14,15 +14,15 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.config import SfmConfig
 from clsplat.errors import InputError
+from clsplat.lenses import camera_models
 
 # Not only for these names: a Pillow that is loaded after pycolmap 4.2.1 takes over some of the zlib inside it and
 # crashes when it writes a PNG. Loaded first, it keeps its own.
@@ -34,119 +34,6 @@ RECORD = "clsplat_sfm.json"
 SEED = 0
 """Of RANSAC and of the mapper. The same photos then give the same bytes on one machine, provided that the mapper runs
 on one thread and photos enter the database in their order."""
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """A camera as COLMAP describes it, without its pose.
-
-    Parameters
-    ----------
-    model : str
-        Name of a COLMAP camera model.
-    params : tuple of float
-        Its parameters in COLMAP's order, focal lengths and principal point in pixels.
-    width, height : int
-        Image size in pixels.
-    """
-
-    model: str
-    params: tuple[float, ...]
-    width: int
-    height: int
-
-
-def undistorted(intrinsics: Intrinsics) -> Intrinsics:
-    """The pinhole camera that COLMAP's undistorter makes of a camera.
-
-    Parameters
-    ----------
-    intrinsics : Intrinsics
-        Any perspective or fisheye model.
-
-    Returns
-    -------
-    Intrinsics
-        Of model PINHOLE. Where the camera is one already, its size stays; otherwise it sees the largest centred
-        rectangle that holds no pixel from outside the photo (COLMAP's blank_pixels = 0).
-
-    Raises
-    ------
-    InputError
-        If the model does not exist, has another number of parameters, or cannot become a pinhole.
-    """
-    if intrinsics.model == "PINHOLE":
-        return intrinsics
-    if intrinsics.model == "SIMPLE_PINHOLE":
-        f, cx, cy = intrinsics.params
-        return replace(intrinsics, model="PINHOLE", params=(f, f, cx, cy))
-    import pycolmap
-
-    camera = _camera(intrinsics)
-    if is_pinhole(intrinsics):
-        params = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-        return replace(intrinsics, model="PINHOLE", params=params)
-    if not camera.is_perspective():
-        raise InputError(
-            f"camera model {intrinsics.model}: expected a perspective or fisheye camera, which can become a pinhole"
-        )
-    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(blank_pixels=0.0), camera)
-    return Intrinsics("PINHOLE", tuple(map(float, pinhole.params)), pinhole.width, pinhole.height)
-
-
-def is_pinhole(intrinsics: Intrinsics) -> bool:
-    """Whether the camera maps straight lines to straight lines: no distortion coefficient is set.
-
-    Fisheye models are none even with all coefficients zero, since their radius grows with the angle.
-    """
-    if intrinsics.model in ("PINHOLE", "SIMPLE_PINHOLE"):
-        return True
-    camera = _camera(intrinsics)
-    return bool(camera.is_perspective_pinhole() and camera.is_undistorted())
-
-
-def project(intrinsics: Intrinsics, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where points appear in the distorted photo.
-
-    Parameters
-    ----------
-    intrinsics : Intrinsics
-        Of any model.
-    points : (N, 3) float64
-        In camera coordinates (x right, y down, z forward).
-
-    Returns
-    -------
-    (N, 2) float64
-        In pixels, from the upper left corner of the photo; NaN behind the camera.
-    """
-    pixels: NDArray[np.float64] = _camera(intrinsics).img_from_cam(points)
-    return pixels
-
-
-def _camera(intrinsics: Intrinsics) -> Any:
-    import pycolmap
-
-    try:
-        camera = pycolmap.Camera.create_from_model_name(1, intrinsics.model, 1.0, intrinsics.width, intrinsics.height)
-    except ValueError as error:
-        raise InputError(
-            f"camera model: expected one of {', '.join(_models())}, found {intrinsics.model!r}"
-        ) from error
-    if len(camera.params) != len(intrinsics.params):
-        raise InputError(
-            f"camera model {intrinsics.model}: expected {len(camera.params)} parameters ({camera.params_info}), "
-            f"found {len(intrinsics.params)}"
-        )
-    camera.params = intrinsics.params
-    return camera
-
-
-def _models() -> list[str]:
-    """Camera models that can become a pinhole."""
-    import pycolmap
-
-    return [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
@@ -231,6 +118,7 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
         found = _largest_model(_readable(folder, names, work), names, work, config)
         registered = 0 if found is None else int(found.num_reg_images())
         _check_registered(registered, len(names), photos, config)
+        _turn_upright(found)
         (work / "sparse" / "0").mkdir(parents=True)
         found.write_binary(work / "sparse" / "0")
         where = "." if output.resolve() == photos.resolve() else str(photos.resolve())
@@ -245,8 +133,8 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
 def _check_options(config: SfmConfig) -> None:
     if config.matching not in ("exhaustive", "sequential"):
         raise InputError(f"matching: expected exhaustive or sequential, found {config.matching!r}")
-    if config.camera_model not in _models():
-        raise InputError(f"camera_model: expected one of {', '.join(_models())}, found {config.camera_model!r}")
+    if config.camera_model not in camera_models():
+        raise InputError(f"camera_model: expected one of {', '.join(camera_models())}, found {config.camera_model!r}")
     if config.max_image_size < 1:
         raise InputError(f"max_image_size: expected a number of pixels, found {config.max_image_size}")
 
@@ -369,6 +257,18 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
         largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
         bar.n = 0 if largest is None else largest.num_reg_images()
     return largest
+
+
+def _turn_upright(model: Any) -> None:
+    """Rotate a model's world so that its y axis points down as the photos do on average: viewers take -y as up, and
+    COLMAP's world is that of the first photo, however it was tilted."""
+    import pycolmap
+    from scipy.spatial.transform import Rotation
+
+    down = np.mean([image.cam_from_world().rotation.matrix()[1] for image in model.images.values()], axis=0)
+    if np.linalg.norm(down) > 0.1:  # photos upside down cancel those that are not: then there is no common direction
+        rotation, _ = Rotation.align_vectors([[0.0, 1.0, 0.0]], [down / np.linalg.norm(down)])
+        model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation.as_matrix()), np.zeros(3)))
 
 
 @contextmanager

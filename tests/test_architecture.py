@@ -22,7 +22,8 @@ STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__i
 LAYERS = """
     constants errors stages randomness
     config photos
-    camera gaussians sfm
+    camera gaussians lenses
+    sfm
     scene structs device reference metrics raytrace orbit
     ops io testing still_life
     render optim densify initialize report demo
@@ -36,7 +37,7 @@ LAYERS = """
 LAYER = {unit: depth for depth, row in enumerate(LAYERS) for unit in row.split()}
 
 # Where a foreign package may be imported at all, whose absence or weight the rest must not feel.
-ONLY_IN = {"pyopencl": {"device", "ops"}, "pycolmap": {"sfm"}}
+ONLY_IN = {"pyopencl": {"device", "ops"}, "pycolmap": {"sfm", "lenses"}}
 
 
 def imports_of(path):

@@ -11,7 +11,7 @@ from clsplat.errors import InputError
 from clsplat.io import load_scene
 from clsplat.io.colmap import FOLDERS, MODELS, find_model, read_dataset, read_model
 from clsplat.io.images import PhotosMissing
-from clsplat.sfm import Intrinsics
+from clsplat.lenses import Intrinsics
 
 CAMERAS = [(1, "PINHOLE", 64, 48, (50.0, 60.0, 32.0, 24.0)), (7, "SIMPLE_RADIAL", 40, 30, (45.0, 20.0, 15.0, 0.0))]
 S = 0.5**0.5

@@ -20,7 +20,7 @@ from clsplat.io.images import (
     locate,
     mask_folder,
 )
-from clsplat.sfm import Intrinsics, undistorted
+from clsplat.lenses import Intrinsics, undistorted
 
 RNG = np.random.default_rng(11)
 PINHOLE = Intrinsics("PINHOLE", (50.0, 60.0, 30.0, 25.0), 64, 48)

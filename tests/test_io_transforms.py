@@ -12,7 +12,7 @@ from clsplat.config import DataConfig
 from clsplat.errors import InputError
 from clsplat.io import load_scene
 from clsplat.io.transforms import read_dataset
-from clsplat.sfm import Intrinsics
+from clsplat.lenses import Intrinsics
 
 CAMERAS = [
     Camera.look_at(eye, (0, 0, 0), (0, 0, 1), 50, 64, 48) for eye in [(3, 0, 1), (0, 3, 1), (-3, 0, 1), (0, -3, 1)]

@@ -181,9 +181,9 @@ def test_photos_are_listed_by_name(tmp_path):
 
 
 def test_pillow_still_writes_once_pycolmap_is_loaded(tmp_path):
-    # Loaded in the other order Pillow crashes the process; see clsplat.sfm.
+    # Loaded in the other order Pillow crashes the process; see clsplat.lenses.
     code = (
-        "import sys; from clsplat.sfm import Intrinsics, undistorted\n"
+        "import sys; from clsplat.lenses import Intrinsics, undistorted\n"
         "undistorted(Intrinsics('RADIAL', (50., 32., 24., 0.1, 0.), 64, 48))\n"
         "from PIL import Image; Image.effect_noise((64, 64), 50).save(sys.argv[1])\n"
     )

@@ -17,7 +17,8 @@ from clsplat.config import DataConfig, SfmConfig
 from clsplat.errors import InputError
 from clsplat.io import load_scene
 from clsplat.io.colmap import read_model
-from clsplat.sfm import RECORD, Intrinsics, is_pinhole, read_record, reconstruct, undistorted
+from clsplat.lenses import Intrinsics, is_pinhole, undistorted
+from clsplat.sfm import RECORD, read_record, reconstruct
 
 CONFIG = SfmConfig(camera_model="SIMPLE_RADIAL")
 FILES = ["cameras.bin", "images.bin", "points3D.bin"]
@@ -109,6 +110,12 @@ def test_known_cameras_are_recovered(solved):
         assert np.degrees(np.arccos(min((np.trace(relative) - 1) / 2, 1))) < 0.2
         assert view.camera.fx == pytest.approx(300, rel=0.01)
     assert len(scene.points) > 500 and scene.colors.std() > 20
+
+
+def test_the_world_is_upright(solved):
+    scene = load_scene(solved, DataConfig(test_every=0))
+    down = np.mean([view.camera.viewmat[1, :3] for view in scene.train], axis=0)
+    np.testing.assert_allclose(down / np.linalg.norm(down), [0, 1, 0], atol=1e-9)
 
 
 def test_nothing_but_model_and_record_stays(solved):

@@ -21,7 +21,7 @@ from clsplat.io.images import (
     mask_folder,
     warn_of_missing,
 )
-from clsplat.sfm import Intrinsics
+from clsplat.lenses import Intrinsics
 
 MODELS: tuple[tuple[str, int], ...] = (
     ("SIMPLE_PINHOLE", 3),

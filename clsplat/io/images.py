@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, DataConfig
 from clsplat.errors import InputError
+from clsplat.lenses import Intrinsics, is_pinhole, project, undistorted
 from clsplat.photos import SUFFIXES, orientation, photo_size, read_mask, read_photo
 from clsplat.scene import View
-from clsplat.sfm import Intrinsics, is_pinhole, project, undistorted
 
 ASPECT_TOLERANCE = 0.01
 """By how much a photo's aspect ratio may differ from its camera's; a smaller copy is off by up to a pixel besides."""

@@ -22,8 +22,8 @@ from clsplat.io.images import (
     mask_folder,
     warn_of_missing,
 )
+from clsplat.lenses import Intrinsics
 from clsplat.photos import photo_size
-from clsplat.sfm import Intrinsics
 
 PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE")
