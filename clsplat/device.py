@@ -78,12 +78,12 @@ def device_label(device: cl.Device) -> str:
 
 
 def select_device(name: str | None = None) -> cl.Device:
-    """The device whose label contains `name`; without a name what PYOPENCL_CTX says, else GPU before CPU.
+    """The first device whose label contains `name`; without a name what PYOPENCL_CTX says, else GPU before CPU.
 
     Raises
     ------
     DeviceError
-        If there is no driver, or none or several of the labels contain `name`.
+        If there is no driver, no label contains `name`, or PYOPENCL_CTX selects nothing.
     """
     devices = list_devices()
     if not devices:
