@@ -282,7 +282,7 @@ class Demo:
 
     out: Out = Path("clsplat-demo")
     """Folder for everything that is made."""
-    iterations: int = 700
+    iterations: int = 1500
     """Optimisation steps."""
     device: str | None = None
     """Part of the platform's or device's name."""
