@@ -136,7 +136,7 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
 
         def progress(record: dict[str, Any]) -> None:
             bar.update(record["iteration"] - bar.n)
-            bar.set_postfix(loss=f"{record['loss']:.4f}", N=record["num_gaussians"], refresh=False)
+            bar.set_postfix_str(f"loss={record['loss']:.4f}, N={record['num_gaussians']}", refresh=False)
 
         def held_out(gaussians: "Gaussians") -> dict[str, float]:
             return mean_metrics(gaussians, scene.test, config.render, device, background)
