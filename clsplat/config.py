@@ -139,6 +139,8 @@ class TrainConfig:
     bands of spherical harmonics come sooner in proportion."""
     seed: int = 0
     """Of the random start, the order of the photos and the positions of split Gaussians."""
+    optimizer: Literal["device", "numpy"] = "device"
+    """Where Adam runs: in a kernel, or in NumPy on the host (slower; the same to rounding)."""
     strategy: str = "adc"
     """Densification strategy: a name of clsplat.densify.STRATEGIES."""
     checkpoint_every: int = 1000

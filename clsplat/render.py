@@ -112,6 +112,11 @@ def download(array: Any) -> Array:
     return array if isinstance(array, np.ndarray) else array.get()
 
 
+def fetch(gaussians: Gaussians) -> Gaussians:
+    """Gaussians of the device on the host; those of the host as they are."""
+    return Gaussians(**{name: download(array) for name, array in gaussians.arrays().items()})
+
+
 class Rendering:
     """A rendered image that knows how to differentiate itself; made by `render`.
 
@@ -182,8 +187,7 @@ class Rendering:
         if self._device is not None:
             v_run = Image(*(self._device.upload("v_image", a) for a in v_run))
         result = backward(self._device, self._run, v_run, viewmat_grad=viewmat_grad)
-        v_gaussians = Gaussians(**{k: download(a) for k, a in result.gaussians.arrays().items()})
-        return Gradients(v_gaussians, download(result.means2d), result.viewmat)
+        return Gradients(fetch(result.gaussians), download(result.means2d), result.viewmat)
 
 
 def render(

@@ -55,3 +55,16 @@ class Image(NamedTuple):
 
     image: Any
     alpha: Any
+
+
+class AdamStep(NamedTuple):
+    """One step of the optimiser: its number, counted from 1, and its constants.
+
+    rates: learning rate by field of `clsplat.gaussians.Gaussians`, with sh0 and sh_rest in the place of sh.
+    """
+
+    iteration: int
+    rates: dict[str, float]
+    beta1: float
+    beta2: float
+    eps: float

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,13 +10,13 @@ import numpy as np
 
 from clsplat.checkpoint import State, load_state, log_file, save_state
 from clsplat.config import BACKGROUNDS, TrainConfig
-from clsplat.densify import STRATEGIES
+from clsplat.densify import STRATEGIES, Edit
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.initialize import initialize
-from clsplat.optim import Moments, adam_step, learning_rates, sh_degree_at
+from clsplat.optim import Moments, adam_settings, sh_degree_at
 from clsplat.randomness import stream
-from clsplat.render import backward, download, forward, stage_functions, upload
+from clsplat.render import backward, download, fetch, forward, stage_functions, upload
 from clsplat.scene import Scene, View
 from clsplat.stages import Image
 
@@ -95,6 +96,8 @@ def train(
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
     state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
     photos = _Photos(device, scene.train)
+    if config.optimizer == "device":
+        _move(state, device)
     losses: list[float] = []
     with log_file(out / "log.jsonl", state.iteration) as log:
         started = time.perf_counter() - state.seconds
@@ -113,25 +116,25 @@ def train(
                 record = {"loss": float(np.mean(losses))}
                 losses.clear()
             if evaluate and config.eval_every and iteration % config.eval_every == 0:
-                record |= evaluate(state.gaussians)
+                record |= evaluate(fetch(state.gaussians))
                 started = time.perf_counter() - state.seconds
             if record:
                 about = {"iteration": iteration, "num_gaussians": len(state.gaussians), "seconds": state.seconds}
                 log(about | record)
             if iteration % config.checkpoint_every == 0 or iteration == config.iterations:
                 save_state(out / "checkpoint.npz", state, config)
-    return state.gaussians
+    return fetch(state.gaussians)
 
 
 def step(state: State, iteration: int, view: View, photos: _Photos, config: TrainConfig, device: "Device") -> float:
     """One iteration: render, compare, differentiate, update, densify. Changes `state`, returns the loss."""
-    gaussians, camera = state.gaussians, view.camera
-    sh_degree = sh_degree_at(iteration, config.shortened(config.optim.sh_degree_every), gaussians.sh_degree)
+    camera = view.camera
+    sh_degree = sh_degree_at(iteration, config.shortened(config.optim.sh_degree_every), state.gaussians.sh_degree)
     photo, mask = photos(view)
+    optimizer = device if config.optimizer == "device" else None
+    gaussians = state.gaussians if optimizer else upload(device, state.gaussians)
 
-    run = forward(
-        device, upload(device, gaussians), camera, config.render, BACKGROUNDS[config.data.background], sh_degree
-    )
+    run = forward(device, gaussians, camera, config.render, BACKGROUNDS[config.data.background], sh_degree)
     loss, v_image = stage_functions(device).l1_ssim(run.image.image, photo, config.optim.ssim_weight, mask)
     # No kernel writes this buffer: the loss does not depend on alpha.
     v_alpha = device.scratch("v_alpha", camera.height * camera.width)
@@ -139,18 +142,33 @@ def step(state: State, iteration: int, view: View, photos: _Photos, config: Trai
 
     visible = download(run.splats.extents)[:, 0] > 0
     state.strategy.observe(download(gradients.means2d), visible, camera.width, camera.height)
-    rates = learning_rates(iteration, config.iterations, state.extent, config.optim)
-    v_gaussians = Gaussians(**{name: download(array) for name, array in gradients.gaussians.arrays().items()})
-    adam_step(gaussians, v_gaussians, state.moments, rates, iteration, sh_degree, config.optim)
-
-    edit = state.strategy.edit(iteration, gaussians)
-    if edit is not None:
-        state.gaussians, state.moments = edit.gaussians, state.moments.take(edit.rows, edit.fresh)
-        if edit.reset_opacities:
-            state.moments.first.logit_opacities[:] = 0
-            state.moments.second.logit_opacities[:] = 0
+    settings = adam_settings(iteration, config.iterations, state.extent, config.optim)
+    v_gaussians = gradients.gaussians if optimizer else fetch(gradients.gaussians)
+    moments = state.moments
+    stage_functions(optimizer).adam_step(
+        state.gaussians, v_gaussians, moments.first, moments.second, settings, sh_degree
+    )
+    if state.strategy.due(iteration):
+        _move(state, None)
+        _apply(state.strategy.edit(iteration, state.gaussians), state)
+        if optimizer:
+            _move(state, optimizer)
     state.iteration = iteration
     return loss
+
+
+def _apply(edit: Edit, state: State) -> None:
+    state.gaussians, state.moments = edit.gaussians, state.moments.take(edit.rows, edit.fresh)
+    if edit.reset_opacities:
+        state.moments.first.logit_opacities[:] = 0
+        state.moments.second.logit_opacities[:] = 0
+
+
+def _move(state: State, device: "Device | None") -> None:
+    """Parameters and moments to the device, or to the host for None."""
+    move = partial(upload, device) if device else fetch
+    state.gaussians = move(state.gaussians)
+    state.moments = Moments(move(state.moments.first), move(state.moments.second))
 
 
 def initial_state(scene: Scene, config: TrainConfig) -> State:

@@ -45,20 +45,28 @@ class Adc:
         self.statistics["grad_sum"] += np.hypot(v_means2d[:, 0] * (width / 2), v_means2d[:, 1] * (height / 2))
         self.statistics["seen"] += visible
 
-    def edit(self, iteration: int, gaussians: Gaussians) -> Edit | None:
+    def _densifies(self, iteration: int) -> bool:
+        return self.start <= iteration < self.stop and iteration % self.config.every == 0
+
+    def _resets(self, iteration: int) -> bool:
+        early = self.white and iteration == self.first_edit
+        return iteration < self.stop and (early or iteration % self.config.reset_every == 0)
+
+    def due(self, iteration: int) -> bool:
         """See `clsplat.densify.Strategy`."""
-        c = self.config
-        if iteration >= self.stop:
-            return None
-        edit = None
-        if iteration >= self.start and iteration % c.every == 0:
-            edit = self._densify(iteration, gaussians)
-            edit = self._prune(iteration, edit)
+        return self._densifies(iteration) or self._resets(iteration)
+
+    def edit(self, iteration: int, gaussians: Gaussians) -> Edit:
+        """See `clsplat.densify.Strategy`."""
+        edit = Edit(gaussians, np.arange(len(gaussians)), np.zeros(len(gaussians), bool))
+        if self._densifies(iteration):
+            edit = self._prune(iteration, self._densify(iteration, gaussians))
             self._clear(len(edit.rows))
-        if iteration % c.reset_every == 0 or (self.white and iteration == self.first_edit):
-            edit = edit or Edit(gaussians, np.arange(len(gaussians)), np.zeros(len(gaussians), bool))
+        if self._resets(iteration):
             lowered = Gaussians(**edit.gaussians.arrays())
-            lowered.logit_opacities = np.minimum(lowered.logit_opacities, logit(np.float32(c.reset_opacity)))
+            lowered.logit_opacities = np.minimum(
+                lowered.logit_opacities, logit(np.float32(self.config.reset_opacity))
+            )
             edit = edit._replace(gaussians=lowered, reset_opacities=True)
         return edit
 

@@ -39,7 +39,10 @@ class Strategy(Protocol):
         """Take in one iteration: gradients (N, 2) with respect to the splats' centres in pixels, whether each splat
         is on screen (N,), and the image's size in pixels."""
 
-    def edit(self, iteration: int, gaussians: Gaussians) -> Edit | None:
-        """The edit due after an iteration, counted from 1, or None.
+    def due(self, iteration: int) -> bool:
+        """Whether an edit is due after an iteration, counted from 1."""
+
+    def edit(self, iteration: int, gaussians: Gaussians) -> Edit:
+        """The edit that is due.
 
         Leaves `gaussians` as they are, and the statistics in step with the result."""

@@ -1,5 +1,6 @@
 """Launches of the stages: `clsplat.reference`'s functions with a `clsplat.device.Device` as first argument."""
 
+from clsplat.ops.adam import adam_step
 from clsplat.ops.bin import bin_splats
 from clsplat.ops.composite import composite_bwd, composite_fwd
 from clsplat.ops.loss import l1_ssim
@@ -8,6 +9,7 @@ from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort
 
 __all__ = [
+    "adam_step",
     "argsort",
     "bin_splats",
     "composite_bwd",

@@ -1,5 +1,6 @@
 """The stages in float64 NumPy: readable mathematics, the oracle of the tests, and a renderer without OpenCL."""
 
+from clsplat.reference.adam import adam_step
 from clsplat.reference.bin import bin_splats
 from clsplat.reference.composite import composite_bwd, composite_fwd
 from clsplat.reference.loss import l1_ssim
@@ -8,6 +9,7 @@ from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort
 
 __all__ = [
+    "adam_step",
     "argsort",
     "bin_splats",
     "composite_bwd",

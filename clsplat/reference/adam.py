@@ -1,0 +1,45 @@
+"""Twin of the stage adam, in the dtype of its arrays: also the optimiser of ``--optimizer numpy``."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.gaussians import SHAPES, Gaussians
+from clsplat.stages import AdamStep
+
+Array = NDArray[Any]
+
+# Values updated at once: their five arrays stay in a core's L2 cache.
+BLOCK = 32768
+
+
+def adam_step(
+    gaussians: Gaussians, gradients: Gaussians, first: Gaussians, second: Gaussians, step: AdamStep, sh_degree: int
+) -> None:
+    """One step of Adam (Kingma and Ba 2015, algorithm 1), in place; arguments as of `clsplat.ops.adam_step`."""
+    correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
+    for name in SHAPES:
+        n = len(gaussians)
+        width = 3 * (sh_degree + 1) ** 2 if name == "sh" else max(1, gaussians.arrays()[name][:1].size)
+        rate: Any
+        if name == "sh":
+            rate = np.full(width, step.rates["sh_rest"], gaussians.sh.dtype)
+            rate[:3] = step.rates["sh0"]
+        else:
+            rate = step.rates[name]
+        p, g, m, v = (getattr(c, name).reshape(n, -1)[:, :width] for c in (gaussians, gradients, first, second))
+        rows = max(1, BLOCK // width)
+        for begin in range(0, n, rows):
+            block = slice(begin, begin + rows)
+            _update(p[block], g[block], m[block], v[block], rate / correction1, correction2, step)
+
+
+def _update(p: Array, g: Array, m: Array, v: Array, rate: Any, correction2: float, step: AdamStep) -> None:
+    m *= step.beta1
+    m += (1 - step.beta1) * g
+    v *= step.beta2
+    v += (1 - step.beta2) * (g * g)
+    denominator = np.sqrt(v * (1 / correction2))
+    denominator += step.eps
+    p -= rate * (m / denominator)
