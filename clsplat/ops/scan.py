@@ -35,7 +35,9 @@ def exclusive_scan(device: Device, values: Array, what: str = "scan") -> tuple[A
     defines = {"GROUP": 1 if device.is_cpu else 64}
     partial = device.empty("scan", chunks + 1, np.uint64)
     sums = device.empty("scan", n + 1, np.uint32)
-    device.launch("scan", "scan_reduce", (chunks,), [n, chunks, values, partial], defines=defines)
+    # A group of one chunk: on a CPU a group runs on one core.
+    group = (1,) if device.is_cpu else None
+    device.launch("scan", "scan_reduce", (chunks,), [n, chunks, values, partial], defines=defines, group=group)
     device.launch(
         "scan",
         "scan_spine",
@@ -44,7 +46,7 @@ def exclusive_scan(device: Device, values: Array, what: str = "scan") -> tuple[A
         defines=defines,
         group=(defines["GROUP"],),
     )
-    device.launch("scan", "scan_down", (chunks,), [n, chunks, values, partial, sums], defines=defines)
+    device.launch("scan", "scan_down", (chunks,), [n, chunks, values, partial, sums], defines=defines, group=group)
     total = int(partial[chunks].get())
     if total >= 2**32:
         raise DeviceError(
