@@ -17,10 +17,11 @@ import pytest
 import clsplat
 from clsplat import ops, reference
 from clsplat.camera import Camera
-from clsplat.config import RenderConfig
+from clsplat.config import OptimConfig, RenderConfig
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.render import render
+from clsplat.optim import adam_settings
+from clsplat.render import render, upload
 
 RACES = """
 __kernel void race(__global int *x) {
@@ -90,6 +91,21 @@ def loss(device):
     np.testing.assert_allclose(v_image.get(), expected_v_image, atol=1e-12 * np.abs(expected_v_image).max())
 
 
+def adam(device):
+    """Runs of both widths that end inside an array, and rows of which the last bands are not trained."""
+    for is_cpu in (True, False):
+        device.is_cpu = is_cpu
+        found = [scene(22, seed, 1).astype(np.float64) for seed in range(3)]
+        found.append(Gaussians(**{name: array**2 for name, array in found[2].arrays().items()}))
+        on_device = [upload(device, part) for part in found]
+        step = adam_settings(3, 10, 1.0, OptimConfig())
+        ops.adam_step(device, *on_device, step, 0)
+        reference.adam_step(*found, step, 0)
+        for a, b in zip(on_device, found, strict=True):
+            for name, array in b.arrays().items():
+                np.testing.assert_allclose(a.arrays()[name].get(), array, rtol=1e-12, atol=1e-14)
+
+
 def scene(n, opacity_logit, scale):
     rng = np.random.default_rng(n)
     return Gaussians(
@@ -124,6 +140,7 @@ CASES = {
     "sort": sort,
     "scan": scan,
     "loss": loss,
+    "adam": adam,
     "gpu-8": lambda device: pipeline(device, "gpu", 8),
     "gpu-16": lambda device: pipeline(device, "gpu", 16),
     "cpu-16": lambda device: pipeline(device, "cpu", 16),

@@ -130,6 +130,7 @@ def test_no_path_of_a_machine():
 
 # What each file's header documents, with values it allows.
 DEFINES = {
+    "adam": {},
     "bin": {"TILE": 16},
     "composite_cpu": {"TILE": 8, "CHANNELS": 1},
     "composite_gpu": {"TILE": 8, "CHANNELS": 1, "BATCH": 16},
