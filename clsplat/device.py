@@ -2,6 +2,7 @@
 
 import os
 import re
+import warnings
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -175,8 +176,10 @@ class Device:
         if what in self._scratch and self._scratch[what][0] != (size, layout):
             del self._scratch[what]
         if what not in self._scratch:
-            self._scratch[what] = (size, layout), self.empty(what, size)
-            self._scratch[what][1].fill(0)
+            array = self.empty(what, size)
+            # Not Array.fill, which compiles a kernel for it.
+            cl.enqueue_fill_buffer(self.queue, array.data, self.real.type(0), 0, array.nbytes)
+            self._scratch[what] = (size, layout), array
         return self._scratch[what][1]
 
     def upload(self, what: str, array: Any, dtype: DTypeLike | None = None) -> cl.array.Array:
@@ -233,4 +236,7 @@ class Device:
             f"-D{name}={value!r}" if isinstance(value, float) else f"-D{name}={value}"
             for name, value in values.items()
         ]
-        return cl.Program(self.context, inline_includes(f"{stage}.cl", kernel_folder())).build(options)
+        with warnings.catch_warnings():
+            # Some drivers report on every success, for example which kernels they vectorised.
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+            return cl.Program(self.context, inline_includes(f"{stage}.cl", kernel_folder())).build(options)
