@@ -1,5 +1,7 @@
 """Launch of the stage adam (cl/adam.cl)."""
 
+import numpy as np
+
 from clsplat.device import Device
 from clsplat.gaussians import SHAPES, Gaussians
 from clsplat.stages import AdamStep
@@ -29,6 +31,7 @@ def adam_step(
         Bands above it have had no gradient yet; their update would be 0 and is left out.
     """
     correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
+    keep = np.array([step.beta1, step.beta2])
     run = RUN if device.is_cpu else 1
     for name in SHAPES:
         arrays = [getattr(c, name) for c in (gradients, gaussians, first, second)]
@@ -39,5 +42,6 @@ def adam_step(
         else:
             stride, width, split = run, run, 0
             split_rate = rate = step.rates[name]
-        scalars = [split_rate / correction1, rate / correction1, 1 / correction2, step.beta1, step.beta2, step.eps]
+        scalars = [split_rate / correction1, rate / correction1, 1 / correction2]
+        scalars += [keep.astype(device.real), (1 - keep).astype(device.real), step.eps]
         device.launch("adam", "adam_step", (-(-total // stride),), [total, stride, width, split, *scalars, *arrays])
