@@ -176,10 +176,7 @@ class Device:
         if what in self._scratch and self._scratch[what][0] != (size, layout):
             del self._scratch[what]
         if what not in self._scratch:
-            array = self.empty(what, size)
-            # Not Array.fill, which compiles a kernel for it.
-            cl.enqueue_fill_buffer(self.queue, array.data, self.real.type(0), 0, array.nbytes)
-            self._scratch[what] = (size, layout), array
+            self._scratch[what] = (size, layout), self.upload(what, np.zeros(size, self.real))
         return self._scratch[what][1]
 
     def upload(self, what: str, array: Any, dtype: DTypeLike | None = None) -> cl.array.Array:

@@ -1,5 +1,7 @@
 """Launch of the stage adam (cl/adam.cl)."""
 
+from typing import Any
+
 import numpy as np
 
 from clsplat.device import Device
@@ -42,6 +44,6 @@ def adam_step(
         else:
             stride, width, split = run, run, 0
             split_rate = rate = step.rates[name]
-        scalars = [split_rate / correction1, rate / correction1, 1 / correction2]
+        scalars: list[Any] = [split_rate / correction1, rate / correction1, 1 / correction2]
         scalars += [keep.astype(device.real), (1 - keep).astype(device.real), step.eps]
         device.launch("adam", "adam_step", (-(-total // stride),), [total, stride, width, split, *scalars, *arrays])
