@@ -13,9 +13,9 @@
 // Buffers, `total` values each: in gradients; in and out parameters, first (m), second (v).
 #include "common.h"
 
-inline void adam_values(size_t begin, size_t end, real rate, real inv_correction2, real2 keep, real2 take, real eps,
-                        const __global real *gradients, __global real *parameters, __global real *first,
-                        __global real *second) {
+static inline void adam_values(size_t begin, size_t end, real rate, real inv_correction2, real2 keep, real2 take,
+                               real eps, const __global real *gradients, __global real *parameters,
+                               __global real *first, __global real *second) {
     for (size_t i = begin; i < end; ++i) {
         const real g = gradients[i];
         const real m = keep.x * first[i] + take.x * g;

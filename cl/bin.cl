@@ -24,9 +24,10 @@
 #endif
 
 // Walks the tiles of splat g; writes them from slot first on, if emitting. Returns their number.
-inline uint walk_tiles(uint g, int width, int height, const __global real *means2d, const __global real *conics,
-                       const __global real *extents, const __global real *opacities, bool emitting, uint first,
-                       __global uint *tiles, __global uint *slot_gauss) {
+static inline uint walk_tiles(uint g, int width, int height, const __global real *means2d,
+                              const __global real *conics, const __global real *extents,
+                              const __global real *opacities, bool emitting, uint first, __global uint *tiles,
+                              __global uint *slot_gauss) {
     const real2 extent = vload2(g, extents);
     if (!(extent.x > 0))
         return 0;
@@ -91,7 +92,7 @@ __kernel void bin_emit(const uint n, const int width, const int height, const __
 }
 
 // Index of the first of the m sorted tiles that is not below `tile`.
-inline uint lower_bound(uint m, const __global uint *sorted_tiles, uint tile) {
+static inline uint lower_bound(uint m, const __global uint *sorted_tiles, uint tile) {
     uint begin = 0, end = m;
     while (begin < end) {
         const uint middle = begin + (end - begin) / 2;

@@ -4,6 +4,9 @@
 //               so that unsuffixed literals are of type real in both builds.
 // -DALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN, BLUR, COMPENSATION_MIN, NEAR, FRUSTUM_MARGIN, QUAT_NORM2_MIN, EXTENT_SLACK
 //               the model's constants; their home, reasons and sources are in clsplat/constants.py.
+//
+// Functions are `static inline`: in C99's sense a plain `inline` defines nothing to link with where a compiler chooses
+// not to inline, as some drivers do when they do not optimise.
 #ifndef CLSPLAT_COMMON_H
 #define CLSPLAT_COMMON_H
 
@@ -37,11 +40,11 @@ typedef int16 mask16;
 #define CONCATENATE_(a, b) a##b
 #define CONCATENATE(a, b)  CONCATENATE_(a, b)
 
-inline real3 load3(const __global real *x, size_t i) {
+static inline real3 load3(const __global real *x, size_t i) {
     return (real3)(x[3 * i], x[3 * i + 1], x[3 * i + 2]);
 }
 
-inline void store3(__global real *x, size_t i, real3 value) {
+static inline void store3(__global real *x, size_t i, real3 value) {
     x[3 * i] = value.x;
     x[3 * i + 1] = value.y;
     x[3 * i + 2] = value.z;

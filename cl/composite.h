@@ -22,8 +22,8 @@ typedef struct {
     real color[CHANNELS];
 } Splat;
 
-inline Splat splat_load(uint g, const __global real *means2d, const __global real *conics,
-                        const __global real *opacities, const __global real *colors) {
+static inline Splat splat_load(uint g, const __global real *means2d, const __global real *conics,
+                               const __global real *opacities, const __global real *colors) {
     Splat s;
     s.x = means2d[2 * g];
     s.y = means2d[2 * g + 1];
@@ -37,14 +37,14 @@ inline Splat splat_load(uint g, const __global real *means2d, const __global rea
 }
 
 // opacity exp(-sigma), not clamped; -1 where sigma < 0, which only rounding of a needle's conic brings about.
-inline REALV splat_alpha(const Splat *s, REALV dx, real dy) {
+static inline REALV splat_alpha(const Splat *s, REALV dx, real dy) {
     const REALV sigma = dx * ((real)0.5 * s->a * dx + s->b * dy) + (real)0.5 * s->c * dy * dy;
     const REALV alpha = s->opacity * exp(-sigma);
     return sigma >= 0 ? alpha : (REALV)-1;
 }
 
 // Gradient of sigma from that of the clamped alpha; alpha is splat_alpha's value. The clamp passes nothing.
-inline REALV splat_alpha_vjp(REALV alpha, REALV v_alpha) {
+static inline REALV splat_alpha_vjp(REALV alpha, REALV v_alpha) {
     return alpha < (REALV)ALPHA_MAX ? -alpha * v_alpha : (REALV)0;
 }
 
@@ -52,7 +52,7 @@ inline REALV splat_alpha_vjp(REALV alpha, REALV v_alpha) {
 // where the splat is not drawn and not clamped elsewhere; returns the weight alpha T. *transmittance goes from
 // before to behind the splat. True is -1 in a vector's mask and 1 in a scalar's: only what is right for both
 // stands here, and *live must be such a mask.
-inline REALV splat_over(const Splat *s, REALV dx, real dy, REALV *transmittance, MASKV *live, REALV *alpha) {
+static inline REALV splat_over(const Splat *s, REALV dx, real dy, REALV *transmittance, MASKV *live, REALV *alpha) {
     const REALV raw = splat_alpha(s, dx, dy);
     const REALV clamped = raw < (REALV)ALPHA_MAX ? raw : (REALV)ALPHA_MAX;
     const REALV before = *transmittance, behind = before * (1 - clamped);
@@ -67,7 +67,7 @@ inline REALV splat_over(const Splat *s, REALV dx, real dy, REALV *transmittance,
 // Gradient of sigma; alpha and weight as splat_over gave them, T as it was before the splat, u = colour . v_image.
 // *behind goes from the sum of u alpha T over this splat and all behind it, the background included, to that
 // without it.
-inline REALV splat_over_vjp(REALV alpha, REALV weight, REALV before, REALV u, REALV *behind) {
+static inline REALV splat_over_vjp(REALV alpha, REALV weight, REALV before, REALV u, REALV *behind) {
     *behind -= weight * u;
     // ALPHA_MAX < 1 bounds the quotient; where alpha is clamped its gradient is dropped anyway.
     const REALV clamped = alpha < (REALV)ALPHA_MAX ? alpha : (REALV)ALPHA_MAX;
@@ -82,7 +82,7 @@ typedef struct {
 // A record: v_means2d[2], v_conics[3], v_opacities[1], v_colors[CHANNELS] of one splat from one tile.
 #define RECORD (6 + CHANNELS)
 
-inline void splat_record(const Splat *s, Moments m, const real *v_color, __global real *record) {
+static inline void splat_record(const Splat *s, Moments m, const real *v_color, __global real *record) {
     record[0] = -(s->a * m.mx + s->b * m.my);
     record[1] = -(s->b * m.mx + s->c * m.my);
     record[2] = (real)0.5 * m.mxx;
@@ -93,7 +93,7 @@ inline void splat_record(const Splat *s, Moments m, const real *v_color, __globa
         record[6 + k] = v_color[k];
 }
 
-inline void splat_record_zero(__global real *record) {
+static inline void splat_record_zero(__global real *record) {
     for (int k = 0; k < RECORD; ++k)
         record[k] = 0;
 }

@@ -40,13 +40,13 @@
 #define COLUMNS ((real8)(0, 1, 2, 3, 4, 5, 6, 7))
 #endif
 
-inline real sum8(real8 v) {
+static inline real sum8(real8 v) {
     const real4 a = v.lo + v.hi;
     const real2 b = a.lo + a.hi;
     return b.x + b.y;
 }
 
-inline real sum_row(REALV v) {
+static inline real sum_row(REALV v) {
 #if TILE == 16
     return sum8(v.lo + v.hi);
 #else
@@ -55,7 +55,7 @@ inline real sum_row(REALV v) {
 }
 
 // Rows [first, last] of the tile with origin (x0, y0) and `rows` rows in which splat g may be visible.
-inline int2 visible_rows(const Splat *s, real2 extent, int x0, int y0, int rows) {
+static inline int2 visible_rows(const Splat *s, real2 extent, int x0, int y0, int rows) {
     const real lo = x0 + (real)0.5 - s->x;
     const real2 range =
         ellipse_range((real3)(s->c, s->b, s->a), ellipse_r2(s->opacity), extent.yx, lo, lo + TILE - 1);
@@ -63,7 +63,7 @@ inline int2 visible_rows(const Splat *s, real2 extent, int x0, int y0, int rows)
 }
 
 // Bit r is set while row r has a live pixel.
-inline uint live_rows(const MASKV *live) {
+static inline uint live_rows(const MASKV *live) {
     uint rows = 0;
     for (int r = 0; r < TILE; ++r)
         rows |= any(live[r]) ? 1u << r : 0;

@@ -44,7 +44,7 @@
 #define PIXELS (TILE * TILE)
 
 // Where pixel p of the tile with origin (x0, y0) lies.
-inline int2 pixel_of(int x0, int y0, uint p) {
+static inline int2 pixel_of(int x0, int y0, uint p) {
     return (int2)(x0 + p % TILE, y0 + p / TILE);
 }
 

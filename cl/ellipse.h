@@ -5,7 +5,7 @@
 
 // r2 in the unit of 2 sigma, the slack of clsplat/constants.py included; not positive: the splat is
 // invisible.
-inline real ellipse_r2(real opacity) {
+static inline real ellipse_r2(real opacity) {
     return opacity > ALPHA_MIN ? 2 * (log(opacity / ALPHA_MIN) + EXTENT_SLACK) : 0;
 }
 
@@ -14,7 +14,7 @@ inline real ellipse_r2(real opacity) {
 // c, ex and ey. The leftmost and rightmost points lie at dy = +-(b/c) ex; within the band an extreme is
 // attained there or at the nearer border (Hanson et al. 2024, "Speedy-Splat", AccuTile). With ey^2 = r2 a/(a
 // c - b^2) the determinant of the conic, which cancels for needles, is not needed.
-inline real2 ellipse_range(real3 conic, real r2, real2 extent, real lo, real hi) {
+static inline real2 ellipse_range(real3 conic, real r2, real2 extent, real lo, real hi) {
     const real a = conic.x, b = conic.y, c = conic.z;
     lo = fmax(lo, -extent.y);
     hi = fmin(hi, extent.y);
@@ -30,7 +30,7 @@ inline real2 ellipse_range(real3 conic, real r2, real2 extent, real lo, real hi)
 }
 
 // Indices [first, last] of the pixels in [0, size) whose centres lie in [lo, hi]; first > last: none.
-inline int2 pixels_between(real lo, real hi, int size) {
+static inline int2 pixels_between(real lo, real hi, int size) {
     // Clamped as reals: converting a real beyond int's range is undefined.
     const int first = (int)ceil(clamp(lo - (real)0.5, (real)0, (real)size));
     const int last = (int)floor(clamp(hi - (real)0.5, (real)-1, (real)(size - 1)));

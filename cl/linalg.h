@@ -8,28 +8,28 @@ typedef struct {
     real3 row0, row1, row2;
 } mat3;
 
-inline real3 mat3_mul(mat3 m, real3 v) {
+static inline real3 mat3_mul(mat3 m, real3 v) {
     return (real3)(dot(m.row0, v), dot(m.row1, v), dot(m.row2, v));
 }
 
-inline real3 mat3_tmul(mat3 m, real3 v) {
+static inline real3 mat3_tmul(mat3 m, real3 v) {
     return m.row0 * v.x + m.row1 * v.y + m.row2 * v.z;
 }
 
 // a b^T + c d^T
-inline mat3 mat3_outer2(real3 a, real3 b, real3 c, real3 d) {
+static inline mat3 mat3_outer2(real3 a, real3 b, real3 c, real3 d) {
     mat3 m = {a.x * b + c.x * d, a.y * b + c.y * d, a.z * b + c.z * d};
     return m;
 }
 
-inline real3 normalize_vjp(real3 v, real3 v_unit) {
+static inline real3 normalize_vjp(real3 v, real3 v_unit) {
     const real inv_norm = 1 / sqrt(dot(v, v));
     const real3 unit = v * inv_norm;
     return (v_unit - unit * dot(unit, v_unit)) * inv_norm;
 }
 
 // Rotation matrix of the unit quaternion q = wxyz (kept in the vector's x, y, z, w in that order).
-inline mat3 rotation_from_quat(real4 q) {
+static inline mat3 rotation_from_quat(real4 q) {
     const real w = q.x, x = q.y, y = q.z, z = q.w;
     mat3 r = {(real3)(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
               (real3)(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -37,7 +37,7 @@ inline mat3 rotation_from_quat(real4 q) {
     return r;
 }
 
-inline real4 rotation_from_quat_vjp(real4 q, mat3 v) {
+static inline real4 rotation_from_quat_vjp(real4 q, mat3 v) {
     const real w = q.x, x = q.y, y = q.z, z = q.w;
     const real3 a = v.row0, b = v.row1, c = v.row2;
     return 2 * (real4)(x * (c.y - b.z) + y * (a.z - c.x) + z * (b.x - a.y),
@@ -46,7 +46,7 @@ inline real4 rotation_from_quat_vjp(real4 q, mat3 v) {
                        x * (c.x + a.z) + y * (c.y + b.z) - 2 * z * (a.x + b.y) + w * (b.x - a.y));
 }
 
-inline real4 normalize_quat_vjp(real4 q, real4 v_unit) {
+static inline real4 normalize_quat_vjp(real4 q, real4 v_unit) {
     const real inv_norm = 1 / sqrt(dot(q, q));
     const real4 unit = q * inv_norm;
     return (v_unit - unit * dot(unit, v_unit)) * inv_norm;

@@ -39,13 +39,13 @@ typedef struct {
     size_t plane; // reals in three channels
 } Layout;
 
-inline Layout layout_of(int width, int height) {
+static inline Layout layout_of(int width, int height) {
     Layout l = {width, height, (width + SEGMENT - 1) / SEGMENT * SEGMENT + 2 * SEGMENT, 0};
     l.plane = (size_t)3 * (height + 2 * RADIUS) * l.pitch;
     return l;
 }
 
-inline size_t plane_index(Layout l, int channel, int row, int column) {
+static inline size_t plane_index(Layout l, int channel, int row, int column) {
     return ((size_t)channel * (l.height + 2 * RADIUS) + row + RADIUS) * l.pitch + SEGMENT + column;
 }
 
@@ -64,7 +64,7 @@ __kernel void loss_planes(const int width, const int height, const __global real
 
 // Columns beyond the image, inside the last segment, are written too: they must be 0 where a later pass reads
 // them.
-inline real16 inside(Layout l, int column, real16 value) {
+static inline real16 inside(Layout l, int column, real16 value) {
     const real16 columns = (real16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) + (real)column;
     return columns < (real16)l.width ? value : (real16)0;
 }
@@ -91,14 +91,14 @@ __kernel void loss_blur_rows(const int width, const int height, const __global r
     vstore16(xy, 0, moments + 4 * l.plane + i);
 }
 
-inline real16 blur_columns(Layout l, const __global real *plane, size_t i) {
+static inline real16 blur_columns(Layout l, const __global real *plane, size_t i) {
     real16 sum = 0;
     for (int k = 0; k <= 2 * RADIUS; ++k)
         sum += taps[k] * vload16(0, plane + i + (k - RADIUS) * l.pitch);
     return sum;
 }
 
-inline real sum16(real16 v) {
+static inline real sum16(real16 v) {
     const real8 a = v.lo + v.hi;
     const real4 b = a.lo + a.hi;
     const real2 c = b.lo + b.hi;

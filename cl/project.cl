@@ -37,14 +37,14 @@
 #error "-DVIEWMAT_GRAD=1 needs -DGROUP, the work-group size of project_bwd"
 #endif
 
-inline mat3 camera_rotation(const Camera *camera) {
+static inline mat3 camera_rotation(const Camera *camera) {
     const real *r = camera->rotation;
     mat3 m = {(real3)(r[0], r[1], r[2]), (real3)(r[3], r[4], r[5]), (real3)(r[6], r[7], r[8])};
     return m;
 }
 
 // Slopes x/z and y/z at which the Jacobian is evaluated: clamped to the image enlarged by FRUSTUM_MARGIN.
-inline real2 clamped_slopes(const Camera *camera, real2 slopes) {
+static inline real2 clamped_slopes(const Camera *camera, real2 slopes) {
     const real2 focal = (real2)(camera->fx, camera->fy), centre = (real2)(camera->cx, camera->cy);
     const real2 size = (real2)(camera->width, camera->height);
     const real2 margin = (real)(0.5 * FRUSTUM_MARGIN) * size / focal;
@@ -64,7 +64,7 @@ typedef struct {
     real det0, det;  // determinants of cov2d without and with the blur
 } Footprint;
 
-inline Footprint footprint(const Camera *camera, real3 mean, real3 log_scales, real4 unit_quat) {
+static inline Footprint footprint(const Camera *camera, real3 mean, real3 log_scales, real4 unit_quat) {
     Footprint f;
     const mat3 view = camera_rotation(camera);
     f.p = mat3_mul(view, mean) + (real3)(camera->translation[0], camera->translation[1], camera->translation[2]);
@@ -97,8 +97,8 @@ typedef struct {
 } FootprintGrad;
 
 // v_xx, v_xy, v_yy: gradients of cov2d, where xy stands for both off-diagonal entries.
-inline FootprintGrad footprint_vjp(const Camera *camera, const Footprint *f, real3 mean, real4 unit_quat, real3 v_cov,
-                                   real2 v_mean2d, real v_depth) {
+static inline FootprintGrad footprint_vjp(const Camera *camera, const Footprint *f, real3 mean, real4 unit_quat,
+                                          real3 v_cov, real2 v_mean2d, real v_depth) {
     FootprintGrad v;
     const mat3 view = camera_rotation(camera);
     const real3 v_b0 = 2 * v_cov.x * f->b0 + v_cov.y * f->b1;
@@ -135,7 +135,7 @@ inline FootprintGrad footprint_vjp(const Camera *camera, const Footprint *f, rea
 }
 
 // Factor on the opacity, and the gradients of the determinants with respect to it.
-inline real compensation(real det0, real det) {
+static inline real compensation(real det0, real det) {
 #if ANTIALIASED
     return sqrt(fmax(det0 / det, (real)(COMPENSATION_MIN * COMPENSATION_MIN)));
 #else
@@ -143,7 +143,7 @@ inline real compensation(real det0, real det) {
 #endif
 }
 
-inline real2 compensation_vjp(real det0, real det, real v_factor) {
+static inline real2 compensation_vjp(real det0, real det, real v_factor) {
 #if ANTIALIASED
     const real ratio = det0 / det;
     if (ratio <= (real)(COMPENSATION_MIN * COMPENSATION_MIN))
@@ -155,18 +155,18 @@ inline real2 compensation_vjp(real det0, real det, real v_factor) {
 #endif
 }
 
-inline real sigmoid(real x) {
+static inline real sigmoid(real x) {
     return 1 / (1 + exp(-x));
 }
 
 // conic (xx, xy, yy) = inverse of cov2d: v_cov = -Q V Q with the symmetric matrix V of (v_xx, v_xy/2, v_yy).
-inline real3 conic_vjp(real3 q, real3 v) {
+static inline real3 conic_vjp(real3 q, real3 v) {
     return -(real3)(q.x * q.x * v.x + q.x * q.y * v.y + q.y * q.y * v.z,
                     2 * q.x * q.y * v.x + (q.y * q.y + q.x * q.z) * v.y + 2 * q.y * q.z * v.z,
                     q.y * q.y * v.x + q.y * q.z * v.y + q.z * q.z * v.z);
 }
 
-inline real3 from_camera(const Camera *camera, real3 mean) {
+static inline real3 from_camera(const Camera *camera, real3 mean) {
     return mean - (real3)(camera->position[0], camera->position[1], camera->position[2]);
 }
 

@@ -18,7 +18,7 @@
 #error "-DGROUP must give the work-group size of scan_spine, at least 1"
 #endif
 
-inline uint chunk_begin(uint n, uint chunks, uint p) {
+static inline uint chunk_begin(uint n, uint chunks, uint p) {
     const uint length = (n + chunks - 1) / chunks;
     return min(n, p * length);
 }

@@ -15,7 +15,7 @@
 #define SH_C3E 1.445305721320277   // sqrt(105/(16 pi))
 
 // The (degree + 1)^2 basis functions at the unit vector d.
-inline void sh_basis(real3 d, int degree, real *basis) {
+static inline void sh_basis(real3 d, int degree, real *basis) {
     const real x = d.x, y = d.y, z = d.z;
     basis[0] = SH_C0;
     if (degree > 0) {
@@ -42,7 +42,7 @@ inline void sh_basis(real3 d, int degree, real *basis) {
 }
 
 // Gradient with respect to d, its three components taken as independent; v holds the gradients of the basis.
-inline real3 sh_basis_vjp(real3 d, int degree, const real *v) {
+static inline real3 sh_basis_vjp(real3 d, int degree, const real *v) {
     const real x = d.x, y = d.y, z = d.z;
     real3 v_d = 0;
     if (degree > 0) {

@@ -49,18 +49,19 @@ typedef ulong sort_key;
 
 #define DIGITS (1u << DIGIT_BITS)
 
-inline uint digit_of(sort_key key, uint shift) {
+static inline uint digit_of(sort_key key, uint shift) {
     return (uint)(key >> shift) & (DIGITS - 1);
 }
 
 // First key of the run of work-item `lane` of block g; its end is the begin of the next lane.
-inline uint run_begin(uint n, uint groups, uint g, uint lane) {
+static inline uint run_begin(uint n, uint groups, uint g, uint lane) {
     const uint run = (n + groups * GROUP - 1) / (groups * GROUP);
     return min(n, (g * GROUP + lane) * run);
 }
 
 // counts[digit * GROUP + lane] of this work-group's block; ends with a barrier.
-inline void count_digits(uint n, uint groups, uint shift, const __global sort_key *keys, __local uint *counts) {
+static inline void count_digits(uint n, uint groups, uint shift, const __global sort_key *keys,
+                                __local uint *counts) {
     const uint lane = get_local_id(0), g = get_group_id(0);
     for (uint d = 0; d < DIGITS; ++d)
         counts[d * GROUP + lane] = 0;
