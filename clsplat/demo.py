@@ -49,7 +49,7 @@ def expose(rgb: Array) -> Array:
 def take_photo(camera: Camera, solids: list[Solid]) -> Array:
     """sRGB (H, W, 3) in [0, 1]: two rays per pixel and axis, each pixel a weighted mean over four."""
     xs, ys = ((np.arange(-1, 2 * n + 1) + 0.5) / 2 for n in (camera.width, camera.height))
-    fine = np.empty((len(ys), len(xs), 3))
+    fine: Array = np.empty((len(ys), len(xs), 3))
     for top in range(0, len(ys), TILE):
         for left in range(0, len(xs), TILE):
             tile = np.s_[top : top + TILE, left : left + TILE]

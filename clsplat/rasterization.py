@@ -95,7 +95,7 @@ def rasterization(
     if sh_degree is None:
         colors = np.broadcast_to(colors, (cameras, *colors.shape)) if colors.ndim == 2 else colors
         _check_shape("colors", colors, (cameras, n, colors.shape[-1] if colors.ndim else 0))
-        sh = np.zeros((n, 1, 3))
+        sh: NDArray[Any] = np.zeros((n, 1, 3))
         channels = colors.shape[2]
     else:
         sh, channels = colors, 3

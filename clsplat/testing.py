@@ -141,7 +141,7 @@ def gradcheck(
 def _pixel_distances(splats: Splats, width: int, height: int) -> Iterator[tuple[int, Array]]:
     """Front to back, without tiles or boxes: each splat and the distances (H, W) of its pixels from a threshold."""
     x, y = np.arange(width)[None, :] + 0.5, np.arange(height)[:, None] + 0.5
-    transmittance = np.ones((height, width))
+    transmittance: Array = np.ones((height, width))
     live = np.ones((height, width), dtype=bool)
     shown = np.flatnonzero(splats.extents[:, 0] > 0)
     for g in shown[np.argsort(splats.depths[shown], kind="stable")]:

@@ -308,7 +308,7 @@ def _check_finite(path: str | Path, table: Array, names: tuple[str, ...]) -> Non
 
 def _read_comments(comments: list[str]) -> tuple[Mode, NDArray[np.float64]]:
     """Rendering mode and world offset; whatever else the comments say is ignored."""
-    offset = np.zeros(3)
+    offset: NDArray[np.float64] = np.zeros(3)
     for comment in comments:
         words = comment.split()
         if words[:1] == ["offset"] and len(words) == 4:
