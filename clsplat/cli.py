@@ -1,7 +1,9 @@
 """The command line: a dataclass per command; tyro makes flags and help of its fields."""
 
 import json
+import signal
 import sys
+import threading
 import time
 import warnings
 from dataclasses import asdict, dataclass, field, replace
@@ -132,10 +134,20 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
     from clsplat.train import train
 
     background = BACKGROUNDS[config.data.background]
+    interrupted = threading.Event()
+
+    def interrupt(*_: object) -> None:
+        interrupted.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # the second Ctrl-C does not wait
+
+    signal.signal(signal.SIGINT, interrupt)
     with tqdm(total=config.iterations, unit="it", dynamic_ncols=True) as bar:
 
         def progress(record: dict[str, Any]) -> None:
             bar.update(record["iteration"] - bar.n)
+            if interrupted.is_set():
+                say(f"\n{out}: stopped after iteration {record['iteration']}; --resume continues from there")
+                raise KeyboardInterrupt
             bar.set_postfix_str(f"loss={record['loss']:.4f}, N={record['num_gaussians']}", refresh=False)
 
         def held_out(gaussians: "Gaussians") -> dict[str, float]:
@@ -144,6 +156,7 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
         gaussians = train(
             scene, config, device, out, resume=resume, evaluate=held_out if scene.test else None, progress=progress
         )
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
     say(f"{out / 'scene.ply'}: {len(gaussians)} Gaussians")
     training_curve(out / "log.jsonl", out / "training_curve.png")

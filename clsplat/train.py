@@ -78,7 +78,8 @@ def train(
     evaluate : callable, optional
         Called every `config.eval_every` iterations; what it returns is logged. Its time does not count.
     progress : callable
-        Called after every iteration with iteration, loss and num_gaussians.
+        Called after every iteration with iteration, loss and num_gaussians. If it raises KeyboardInterrupt, a
+        checkpoint is written before the run ends.
 
     Returns
     -------
@@ -109,8 +110,12 @@ def train(
                     f"(--optim.*); the last checkpoint in {out} is intact"
                 )
             losses.append(loss)
-            progress({"iteration": iteration, "loss": loss, "num_gaussians": len(state.gaussians)})
             state.seconds = time.perf_counter() - started
+            try:
+                progress({"iteration": iteration, "loss": loss, "num_gaussians": len(state.gaussians)})
+            except KeyboardInterrupt:
+                save_state(out / "checkpoint.npz", state, config)
+                raise
             record: dict[str, Any] = {}
             if iteration % LOG_EVERY == 0 or iteration == config.iterations:
                 record = {"loss": float(np.mean(losses))}

@@ -1,8 +1,10 @@
 """The command line end to end on a tiny dataset, and one clear sentence for each kind of bad input."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +128,23 @@ def test_resume_of_a_finished_run_changes_nothing(dataset: Path, tmp_path: Path)
     before = (tmp_path / "scene.ply").read_bytes()
     run("train", dataset, "-o", tmp_path, *TRAIN, "--resume")
     assert (tmp_path / "scene.ply").read_bytes() == before
+
+
+def test_control_c_saves_and_says_how_to_go_on(dataset: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "clsplat", "train", str(dataset), "-o", str(tmp_path), "--iterations", "100000"]
+    command += ["--init.random-points", "200"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    # The log's first line is written after 10 iterations: training is under way.
+    while not ((tmp_path / "log.jsonl").exists() and (tmp_path / "log.jsonl").stat().st_size):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=120)[1]
+    assert process.returncode == 130
+    assert "--resume continues from there" in error
+    assert "Traceback" not in error
+    assert (tmp_path / "checkpoint.npz").exists()
 
 
 def test_devices_names_the_default(capsys: pytest.CaptureFixture[str]) -> None:

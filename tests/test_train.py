@@ -113,6 +113,19 @@ def test_a_killed_run_resumes_to_the_same_bits(scene: Scene, device: Device, tmp
     assert lines(broken) == lines(whole)
 
 
+def test_an_interrupted_run_loses_nothing(scene: Scene, device: Device, tmp_path: Path) -> None:
+    expected = train(scene, CONFIG, device, tmp_path)
+
+    def interrupt(record: dict[str, object]) -> None:
+        if record["iteration"] == 33:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(scene, CONFIG, device, tmp_path, progress=interrupt)
+    assert load_state(tmp_path / "checkpoint.npz", scene.extent, CONFIG).iteration == 33
+    assert same(train(scene, CONFIG, device, tmp_path, resume=True), expected)
+
+
 def test_resume_refuses_what_would_not_continue(scene: Scene, device: Device, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"checkpoint\.npz: expected a checkpoint to resume from, found none"):
         train(scene, CONFIG, device, tmp_path, resume=True)
