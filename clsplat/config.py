@@ -12,7 +12,7 @@ Background = Literal["black", "white"]
 
 SHORT_RUN = 7000
 """Iterations of the paper's shorter setting (table 1, "7K"). Its fixed intervals leave 700 iterations without
-densification and view dependence: fox_pinhole at 269x480 then reached 23.6 dB instead of 26.3 dB."""
+densification and view dependence: fox_pinhole at 269x480 then reached 23.6 dB instead of 26.6 dB."""
 
 BACKGROUNDS: dict[Background, tuple[float, float, float]] = {
     "black": (0.0, 0.0, 0.0),
