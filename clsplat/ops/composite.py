@@ -15,6 +15,12 @@ def _variant(device: Device, compositor: str) -> str:
     return f"composite_{compositor}"
 
 
+def _inputs(splats: Splats, bins: Bins) -> list[Any]:
+    """The first arguments of both kernels."""
+    geometry = [splats.means2d, splats.conics, splats.extents, splats.opacities, splats.colors]
+    return [bins.width, bins.height, *geometry, bins.gauss_ids, bins.tile_ranges]
+
+
 def _launch(device: Device, stage: str, kernel: str, bins: Bins, channels: int, arguments: list[Any]) -> None:
     tiles = bins.tile_ranges.shape[0]
     defines = {"TILE": bins.tile_size, "CHANNELS": channels}
@@ -41,16 +47,7 @@ def composite_fwd(device: Device, splats: Splats, bins: Bins, background: Any, *
         device.empty("image", (bins.height, bins.width, channels)),
         device.empty("alpha", (bins.height, bins.width)),
     )
-    arguments = [
-        bins.width,
-        bins.height,
-        splats.means2d,
-        splats.conics,
-        splats.extents,
-        splats.opacities,
-        splats.colors,
-    ]
-    arguments += [bins.gauss_ids, bins.tile_ranges, device.upload("background", background), *result]
+    arguments = [*_inputs(splats, bins), device.upload("background", background), *result]
     _launch(device, _variant(device, compositor), "composite_fwd", bins, channels, arguments)
     return result
 
@@ -72,16 +69,7 @@ def composite_bwd(
     n, channels = splats.colors.shape
     m = bins.gauss_ids.shape[0]
     records = device.empty("gradients per intersection", (max(m, 1), 6 + channels))
-    arguments = [
-        bins.width,
-        bins.height,
-        splats.means2d,
-        splats.conics,
-        splats.extents,
-        splats.opacities,
-        splats.colors,
-    ]
-    arguments += [bins.gauss_ids, bins.tile_ranges, bins.slots, *image, *v_image, records]
+    arguments = [*_inputs(splats, bins), bins.slots, *image, *v_image, records]
     stage = _variant(device, compositor)
     _launch(device, stage, "composite_bwd", bins, channels, arguments)
     v = SplatGrads(
