@@ -71,12 +71,6 @@ def orientation(path: Path) -> int:
         return int(tag) if tag in range(1, 9) else 1
 
 
-def upright_size(path: Path) -> tuple[int, int]:
-    """Width and height after the EXIF orientation; see `photo_size` and `orientation`."""
-    width, height = photo_size(path)
-    return (height, width) if orientation(path) >= 5 else (width, height)
-
-
 def is_plain(path: Path) -> bool:
     """Whether every reader sees these pixels alike: an upright JPEG or PNG, 8-bit RGB or grey.
 

@@ -111,11 +111,6 @@ def train(
                 )
             losses.append(loss)
             state.seconds = time.perf_counter() - started
-            try:
-                progress({"iteration": iteration, "loss": loss, "num_gaussians": len(state.gaussians)})
-            except KeyboardInterrupt:
-                save_state(out / "checkpoint.npz", state, config)
-                raise
             record: dict[str, Any] = {}
             if iteration % LOG_EVERY == 0 or iteration == config.iterations:
                 record = {"loss": float(np.mean(losses))}
@@ -128,6 +123,11 @@ def train(
                 log(about | record)
             if iteration % config.checkpoint_every == 0 or iteration == config.iterations:
                 save_state(out / "checkpoint.npz", state, config)
+            try:
+                progress({"iteration": iteration, "loss": loss, "num_gaussians": len(state.gaussians)})
+            except KeyboardInterrupt:
+                save_state(out / "checkpoint.npz", state, config)
+                raise
     return fetch(state.gaussians)
 
 
@@ -145,8 +145,9 @@ def step(state: State, iteration: int, view: View, photos: _Photos, config: Trai
     v_alpha = device.scratch("v_alpha", camera.height * camera.width)
     gradients = backward(device, run, Image(v_image, v_alpha))
 
-    visible = download(run.splats.extents)[:, 0] > 0
-    state.strategy.observe(download(gradients.means2d), visible, camera.width, camera.height)
+    if state.strategy.watches(iteration):
+        visible = download(run.splats.extents)[:, 0] > 0
+        state.strategy.observe(download(gradients.means2d), visible, camera.width, camera.height)
     settings = adam_settings(iteration, config.iterations, state.extent, config.optim)
     v_gaussians = gradients.gaussians if optimizer else fetch(gradients.gaussians)
     moments = state.moments

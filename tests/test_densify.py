@@ -127,6 +127,7 @@ def test_reset_lowers_opacities_and_clears_their_moments() -> None:
 
 def test_nothing_changes_outside_its_time() -> None:
     strategy, _ = observed()
+    assert [strategy.watches(i) for i in (1, 999, 1000)] == [True, True, False]
     assert [strategy.due(i) for i in (50, 99, 100, 101, 900, 1000)] == [False, False, True, False, True, False]
 
 

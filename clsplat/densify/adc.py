@@ -39,6 +39,10 @@ class Adc:
     def _clear(self, n: int) -> None:
         self.statistics = {"grad_sum": np.zeros(n, np.float32), "seen": np.zeros(n, np.int32)}
 
+    def watches(self, iteration: int) -> bool:
+        """See `clsplat.densify.Strategy`."""
+        return iteration < self.stop
+
     def observe(self, v_means2d: Array, visible: Array, width: int, height: int) -> None:
         """See `clsplat.densify.Strategy`."""
         # One unit of normalised device coordinates is half the image.

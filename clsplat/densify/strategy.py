@@ -35,6 +35,9 @@ class Strategy(Protocol):
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         """Statistics of `n` Gaussians in a scene of the given extent, in world units."""
 
+    def watches(self, iteration: int) -> bool:
+        """Whether `observe` is to be told of an iteration, counted from 1: it costs copies from the device."""
+
     def observe(self, v_means2d: Array, visible: Array, width: int, height: int) -> None:
         """Take in one iteration: gradients (N, 2) with respect to the splats' centres in pixels, whether each splat
         is on screen (N,), and the image's size in pixels."""

@@ -28,6 +28,17 @@ def exclusive_scan(device: Device, values: Array, what: str = "scan") -> tuple[A
     DeviceError
         If the total exceeds 2^32 - 1.
     """
+    sums, partial = queue_scan(device, values)
+    total = int(partial[-1].get())
+    if total >= 2**32:
+        raise DeviceError(
+            f"{what}: expected a total below 2^32, found {total}; use fewer Gaussians or a smaller image"
+        )
+    return sums, total
+
+
+def queue_scan(device: Device, values: Array) -> tuple[Array, Array]:
+    """`exclusive_scan` without waiting for the device: the sums, and an array that ends with their true total."""
     n = values.shape[0]
     # A few chunks per core on a CPU; enough work-items to fill any GPU otherwise.
     chunks = 4 * device.cl_device.max_compute_units if device.is_cpu else 8192
@@ -47,9 +58,4 @@ def exclusive_scan(device: Device, values: Array, what: str = "scan") -> tuple[A
         group=(defines["GROUP"],),
     )
     device.launch("scan", "scan_down", (chunks,), [n, chunks, values, partial, sums], defines=defines, group=group)
-    total = int(partial[chunks].get())
-    if total >= 2**32:
-        raise DeviceError(
-            f"{what}: expected a total below 2^32, found {total}; use fewer Gaussians or a smaller image"
-        )
-    return sums, total
+    return sums, partial

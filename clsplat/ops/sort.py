@@ -5,7 +5,7 @@ from pyopencl.array import Array
 
 from clsplat.device import Device
 from clsplat.errors import InputError
-from clsplat.ops.scan import exclusive_scan
+from clsplat.ops.scan import queue_scan
 
 # Longest list that one work-group sorts in local memory: 12 KiB with 64-bit keys, within the 16 KiB of the smallest
 # embedded devices.
@@ -67,7 +67,7 @@ def argsort(device: Device, keys: Array, bits: int, method: str = "auto") -> tup
             defines=defines,
             group=(group,),
         )
-        offsets, _ = exclusive_scan(device, histogram)
+        offsets, _ = queue_scan(device, histogram)
         keys_out = device.empty("sort keys", n, keys.dtype)
         values_out = device.empty("sort order", n, np.uint32)
         device.launch(
