@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from clsplat.camera import Camera
-from clsplat.checkpoint import load_state, log_file, save_state
+from clsplat.checkpoint import State, load_state, log_file, save_state
 from clsplat.config import AdcConfig, InitConfig, OptimConfig, TrainConfig
+from clsplat.densify import Edit
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
@@ -19,7 +20,7 @@ from clsplat.metrics import psnr, to_uint8
 from clsplat.render import render
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
-from clsplat.train import initial_state, train, view_at
+from clsplat.train import _apply, initial_state, train, view_at
 
 SIZE = (40, 32)
 CONFIG = TrainConfig(
@@ -168,6 +169,43 @@ def test_every_epoch_takes_every_view_once(scene: Scene) -> None:
     names = [view_at(i, scene.train, seed=3).name for i in range(1, 25)]
     assert sorted(names[:12]) == sorted(names[12:]) == sorted(v.name for v in scene.train)
     assert names[:12] != names[12:]
+
+
+def random_state(scene: Scene) -> State:
+    """A state every array of which is unlike that of a fresh one."""
+    state, rng = initial_state(scene, CONFIG), np.random.default_rng(0)
+    for part in (state.moments.first, state.moments.second):
+        for array in part.arrays().values():
+            array[:] = rng.uniform(1, 2, array.shape)
+    for array in state.strategy.statistics.values():
+        array[:] = rng.integers(1, 9, array.shape)
+    return replace(state, iteration=7, seconds=1.5)
+
+
+def test_a_checkpoint_holds_everything(scene: Scene, tmp_path: Path) -> None:
+    state = random_state(scene)
+    save_state(tmp_path / "checkpoint.npz", state, CONFIG)
+    loaded = load_state(tmp_path / "checkpoint.npz", scene.extent, CONFIG)
+    assert (loaded.iteration, loaded.seconds, loaded.extent) == (7, 1.5, scene.extent)
+    assert same(loaded.gaussians, state.gaussians)
+    assert same(loaded.moments.first, state.moments.first)
+    assert same(loaded.moments.second, state.moments.second)
+    for name, array in state.strategy.statistics.items():
+        np.testing.assert_array_equal(loaded.strategy.statistics[name], array)
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_moments_follow_an_edit(scene: Scene, reset: bool) -> None:
+    state = random_state(scene)
+    before = state.moments
+    rows, fresh = np.array([3, 1, 1]), np.array([False, False, True])
+    _apply(Edit(state.gaussians.take(rows), rows, fresh, reset_opacities=reset), state)
+    assert len(state.gaussians) == 3
+    for old, new in ((before.first, state.moments.first), (before.second, state.moments.second)):
+        for name in ("means", "logit_opacities"):
+            kept = 0 if reset and name == "logit_opacities" else getattr(old, name)[rows[:2]]
+            np.testing.assert_array_equal(getattr(new, name)[:2], kept)
+            assert (getattr(new, name)[2] == 0).all()
 
 
 def test_a_failed_write_leaves_the_last_checkpoint(
