@@ -125,6 +125,16 @@ def test_reset_lowers_opacities_and_clears_their_moments() -> None:
     assert (edit.rows == np.arange(N)).all()
 
 
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_on_white_the_first_round_resets(background: str) -> None:
+    config = replace(CONFIG, data=replace(CONFIG.data, background=background))
+    for iteration, resets in ((100, background == "white"), (200, False)):
+        strategy, gaussians = observed(config, rows=slice(0, 0))
+        edit = strategy.edit(iteration, gaussians)
+        assert edit.reset_opacities == resets
+        assert (edit.gaussians.opacities.max() < 0.02) == resets
+
+
 def test_nothing_changes_outside_its_time() -> None:
     strategy, _ = observed()
     assert [strategy.watches(i) for i in (1, 999, 1000)] == [True, True, False]
