@@ -2,7 +2,8 @@
 //
 // -DUSE_DOUBLE  selects real = double; without it real = float and the host passes -cl-single-precision-constant,
 //               so that unsuffixed literals are of type real in both builds.
-// -DALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN, BLUR, COMPENSATION_MIN, NEAR, FRUSTUM_MARGIN, QUAT_NORM2_MIN, EXTENT_SLACK
+// -DALPHA_MIN, LOG2_ALPHA_MIN, EXPONENT_SLACK, ALPHA_MAX, TRANSMITTANCE_MIN, BLUR, COMPENSATION_MIN, NEAR, FRUSTUM_MARGIN,
+// -DQUAT_NORM2_MIN, EXTENT_SLACK
 //               the model's constants; their home, reasons and sources are in clsplat/constants.py.
 //
 // Functions are `static inline`: in C99's sense a plain `inline` defines nothing to link with where a compiler chooses
@@ -10,9 +11,9 @@
 #ifndef CLSPLAT_COMMON_H
 #define CLSPLAT_COMMON_H
 
-#if !defined(ALPHA_MIN) || !defined(ALPHA_MAX) || !defined(TRANSMITTANCE_MIN) || !defined(BLUR) ||                   \
-    !defined(COMPENSATION_MIN) || !defined(NEAR) || !defined(QUAT_NORM2_MIN) || !defined(EXTENT_SLACK) ||            \
-    !defined(FRUSTUM_MARGIN)
+#if !defined(ALPHA_MIN) || !defined(LOG2_ALPHA_MIN) || !defined(EXPONENT_SLACK) || !defined(ALPHA_MAX) ||            \
+    !defined(TRANSMITTANCE_MIN) || !defined(BLUR) || !defined(COMPENSATION_MIN) || !defined(NEAR) ||                 \
+    !defined(QUAT_NORM2_MIN) || !defined(EXTENT_SLACK) || !defined(FRUSTUM_MARGIN)
 #error "the constants of clsplat/constants.py must be passed as -D; build through clsplat.device.Device.program"
 #endif
 
@@ -24,7 +25,8 @@ typedef double3 real3;
 typedef double4 real4;
 typedef double8 real8;
 typedef double16 real16;
-typedef long8 mask8; // what comparing two real8 gives
+typedef long4 mask4; // what comparing two real4 gives
+typedef long8 mask8;
 typedef long16 mask16;
 #else
 typedef float real;
@@ -33,12 +35,21 @@ typedef float3 real3;
 typedef float4 real4;
 typedef float8 real8;
 typedef float16 real16;
+typedef int4 mask4;
 typedef int8 mask8;
 typedef int16 mask16;
 #endif
 
 #define CONCATENATE_(a, b) a##b
 #define CONCATENATE(a, b)  CONCATENATE_(a, b)
+
+// For the innermost loops, and for vectors as for scalars. PoCL inlines its built-in functions only where its library
+// was compiled for no more than what it takes the CPU to be; elsewhere each costs a call that spills every vector
+// register.
+#define LESSER(a, b)     ((a) < (b) ? (a) : (b))
+#define GREATER(a, b)    ((a) > (b) ? (a) : (b))
+#define CLAMP(x, lo, hi) ((x) < (lo) ? (lo) : (x) > (hi) ? (hi) : (x))
+#define ABSOLUTE(x)      ((x) < 0 ? -(x) : (x))
 
 static inline real3 load3(const __global real *x, size_t i) {
     return (real3)(x[3 * i], x[3 * i + 1], x[3 * i + 2]);

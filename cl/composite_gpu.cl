@@ -21,9 +21,8 @@
 // A batch takes TILE*TILE + BATCH - 1 steps. The work-item of its last splat sees each pixel as the batch leaves it:
 // its vote stops the group where no pixel is left, and the records behind are zeros.
 //
-// Buffers: as in composite_cpu.cl; extents[N,2] is not read, since no pixel can be skipped at less than the cost
-// of its test.
-// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (6 + CHANNELS), backward TILE^2
+// Buffers: as in composite_cpu.cl.
+// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (9 + CHANNELS), backward TILE^2
 // (2 + CHANNELS). At TILE 16, BATCH 64 and CHANNELS 4 that is 2.5 KiB and 6 KiB (double: 5 KiB and 12 KiB) of the
 // 32 KiB which OpenCL 1.2 guarantees.
 // -DTILE=8|16   edge of a tile, px; the forward work-group has TILE*TILE work-items
@@ -43,78 +42,79 @@
 
 #define PIXELS (TILE * TILE)
 
+// t of the splat at (dx, dy) from its centre.
+static inline real exponent_at(const Splat *s, real dx, real dy) {
+    return s->level + (dx * (s->a * dx + s->b * dy) + s->c * dy * dy);
+}
+
 // Where pixel p of the tile with origin (x0, y0) lies.
 static inline int2 pixel_of(int x0, int y0, uint p) {
     return (int2)(x0 + p % TILE, y0 + p / TILE);
 }
 
 __kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1))) void
-composite_fwd(const int width, const int height, const __global real *means2d, const __global real *conics,
-              const __global real *extents, const __global real *opacities, const __global real *colors,
-              const __global uint *gauss_ids, const __global uint *tile_ranges, const __global real *background,
-              __global real *image, __global real *alpha_image) {
+composite_fwd(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
+              const __global uint *tile_ranges, const __global real *background, __global real *image,
+              __global real *alpha_image) {
     __local Splat staged[BATCH];
     __local int live_pixels;
-    const uint t = get_group_id(0), lane = get_local_id(0);
+    const uint tile = get_group_id(0), lane = get_local_id(0);
     const int tiles_x = (width + TILE - 1) / TILE;
-    const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
+    const int x0 = tile % tiles_x * TILE, y0 = tile / tiles_x * TILE;
     const int2 pixel = pixel_of(x0, y0, lane);
     const int inside = pixel.x < width && pixel.y < height;
 
     if (lane == 0)
         live_pixels = min(TILE, width - x0) * min(TILE, height - y0);
-    real transmittance = 1, sums[CHANNELS];
-    int live = inside;
+    real transmittance = inside ? 1 : -1, sums[CHANNELS];
     for (int k = 0; k < CHANNELS; ++k)
         sums[k] = 0;
 
-    const uint begin = tile_ranges[2 * t], length = tile_ranges[2 * t + 1] - begin;
+    const uint begin = tile_ranges[2 * tile], length = tile_ranges[2 * tile + 1] - begin;
     for (uint first = 0; first < length; first += BATCH) {
         barrier(CLK_LOCAL_MEM_FENCE); // live_pixels is written, and nobody reads the last batch any more
         if (live_pixels == 0)
             break;
         const uint count = min((uint)BATCH, length - first);
         for (uint j = lane; j < count; j += PIXELS)
-            staged[j] = splat_load(gauss_ids[begin + first + j], means2d, conics, opacities, colors);
+            staged[j] = splats[gauss_ids[begin + first + j]];
         barrier(CLK_LOCAL_MEM_FENCE);
-        const int was_live = live;
-        for (uint j = 0; j < count && live; ++j) {
+        const int was_live = transmittance > 0;
+        for (uint j = 0; j < count && transmittance > 0; ++j) {
             const Splat s = staged[j];
-            const real dx = pixel.x + (real)0.5 - s.x, dy = pixel.y + (real)0.5 - s.y;
-            real alpha;
-            const real weight = splat_over(&s, dx, dy, &transmittance, &live, &alpha);
+            const real t = exponent_at(&s, pixel.x + (real)0.5 - s.x, pixel.y + (real)0.5 - s.y);
+            int drawn = splat_seen(&s, t);
+            const real weight = splat_over(exp2(t), &drawn, &transmittance);
             for (int k = 0; k < CHANNELS; ++k)
                 sums[k] += weight * s.color[k];
         }
-        if (was_live && !live)
+        if (was_live && transmittance < 0)
             atomic_dec(&live_pixels);
     }
 
     if (inside) {
         const size_t p = (size_t)pixel.y * width + pixel.x;
         for (int k = 0; k < CHANNELS; ++k)
-            image[CHANNELS * p + k] = sums[k] + transmittance * background[k];
-        alpha_image[p] = 1 - transmittance;
+            image[CHANNELS * p + k] = sums[k] + fabs(transmittance) * background[k];
+        alpha_image[p] = 1 - fabs(transmittance);
     }
 }
 
 __kernel __attribute__((reqd_work_group_size(BATCH, 1, 1))) void
-composite_bwd(const int width, const int height, const __global real *means2d, const __global real *conics,
-              const __global real *extents, const __global real *opacities, const __global real *colors,
-              const __global uint *gauss_ids, const __global uint *tile_ranges, const __global uint *slots,
-              const __global real *image, const __global real *alpha_image, const __global real *v_image,
-              const __global real *v_alpha_image, __global real *records) {
-    // Transmittance 0 marks a finished pixel or one outside the image: no live one ever falls to it.
+composite_bwd(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
+              const __global uint *tile_ranges, const __global uint *slots, const __global real *image,
+              const __global real *alpha_image, const __global real *v_image, const __global real *v_alpha_image,
+              __global real *records) {
     __local real transmittance[PIXELS], behind[PIXELS], v_pixels[CHANNELS][PIXELS];
     __local int unfinished;
-    const uint t = get_group_id(0), lane = get_local_id(0);
+    const uint tile = get_group_id(0), lane = get_local_id(0);
     const int tiles_x = (width + TILE - 1) / TILE;
-    const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
+    const int x0 = tile % tiles_x * TILE, y0 = tile / tiles_x * TILE;
 
     for (uint p = lane; p < PIXELS; p += BATCH) {
         const int2 pixel = pixel_of(x0, y0, p);
         const int inside = pixel.x < width && pixel.y < height;
-        transmittance[p] = inside;
+        transmittance[p] = inside ? 1 : -1;
         if (!inside)
             continue;
         const size_t i = (size_t)pixel.y * width + pixel.x;
@@ -130,60 +130,60 @@ composite_bwd(const int width, const int height, const __global real *means2d, c
         unfinished = 1;
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    const uint begin = tile_ranges[2 * t], length = tile_ranges[2 * t + 1] - begin;
+    const uint begin = tile_ranges[2 * tile], length = tile_ranges[2 * tile + 1] - begin;
     uint first = 0;
     for (; first < length && unfinished; first += BATCH) {
         const uint count = min((uint)BATCH, length - first);
         const uint i = begin + first + lane;
         Splat s;
-        Moments m = {0, 0, 0, 0, 0, 0};
-        real v_color[CHANNELS];
+        real sums[RECORD];
         int any_live = 0;
         if (lane < count)
-            s = splat_load(gauss_ids[i], means2d, conics, opacities, colors);
-        for (int k = 0; k < CHANNELS; ++k)
-            v_color[k] = 0;
+            s = splats[gauss_ids[i]];
+        for (int k = 0; k < RECORD; ++k)
+            sums[k] = 0;
 
         for (uint step = 0; step < PIXELS + count - 1; ++step) {
             const uint p = step - lane; // wraps to beyond PIXELS where the stream has not reached this work-item
             if (lane < count && p < PIXELS && transmittance[p] > 0) {
                 const int2 pixel = pixel_of(x0, y0, p);
                 const real dx = pixel.x + (real)0.5 - s.x, dy = pixel.y + (real)0.5 - s.y;
-                const real before = transmittance[p];
-                real after = before, alpha;
-                int live = 1;
-                const real weight = splat_over(&s, dx, dy, &after, &live, &alpha);
-                any_live |= live;
-                if (weight > 0) {
-                    real u = 0, part = behind[p];
+                const real t = exponent_at(&s, dx, dy), alpha = exp2(t);
+                real after = transmittance[p];
+                int drawn = splat_seen(&s, t);
+                const real weight = splat_over(alpha, &drawn, &after);
+                any_live |= after > 0;
+                transmittance[p] = after;
+                if (drawn) {
+                    real u = 0;
                     for (int k = 0; k < CHANNELS; ++k) {
                         u += s.color[k] * v_pixels[k][p];
-                        v_color[k] += weight * v_pixels[k][p];
+                        sums[6 + k] += weight * v_pixels[k][p];
                     }
-                    const real v_sigma = splat_over_vjp(alpha, weight, before, u, &part);
-                    transmittance[p] = after;
+                    real part = behind[p];
+                    const real v_sigma = splat_over_vjp(alpha, drawn, weight, u, &part);
                     behind[p] = part;
-                    m.m0 += v_sigma;
-                    m.mx += dx * v_sigma;
-                    m.my += dy * v_sigma;
-                    m.mxx += dx * dx * v_sigma;
-                    m.mxy += dx * dy * v_sigma;
-                    m.myy += dy * dy * v_sigma;
-                } else if (!live) {
-                    transmittance[p] = 0;
+                    sums[0] += v_sigma;
+                    sums[1] += dx * v_sigma;
+                    sums[2] += dy * v_sigma;
+                    sums[3] += dx * dx * v_sigma;
+                    sums[4] += dx * dy * v_sigma;
+                    sums[5] += dy * dy * v_sigma;
                 }
             }
             barrier(CLK_LOCAL_MEM_FENCE);
         }
 
-        if (lane < count)
-            splat_record(&s, m, v_color, records + (size_t)RECORD * slots[i]);
+        for (int k = 0; lane < count && k < RECORD; ++k)
+            records[(size_t)RECORD * slots[i] + k] = sums[k];
         if (lane == count - 1)
             unfinished = any_live;
         barrier(CLK_LOCAL_MEM_FENCE);
     }
-    for (uint j = first + lane; j < length; j += BATCH)
-        splat_record_zero(records + (size_t)RECORD * slots[begin + j]);
+    for (uint j = first + lane; j < length; j += BATCH) {
+        for (int k = 0; k < RECORD; ++k)
+            records[(size_t)RECORD * slots[begin + j] + k] = 0;
+    }
 }
 
-#include "composite_sum.h"
+#include "composite_splats.h"

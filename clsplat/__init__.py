@@ -14,7 +14,7 @@ from clsplat.errors import ClsplatError
 from clsplat.gaussians import Gaussians
 from clsplat.io import load_gaussians, load_scene, save_gaussians
 from clsplat.rasterization import rasterization
-from clsplat.render import Rendering, render
+from clsplat.render import Rendering, render, render_views
 from clsplat.scene import Scene, View
 from clsplat.train import train
 
@@ -35,6 +35,7 @@ __all__ = [
     "load_scene",
     "rasterization",
     "render",
+    "render_views",
     "save_gaussians",
     "train",
 ]

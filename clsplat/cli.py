@@ -1,11 +1,14 @@
 """The command line: a dataclass per command; tyro makes flags and help of its fields."""
 
 import json
+import os
 import signal
 import sys
 import threading
 import time
 import warnings
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -240,7 +243,7 @@ class Render:
         from clsplat.io.atomic import replacing
         from clsplat.metrics import to_uint8
         from clsplat.orbit import orbit
-        from clsplat.render import render
+        from clsplat.render import Rendering, render_views
 
         if self.path not in ("test", "orbit"):
             raise InputError(f"--path: expected test or orbit, found {self.path!r}")
@@ -258,8 +261,8 @@ class Render:
         new_folder(self.out)
         config = replace(self.render, mode=mode)
         background = BACKGROUNDS[self.data_config.background]
-        for name, camera in tqdm(cameras.items(), unit="view"):
-            rendering = render(gaussians, camera, config, device, background=background, depth=self.depth)
+
+        def write(name: str, rendering: Rendering) -> None:
             target = (self.out / name).with_suffix(".png")
             new_folder(target.parent)
             with replacing(target) as file:
@@ -268,6 +271,19 @@ class Render:
                 depth = rendering.depth / max(float(rendering.depth.max()), 1e-12) * 65535
                 with replacing(target.with_name(f"{target.stem}_depth.png")) as file:
                     Image.fromarray(np.rint(depth).astype(np.uint16)).save(file, format="PNG")
+
+        renderings = render_views(
+            gaussians, cameras.values(), config, device, background=background, depth=self.depth
+        )
+        # PNG compression takes as long as rendering: it runs beside it, a few pictures behind.
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            writing: deque[Future[None]] = deque()
+            for name, rendering in tqdm(zip(cameras, renderings, strict=True), unit="view", total=len(cameras)):
+                writing.append(pool.submit(write, name, rendering))
+                if len(writing) > 2 * (os.cpu_count() or 1):
+                    writing.popleft().result()
+            for picture in writing:
+                picture.result()
         say(f"{self.out}: {len(cameras)} pictures")
 
 
@@ -304,7 +320,7 @@ class Demo:
         """Run the command."""
         from clsplat.demo import make_photos
         from clsplat.io import load_scene
-        from clsplat.render import render
+        from clsplat.render import render_views
         from clsplat.report import side_by_side
 
         if self.out.exists() and any(self.out.iterdir()):
@@ -321,7 +337,8 @@ class Demo:
         say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
         write_json(self.out / "config.json", asdict(config))
         gaussians = train_and_report(scene, config, device, self.out, resume=False)
-        pairs = [(view.image, render(gaussians, view.camera, config.render, device).rgb) for view in scene.test]
+        renderings = render_views(gaussians, [view.camera for view in scene.test], config.render, device)
+        pairs = [(view.image, rendering.rgb) for view, rendering in zip(scene.test, renderings, strict=True)]
         side_by_side(self.out / "side_by_side.png", pairs)
         say(
             f"done in {time.perf_counter() - started:.0f} s. Look at {self.out / 'side_by_side.png'} (photo and "

@@ -5,11 +5,18 @@ and the documentation. Sources: "paper" is Kerbl et al. 2023, doi:10.1145/359243
 published with it.
 """
 
-from math import exp
+from math import exp, log2
 from typing import Literal
 
 ALPHA_MIN = 1.0 / 255.0
 """Pairs with a smaller alpha are skipped: less than one step of an 8-bit image (original, section 6 of the paper)."""
+
+LOG2_ALPHA_MIN = log2(ALPHA_MIN)
+"""The compositing kernels compare exponents of two."""
+
+EXPONENT_SLACK = 1e-5
+"""By how much an exponent of two may exceed that of the opacity: float32 rounding where sigma is 0, no more. What lies
+beyond has sigma < 0, which only an indefinite conic brings about, and is skipped (original)."""
 
 ALPHA_MAX = 0.99
 """Alpha is clamped here so that 1/(1 - alpha) stays bounded in the backward pass (original)."""

@@ -20,6 +20,8 @@ POCL_HINT = "install one, for example the embedded CPU driver: pip install 'clsp
 # Passed to every program; the kernels' copy of clsplat/constants.py.
 MODEL_CONSTANTS = (
     "ALPHA_MIN",
+    "LOG2_ALPHA_MIN",
+    "EXPONENT_SLACK",
     "ALPHA_MAX",
     "TRANSMITTANCE_MIN",
     "BLUR",
@@ -119,15 +121,28 @@ class Device:
         Taken from `select_device` where not given.
     real : float32 or float64
         Type of every real number on the device. float64 needs cl_khr_fp64 and is meant for tests.
+    memory_limit : int, optional
+        Bytes that buffers may take together, those kept for reuse included; default and maximum: the device's memory.
+
+    Attributes
+    ----------
+    memory_limit : int
+        As above.
+    memory_peak : int
+        The most bytes that buffers have taken so far.
     """
 
-    def __init__(self, cl_device: cl.Device | None = None, real: DTypeLike = np.float32):
+    def __init__(
+        self, cl_device: cl.Device | None = None, real: DTypeLike = np.float32, memory_limit: int | None = None
+    ):
         self.cl_device = cl_device if cl_device is not None else select_device()
         self.real: np.dtype[Any] = np.dtype(real)
         if self.real == np.float64 and "cl_khr_fp64" not in self.cl_device.extensions:
             raise DeviceError(f"{self.label}: expected a device with double precision (cl_khr_fp64) for float64")
         self.context = cl.Context([self.cl_device])
         self.queue = cl.CommandQueue(self.context)
+        self.memory_limit = min(memory_limit or self.cl_device.global_mem_size, self.cl_device.global_mem_size)
+        self.memory_peak = 0
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self.queue))
         self._kernels: dict[tuple[str, tuple[Any, ...]], cl.Kernel] = {}
         self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}
@@ -136,6 +151,11 @@ class Device:
     def label(self) -> str:
         """Platform and device name."""
         return device_label(self.cl_device)
+
+    @property
+    def memory(self) -> int:
+        """Bytes that buffers take now, those kept for reuse included."""
+        return int(self._pool.managed_bytes)
 
     @cached_property
     def is_cpu(self) -> bool:
@@ -149,6 +169,15 @@ class Device:
                 f"{what}: needs a buffer of {nbytes / 2**20:.0f} MiB, but {self.label} allows at most "
                 f"{limit / 2**20:.0f} MiB per buffer; use fewer Gaussians or a smaller image (--downscale)"
             )
+        block = self._pool.alloc_size(self._pool.bin_number(nbytes))
+        if self.memory + block > self.memory_limit:
+            self._pool.free_held()
+        if self.memory + block > self.memory_limit:
+            raise DeviceError(
+                f"{what}: needs {nbytes / 2**20:.0f} MiB beside {self.memory / 2**20:.0f} MiB in use, but the limit "
+                f"is {self.memory_limit / 2**20:.0f} MiB (--memory-limit); use fewer Gaussians or a smaller image "
+                "(--downscale)"
+            )
 
     def empty(self, what: str, shape: tuple[int, ...] | int, dtype: DTypeLike | None = None) -> cl.array.Array:
         """Uninitialised array of `dtype` (default: real); `what` names it in errors.
@@ -156,17 +185,19 @@ class Device:
         Raises
         ------
         DeviceError
-            If it exceeds the device's largest buffer or its memory.
+            If it exceeds the device's largest buffer, its memory, or the limit.
         """
         dtype = self.real if dtype is None else np.dtype(dtype)
         self._check_size(what, int(np.prod(shape)) * dtype.itemsize)
         try:
-            return cl.array.Array(self.queue, shape, dtype, allocator=self._pool)
+            array = cl.array.Array(self.queue, shape, dtype, allocator=self._pool)
         except cl.MemoryError as error:
             raise DeviceError(
                 f"{what}: {self.label} has no memory left for {np.prod(shape) * dtype.itemsize / 2**20:.0f} MiB; "
                 "use fewer Gaussians or a smaller image (--downscale)"
             ) from error
+        self.memory_peak = max(self.memory_peak, self.memory)
+        return array
 
     def scratch(self, what: str, size: int, layout: Any = None) -> cl.array.Array:
         """The flat array of reals named `what`, kept between calls.

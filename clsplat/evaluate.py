@@ -2,10 +2,12 @@
 
 import json
 import math
+import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +17,14 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
 from clsplat.metrics import flip, psnr, ssim, to_uint8
-from clsplat.render import render
+from clsplat.render import Color, render_views
 from clsplat.report import save_difference, save_png, write_page
 from clsplat.scene import View
 
 if TYPE_CHECKING:
     from clsplat.device import Device
 
-Color = tuple[float, float, float]
+Result = TypeVar("Result")
 
 
 def mean_metrics(
@@ -39,11 +41,12 @@ def mean_metrics(
     dict
         psnr in decibels, ssim.
     """
-    images = list(_renders(gaussians, views, config, device, background))
-    return {
-        "psnr": float(np.mean([psnr(image, view.image, view.mask) for view, image in images])),
-        "ssim": float(np.mean([ssim(image, view.image, view.mask) for view, image in images])),
-    }
+
+    def compare(_: int, view: View, image: NDArray[np.uint8]) -> tuple[float, float]:
+        return psnr(image, view.image, view.mask), ssim(image, view.image, view.mask)
+
+    means = np.mean(_compared(compare, gaussians, list(views), config, device, background), axis=0)
+    return {"psnr": float(means[0]), "ssim": float(means[1])}
 
 
 def evaluate(
@@ -89,10 +92,11 @@ def evaluate(
             (out / kind).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{out}: expected a folder that can be written to, found: {error.strerror}") from error
-    records: list[dict[str, Any]] = []
-    taken: set[str] = set()
-    for view, image in _renders(gaussians, views, config, device, background):
-        name = _file_name(view.name, taken)
+    views = list(views)
+    names = _file_names(views)
+
+    def compare(index: int, view: View, image: NDArray[np.uint8]) -> dict[str, Any]:
+        name = names[index]
         files = {kind: f"{kind}/{name}" for kind in kinds}
         save_png(out / files["truth"], view.image)
         save_png(out / files["render"], image)
@@ -101,7 +105,9 @@ def evaluate(
         if metrics["psnr"] == math.inf:
             metrics["psnr"] = None
         size = {"width": view.camera.width, "height": view.camera.height}
-        records.append({"name": view.name, **metrics, **size, **files})
+        return {"name": view.name, **metrics, **size, **files}
+
+    records = _compared(compare, gaussians, views, config, device, background)
 
     def mean(metric: str) -> float | None:
         values = [record[metric] for record in records]
@@ -122,28 +128,35 @@ def evaluate(
     return result
 
 
-def _renders(
-    gaussians: Gaussians, views: Iterable[View], config: RenderConfig, device: "Device | None", background: Color
-) -> Iterator[tuple[View, NDArray[np.uint8]]]:
-    """Each view with its render, rounded to 8 bits."""
-    count = 0
-    for view in views:
-        camera = view.camera
-        if view.image.shape != (camera.height, camera.width, 3):
-            raise InputError(
-                f"{view.name}: expected a photo of its camera's size, {(camera.height, camera.width, 3)}, "
-                f"found {view.image.shape}"
-            )
-        yield view, to_uint8(render(gaussians, camera, config, device, background=background).rgb)
-        count += 1
-    if count == 0:
+def _compared(
+    compare: Callable[[int, View, NDArray[np.uint8]], Result],
+    gaussians: Gaussians,
+    views: list[View],
+    config: RenderConfig,
+    device: "Device | None",
+    background: Color,
+) -> list[Result]:
+    """What `compare` finds of each view, from its index and its render in 8 bits; on threads."""
+    if not views:
         raise InputError("views: expected at least one view to evaluate, found none")
+    for view in views:
+        shape = view.camera.height, view.camera.width, 3
+        if view.image.shape != shape:
+            raise InputError(f"{view.name}: expected a photo of its camera's size, {shape}, found {view.image.shape}")
+    cameras = [view.camera for view in views]
+    renderings = render_views(gaussians, cameras, config, device, background=background)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(compare, range(len(views)), views, (to_uint8(r.rgb) for r in renderings)))
 
 
-def _file_name(name: str, taken: set[str]) -> str:
-    """A PNG's name for a view: safe in any file system and unlike those in `taken`, to which it is added."""
-    stem = re.sub(r"[^\w.-]+", "_", str(PurePosixPath(name).with_suffix(""))).strip("._")[:100] or "view"
-    while stem.casefold() in taken:
-        stem += "_"
-    taken.add(stem.casefold())
-    return f"{stem}.png"
+def _file_names(views: list[View]) -> list[str]:
+    """Names of PNGs for the views: safe in any file system and unlike each other."""
+    names: list[str] = []
+    taken: set[str] = set()
+    for view in views:
+        stem = re.sub(r"[^\w.-]+", "_", str(PurePosixPath(view.name).with_suffix(""))).strip("._")[:100] or "view"
+        while stem.casefold() in taken:
+            stem += "_"
+        taken.add(stem.casefold())
+        names.append(f"{stem}.png")
+    return names

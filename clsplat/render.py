@@ -1,5 +1,6 @@
 """Rendering and its gradients: the stages in their order, on a device or by the float64 twins."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from clsplat.device import Device
 
 Array = NDArray[Any]
+Color = tuple[float, float, float]
 
 
 class Gradients(NamedTuple):
@@ -118,7 +120,7 @@ def fetch(gaussians: Gaussians) -> Gaussians:
 
 
 class Rendering:
-    """A rendered image that knows how to differentiate itself; made by `render`.
+    """A rendered image that knows how to differentiate itself; made by `render` and, without that, `render_views`.
 
     Attributes
     ----------
@@ -163,8 +165,11 @@ class Rendering:
         Raises
         ------
         InputError
-            If a shape does not fit, or v_depth is given though no depth was rendered.
+            If a shape does not fit, v_depth is given though no depth was rendered, or it was rendered without
+            gradients.
         """
+        if self._run is None and len(self._gaussians):
+            raise InputError("gradients: expected a rendering made with gradients=True, found one made without")
         for name, v, shape in (
             ("v_rgb", v_rgb, self.rgb.shape),
             ("v_alpha", v_alpha, self.alpha.shape),
@@ -196,9 +201,10 @@ def render(
     config: RenderConfig = RenderConfig(),
     device: "Device | None" = None,
     *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Color = (0.0, 0.0, 0.0),
     sh_degree: int | None = None,
     depth: bool = False,
+    gradients: bool = True,
 ) -> Rendering:
     """Render Gaussians (Kerbl et al. 2023).
 
@@ -216,6 +222,8 @@ def render(
         Highest degree of the spherical harmonics evaluated; default: all that are stored.
     depth : bool
         Composite the expected depth too.
+    gradients : bool
+        Keep on the device what `Rendering.backward` needs. False is for pictures alone: faster, and nothing stays.
 
     Returns
     -------
@@ -228,14 +236,64 @@ def render(
     DeviceError
         If a buffer exceeds the device's limits.
     """
+    behind, degree = _checked(gaussians, background, sh_degree, depth)
+    return next(_renderings(gaussians, [camera], config, device, behind, degree, gradients=gradients))
+
+
+def render_views(
+    gaussians: Gaussians,
+    cameras: Iterable[Camera],
+    config: RenderConfig = RenderConfig(),
+    device: "Device | None" = None,
+    *,
+    background: Color = (0.0, 0.0, 0.0),
+    sh_degree: int | None = None,
+    depth: bool = False,
+) -> Iterator[Rendering]:
+    """Render one image after the other, forward only; the Gaussians are uploaded once.
+
+    Parameters
+    ----------
+    cameras : iterable of Camera
+        Of any sizes; each is asked for when its image is.
+    gaussians, config, device, background, sh_degree, depth
+        As given to `render`, which has the errors too.
+
+    Yields
+    ------
+    Rendering
+        Per camera; without gradients.
+    """
+    behind, degree = _checked(gaussians, background, sh_degree, depth)
+    return _renderings(gaussians, cameras, config, device, behind, degree, gradients=False)
+
+
+def _checked(gaussians: Gaussians, background: Color, sh_degree: int | None, depth: bool) -> tuple[Array, int]:
+    """What is behind each channel, and the degree that is evaluated."""
     gaussians.validate()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= gaussians.sh_degree:
         raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree} (what is stored), found {degree}")
-    behind = np.array([*background, 0.0] if depth else background)
-    if len(gaussians) == 0:
-        dtype = np.float64 if device is None else device.real
-        image = np.broadcast_to(behind.astype(dtype), (camera.height, camera.width, len(behind)))
-        return Rendering(device, None, gaussians, image, np.zeros(image.shape[:2], dtype))
-    run = forward(device, upload(device, gaussians), camera, config, behind, degree)
-    return Rendering(device, run, gaussians, download(run.image.image), download(run.image.alpha))
+    return np.array([*background, 0.0] if depth else background), degree
+
+
+def _renderings(
+    gaussians: Gaussians,
+    cameras: Iterable[Camera],
+    config: RenderConfig,
+    device: "Device | None",
+    background: Array,
+    sh_degree: int,
+    *,
+    gradients: bool,
+) -> Iterator[Rendering]:
+    uploaded = upload(device, gaussians) if len(gaussians) else gaussians
+    for camera in cameras:
+        if len(gaussians) == 0:
+            dtype = np.float64 if device is None else device.real
+            image = np.broadcast_to(background.astype(dtype), (camera.height, camera.width, len(background)))
+            yield Rendering(device, None, gaussians, image, np.zeros(image.shape[:2], dtype))
+            continue
+        run = forward(device, uploaded, camera, config, background, sh_degree)
+        image, alpha = download(run.image.image), download(run.image.alpha)
+        yield Rendering(device, run if gradients else None, gaussians, image, alpha)

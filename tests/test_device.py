@@ -95,6 +95,36 @@ class TestBuffers:
         with pytest.raises(DeviceError, match=r"^splats: needs a buffer of \d+ MiB, but .* allows at most \d+ MiB"):
             device.empty("splats", size)
 
+    def test_memory_is_counted(self):
+        device = Device()
+        assert device.memory == device.memory_peak == 0
+        kept = device.empty("kept", 1 << 18)
+        dropped = device.empty("dropped", 1 << 20)
+        assert 5 << 20 <= device.memory == device.memory_peak <= 1.1 * (5 << 20)
+        del dropped
+        peak = device.memory_peak
+        device.empty("reused", 1 << 20)
+        assert device.memory == device.memory_peak == peak  # what is dropped is kept for reuse
+        del kept
+
+    def test_limit(self):
+        device = Device(memory_limit=10 << 20)
+        kept = device.empty("kept", 1 << 20)
+        device.empty("dropped", 1 << 20)
+        # Only what is kept for reuse stands in the way: it goes.
+        other = device.empty("other", 5 << 18)
+        assert device.memory <= device.memory_limit
+        with pytest.raises(DeviceError, match=r"^more: needs 4 MiB beside \d MiB in use, but the limit is 10 MiB"):
+            device.empty("more", 1 << 20)
+        del kept, other
+        device.empty("more", 1 << 20)
+        assert device.memory_peak <= 10 << 20
+
+    def test_the_limit_is_at_most_the_memory(self, device):
+        memory = device.cl_device.global_mem_size
+        assert device.memory_limit == memory
+        assert Device(memory_limit=2 * memory).memory_limit == memory
+
     def test_no_memory_left(self, device, monkeypatch):
         def allocate(*arguments, **options):
             raise cl.MemoryError("clCreateBuffer failed: MEM_OBJECT_ALLOCATION_FAILURE")

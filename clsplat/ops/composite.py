@@ -15,20 +15,29 @@ def _variant(device: Device, compositor: str) -> str:
     return f"composite_{compositor}"
 
 
-def _inputs(splats: Splats, bins: Bins) -> list[Any]:
-    """The first arguments of both kernels."""
+def _defines(bins: Bins, channels: int, stage: str) -> dict[str, Any]:
+    batch = {"BATCH": GPU_BATCH} if stage == "composite_gpu" else {}
+    return {"TILE": bins.tile_size, "CHANNELS": channels} | batch
+
+
+def _packed(device: Device, splats: Splats, bins: Bins, stage: str) -> Any:
+    """The splats as the kernels read them: SPLAT_REALS each (cl/composite.h)."""
+    n, channels = splats.colors.shape
+    packed = device.empty("packed splats", (n, -(-(6 + channels) // 4) * 4))
     geometry = [splats.means2d, splats.conics, splats.extents, splats.opacities, splats.colors]
-    return [bins.width, bins.height, *geometry, bins.gauss_ids, bins.tile_ranges]
+    device.launch(stage, "composite_pack", (n,), [n, *geometry, packed], defines=_defines(bins, channels, stage))
+    return packed
 
 
 def _launch(device: Device, stage: str, kernel: str, bins: Bins, channels: int, arguments: list[Any]) -> None:
     tiles = bins.tile_ranges.shape[0]
-    defines = {"TILE": bins.tile_size, "CHANNELS": channels}
     group = 1
     if stage == "composite_gpu":
-        defines["BATCH"] = GPU_BATCH
         group = bins.tile_size**2 if kernel == "composite_fwd" else GPU_BATCH
-    device.launch(stage, kernel, (tiles * group,), arguments, defines=defines, group=(group,))
+    arguments = [bins.width, bins.height, arguments[0], bins.gauss_ids, bins.tile_ranges, *arguments[1:]]
+    device.launch(
+        stage, kernel, (tiles * group,), arguments, defines=_defines(bins, channels, stage), group=(group,)
+    )
 
 
 def composite_fwd(device: Device, splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto") -> Image:
@@ -47,8 +56,9 @@ def composite_fwd(device: Device, splats: Splats, bins: Bins, background: Any, *
         device.empty("image", (bins.height, bins.width, channels)),
         device.empty("alpha", (bins.height, bins.width)),
     )
-    arguments = [*_inputs(splats, bins), device.upload("background", background), *result]
-    _launch(device, _variant(device, compositor), "composite_fwd", bins, channels, arguments)
+    stage = _variant(device, compositor)
+    arguments = [_packed(device, splats, bins, stage), device.upload("background", background), *result]
+    _launch(device, stage, "composite_fwd", bins, channels, arguments)
     return result
 
 
@@ -69,8 +79,8 @@ def composite_bwd(
     n, channels = splats.colors.shape
     m = bins.gauss_ids.shape[0]
     records = device.empty("gradients per intersection", (max(m, 1), 6 + channels))
-    arguments = [*_inputs(splats, bins), bins.slots, *image, *v_image, records]
     stage = _variant(device, compositor)
+    arguments = [_packed(device, splats, bins, stage), bins.slots, *image, *v_image, records]
     _launch(device, stage, "composite_bwd", bins, channels, arguments)
     v = SplatGrads(
         device.empty("v_means2d", (n, 2)),
@@ -78,8 +88,6 @@ def composite_bwd(
         device.empty("v_opacities", n),
         device.empty("v_colors", (n, channels)),
     )
-    defines = {"TILE": bins.tile_size, "CHANNELS": channels} | (
-        {"BATCH": GPU_BATCH} if stage == "composite_gpu" else {}
-    )
-    device.launch(stage, "composite_sum", (n,), [n, bins.order, bins.first_slots, records, *v], defines=defines)
+    arguments = [n, bins.order, bins.first_slots, splats.conics, splats.opacities, records, *v]
+    device.launch(stage, "composite_sum", (n,), arguments, defines=_defines(bins, channels, stage))
     return v

@@ -1,0 +1,56 @@
+// What both variants of the stage composite do per splat, before and after the pixels.
+//   composite_pack  the splats as compositing reads them, side by side (composite.h)
+//   composite_sum   a splat's records, one per tile, added up in the order of their slots, and its gradients:
+//     v_mean2d = -sum_pixels v_sigma (a dx + b dy, b dx + c dy),   v_conic = sum_pixels v_sigma (dx^2/2, dx dy, dy^2/2),
+//     v_opacity = -sum_pixels v_sigma / opacity,                   v_colour = sum_pixels weight v_image
+//
+// Mapping: one work-item per splat, by index (composite_pack) or in depth order (composite_sum, see bin.cl). Buffers
+// as in composite_cpu.cl.
+#ifndef CLSPLAT_COMPOSITE_SPLATS_H
+#define CLSPLAT_COMPOSITE_SPLATS_H
+
+__kernel void composite_pack(const uint n, const __global real *means2d, const __global real *conics,
+                             const __global real *extents, const __global real *opacities,
+                             const __global real *colors, __global Splat *splats) {
+    const size_t i = get_global_id(0);
+    if (i >= n || !(extents[2 * i] > 0))
+        return;
+    const real3 conic = load3(conics, i);
+    Splat s;
+    s.x = means2d[2 * i];
+    s.y = means2d[2 * i + 1];
+    s.a = (real)(-0.5 * LOG2_E) * conic.x;
+    s.b = (real)-LOG2_E * conic.y;
+    s.c = (real)(-0.5 * LOG2_E) * conic.z;
+    // As a vector: the logarithm of a scalar costs ten times as much on some CPUs.
+    s.level = log2((real4)(opacities[i])).x;
+    for (int k = 0; k < CHANNELS; ++k)
+        s.color[k] = colors[CHANNELS * i + k];
+    splats[i] = s;
+}
+
+__kernel void composite_sum(const uint n, const __global uint *order, const __global uint *first_slots,
+                            const __global real *conics, const __global real *opacities, const __global real *records,
+                            __global real *v_means2d, __global real *v_conics, __global real *v_opacities,
+                            __global real *v_colors) {
+    const size_t i = get_global_id(0);
+    if (i >= n)
+        return;
+    real total[RECORD];
+    for (int k = 0; k < RECORD; ++k)
+        total[k] = 0;
+    const uint begin = first_slots[i], end = first_slots[i + 1];
+    for (uint slot = begin; slot < end; ++slot) {
+        for (int k = 0; k < RECORD; ++k)
+            total[k] += records[(size_t)RECORD * slot + k];
+    }
+    const uint g = order[i];
+    const real3 conic = load3(conics, g);
+    vstore2(-(real2)(conic.x * total[1] + conic.y * total[2], conic.y * total[1] + conic.z * total[2]), g, v_means2d);
+    store3(v_conics, g, (real3)((real)0.5 * total[3], total[4], (real)0.5 * total[5]));
+    v_opacities[g] = begin < end ? -total[0] / opacities[g] : 0;
+    for (int k = 0; k < CHANNELS; ++k)
+        v_colors[CHANNELS * g + k] = total[6 + k];
+}
+
+#endif
