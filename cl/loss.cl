@@ -5,153 +5,282 @@
 // means over all pixels and channels (Kerbl et al. 2023, equation 7). A mask weights image and photo alike
 // before either term. docs/stages/loss.md derives the gradient; clsplat/reference/loss.py is the twin.
 //
-// How does it work? The window is separable. Planes with margins of zeros wide enough for the window need no
-// borders.
-//   loss_planes      image and photo, masked, to planes
-//   loss_blur_rows   the five moments x, y, xx, yy, xy blurred along rows
-//   loss_ssim        the same along columns; SSIM's sum; its derivatives by mx, E[xx] and E[xy]
-//   loss_blur_rows3  the derivatives blurred along rows (the window is symmetric: its own adjoint)
-//   loss_grad        the same along columns, combined to v_image; L1's sum
-// Mapping: one work-item per pixel (loss_planes) or per segment (the others): SEGMENT neighbouring pixels of a row,
-// one vector.
+// How does it work? The window is separable, and a row of interleaved channels is 3 W values, in which its taps
+// lie 3 apart: neighbouring values make a vector, whatever their channels. A work-item walks down the rows of
+// its band, blurs each along the row, and keeps the blurred rows that the window spans in a ring, from which it
+// blurs along columns. So no moment leaves private memory.
+//   loss_ssim  blurs four moments of image x and photo y: mx, my, E[xx + yy] (SSIM needs the sum of the
+//              variances only), E[xy]; writes SSIM's derivatives by mx, E[xx], E[xy], and parts of the loss
+//   loss_sum   adds up the parts
+//   loss_grad  blurs the derivatives (the window is symmetric: its own adjoint), combines them to v_image
+// Mapping: loss_ssim and loss_grad have one work-item for VECTORS neighbouring vectors of LANES values in a band
+// of BAND rows, from MARGIN values before each row to at least MARGIN values behind it; loss_sum is one
+// work-group. Sums have a fixed order: within a work-item, then a work-group (a tree), then loss_sum.
 //
 // Buffers: image[H,W,3], photo[H,W,3] u8, mask[H,W] u8 (0 or 1; not read where masked is 0), v_image[H,W,3];
-//   a plane is [3, HEIGHT + 2 RADIUS, pitch] with its pixel (0, 0) at row RADIUS, column SEGMENT;
-//   x, y: one plane; moments: five, derivatives: three, blurred: three; ssim_sums, l1_sums[3, H, segments].
+//   derivatives[H,3,pitch], where a row begins with the margin, and loss_ssim fills the margins with zeros, so
+//   that loss_grad needs no guards; parts: one per work-group of loss_ssim; loss[1].
 // -DSSIM_C1, -DSSIM_C2     stabilisers
 // -DSSIM_TAPS=w0,w1,..     the 2 RADIUS + 1 weights of the window
-// -DRADIUS                 half width of the window, px, at most SEGMENT
+// -DRADIUS                 half width of the window, px, 1 or more
+// -DLANES=1|16             values per vector: 16 on CPUs, 1 on GPUs, whose work-items touch neighbours together
+// -DVECTORS                vectors per work-item, 1 where LANES is 1
+// -DBAND                   rows per work-item; 2 RADIUS more are blurred along the row
+// -DGROUP                  largest work-group; work-groups are powers of two wide
 #include "common.h"
 
 #if !defined(SSIM_C1) || !defined(SSIM_C2) || !defined(SSIM_TAPS) || !defined(RADIUS)
 #error "-DSSIM_C1, -DSSIM_C2, -DSSIM_TAPS and -DRADIUS must be given"
 #endif
-
-#define SEGMENT 16
-#if RADIUS < 0 || RADIUS > SEGMENT
-#error "-DRADIUS must be 0 to 16, the margin of a plane"
+#if RADIUS < 1
+#error "-DRADIUS must be 1 or more"
+#endif
+#if LANES != 1 && LANES != 16
+#error "-DLANES must be 1 or 16"
+#endif
+#if !defined(VECTORS) || VECTORS < 1 || (LANES == 1 && VECTORS != 1)
+#error "-DVECTORS must be 1 or more, and 1 where -DLANES is"
+#endif
+#if !defined(BAND) || BAND < 1
+#error "-DBAND must be 1 or more"
+#endif
+#if !defined(GROUP) || GROUP < 1
+#error "-DGROUP must be 1 or more"
 #endif
 
-__constant real taps[2 * RADIUS + 1] = {SSIM_TAPS};
+#define WINDOW (2 * RADIUS + 1)
 
-typedef struct {
-    int width, height, pitch;
-    size_t plane; // reals in three channels
-} Layout;
+// Of each row a work-item fetches FETCHED values, STEP apart; those for tap k of its first vector begin at TAP(k).
+#if LANES == 1
+typedef real reals;
+#define INDICES          0
+#define MARGIN           (3 * RADIUS)
+#define STEP             3
+#define FETCHED          WINDOW
+#define TAP(k)           (k)
+#define VECTOR(space, p) (*(p))
+#else
+typedef real16 reals;
+#define INDICES          ((real16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+#define MARGIN           ((3 * RADIUS + LANES - 1) / LANES * LANES)
+#define STEP             1
+#define FETCHED          (VECTORS * LANES + 2 * MARGIN)
+#define TAP(k)           (MARGIN + 3 * ((k)-RADIUS))
 
-static inline Layout layout_of(int width, int height) {
-    Layout l = {width, height, (width + SEGMENT - 1) / SEGMENT * SEGMENT + 2 * SEGMENT, 0};
-    l.plane = (size_t)3 * (height + 2 * RADIUS) * l.pitch;
-    return l;
+// The vector at any address. PoCL 3.0 calls vload16 and vstore16 as functions, which doubled the time of loss_grad.
+typedef struct __attribute__((packed)) {
+    reals v;
+} Vector;
+typedef struct __attribute__((packed)) {
+    uchar16 v;
+} Bytes;
+#define VECTOR(space, p) (((space Vector *)(p))->v)
+
+static inline reals load_photo(const __global uchar *photo) {
+    const uchar16 bytes = ((const __global Bytes *)photo)->v;
+#ifdef USE_DOUBLE
+    return convert_double16(bytes) * (1 / (real)255);
+#else
+    return convert_float16(bytes) * (1 / (real)255);
+#endif
 }
+#endif
 
-static inline size_t plane_index(Layout l, int channel, int row, int column) {
-    return ((size_t)channel * (l.height + 2 * RADIUS) + row + RADIUS) * l.pitch + SEGMENT + column;
-}
+__constant real taps[WINDOW] = {SSIM_TAPS};
+// From entry 2 RADIUS - newest on: the taps in the order in which their rows lie in a ring.
+__constant real turned_taps[2 * WINDOW] = {SSIM_TAPS, SSIM_TAPS};
 
-__kernel void loss_planes(const int width, const int height, const __global real *image, const __global uchar *photo,
-                          const int masked, const __global uchar *mask, __global real *x, __global real *y) {
-    const int column = get_global_id(0), row = get_global_id(1);
-    const Layout l = layout_of(width, height);
-    const size_t pixel = (size_t)row * width + column;
-    const real weight = masked ? mask[pixel] : 1;
-    for (int c = 0; c < 3; ++c) {
-        const size_t i = plane_index(l, c, row, column);
-        x[i] = weight * image[3 * pixel + c];
-        y[i] = weight * photo[3 * pixel + c] / 255;
-    }
-}
-
-// Columns beyond the image, inside the last segment, are written too: they must be 0 where a later pass reads
-// them.
-static inline real16 inside(Layout l, int column, real16 value) {
-    const real16 columns = (real16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) + (real)column;
-    return columns < (real16)l.width ? value : (real16)0;
-}
-
-__kernel void loss_blur_rows(const int width, const int height, const __global real *x, const __global real *y,
-                             __global real *moments) {
-    const int column = get_global_id(0) * SEGMENT, row = get_global_id(1), channel = get_global_id(2);
-    const Layout l = layout_of(width, height);
-    const size_t i = plane_index(l, channel, row, column);
-    real16 mx = 0, my = 0, xx = 0, yy = 0, xy = 0;
-    for (int k = 0; k <= 2 * RADIUS; ++k) {
-        const real16 a = vload16(0, x + i + k - RADIUS), b = vload16(0, y + i + k - RADIUS);
-        const real16 wa = taps[k] * a, wb = taps[k] * b;
-        mx += wa;
-        my += wb;
-        xx += wa * a;
-        yy += wb * b;
-        xy += wa * b;
-    }
-    vstore16(mx, 0, moments + i);
-    vstore16(my, 0, moments + l.plane + i);
-    vstore16(xx, 0, moments + 2 * l.plane + i);
-    vstore16(yy, 0, moments + 3 * l.plane + i);
-    vstore16(xy, 0, moments + 4 * l.plane + i);
-}
-
-static inline real16 blur_columns(Layout l, const __global real *plane, size_t i) {
-    real16 sum = 0;
-    for (int k = 0; k <= 2 * RADIUS; ++k)
-        sum += taps[k] * vload16(0, plane + i + (k - RADIUS) * l.pitch);
-    return sum;
-}
-
-static inline real sum16(real16 v) {
+static inline real sum_lanes(reals v) {
+#if LANES == 1
+    return v;
+#else
     const real8 a = v.lo + v.hi;
     const real4 b = a.lo + a.hi;
     const real2 c = b.lo + b.hi;
     return c.x + c.y;
+#endif
 }
 
-__kernel void loss_ssim(const int width, const int height, const __global real *moments, __global real *derivatives,
-                        __global real *ssim_sums) {
-    const int column = get_global_id(0) * SEGMENT, row = get_global_id(1), channel = get_global_id(2);
-    const Layout l = layout_of(width, height);
-    const size_t i = plane_index(l, channel, row, column);
-    const real16 mx = blur_columns(l, moments, i), my = blur_columns(l, moments + l.plane, i);
-    const real16 exx = blur_columns(l, moments + 2 * l.plane, i), eyy = blur_columns(l, moments + 3 * l.plane, i);
-    const real16 exy = blur_columns(l, moments + 4 * l.plane, i);
-
-    const real16 a1 = 2 * mx * my + SSIM_C1, a2 = 2 * (exy - mx * my) + SSIM_C2;
-    const real16 b1 = mx * mx + my * my + SSIM_C1, b2 = exx - mx * mx + eyy - my * my + SSIM_C2;
-    const real16 inv_b = 1 / (b1 * b2), ssim = a1 * a2 * inv_b;
-    const real16 by_mx = 2 * my * (a2 - a1) * inv_b - 2 * mx * ssim * (1 / b1 - 1 / b2);
-    vstore16(inside(l, column, by_mx), 0, derivatives + i);
-    vstore16(inside(l, column, -ssim / b2), 0, derivatives + l.plane + i);
-    vstore16(inside(l, column, 2 * a1 * inv_b), 0, derivatives + 2 * l.plane + i);
-    ssim_sums[(channel * height + row) * get_global_size(0) + get_global_id(0)] = sum16(inside(l, column, ssim));
+// The sum over the work-group, for its first work-item.
+static inline real sum_group(real value, __local real *sums) {
+    const int i = get_local_id(0);
+    sums[i] = value;
+    for (int n = get_local_size(0) / 2; n > 0; n /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (i < n)
+            sums[i] += sums[i + n];
+    }
+    return sums[i];
 }
 
-__kernel void loss_blur_rows3(const int width, const int height, const __global real *derivatives,
-                              __global real *blurred) {
-    const int column = get_global_id(0) * SEGMENT, row = get_global_id(1), channel = get_global_id(2);
-    const Layout l = layout_of(width, height);
-    for (int plane = 0; plane < 3; ++plane) {
-        const size_t i = plane * l.plane + plane_index(l, channel, row, column);
-        real16 sum = 0;
-        for (int k = 0; k <= 2 * RADIUS; ++k)
-            sum += taps[k] * vload16(0, derivatives + i + k - RADIUS);
-        vstore16(sum, 0, blurred + i);
+// Image and photo from a column on, where a row has `length` values: masked, 0 beside the image.
+static inline void fetch(int length, int row, int column, const __global real *image, const __global uchar *photo,
+                         int masked, const __global uchar *mask, real *x, real *y) {
+    const size_t begin = (size_t)row * length;
+#if LANES != 1
+    if (column >= 0 && column + LANES <= length && !masked) {
+        VECTOR(__private, x) = VECTOR(const __global, image + begin + column);
+        VECTOR(__private, y) = load_photo(photo + begin + column);
+        return;
+    }
+#endif
+    for (int k = 0; k < LANES; ++k) {
+        const int c = column + k;
+        const bool counts = c >= 0 && c < length && !(masked && mask[(begin + c) / 3] == 0);
+        x[k] = counts ? image[begin + c] : 0;
+        y[k] = counts ? photo[begin + c] * (1 / (real)255) : 0;
     }
 }
 
+typedef struct {
+    reals mx, my, square, xy; // square: E[xx + yy]
+} Moments;
+
+static inline Moments blur_row(const real *x, const real *y) {
+    Moments m = {0, 0, 0, 0};
+#pragma unroll
+    for (int k = 0; k < WINDOW; ++k) {
+        const reals a = VECTOR(const, x + TAP(k)), b = VECTOR(const, y + TAP(k));
+        const reals wa = taps[k] * a, wb = taps[k] * b;
+        m.mx += wa;
+        m.my += wb;
+        m.square += wa * a + wb * b;
+        m.xy += wa * b;
+    }
+    return m;
+}
+
+static inline Moments blur_columns(const Moments *ring, int newest) {
+    Moments m = {0, 0, 0, 0};
+#pragma unroll
+    for (int k = 0; k < WINDOW; ++k) {
+        const real w = turned_taps[2 * RADIUS - newest + k];
+        m.mx += w * ring[k].mx;
+        m.my += w * ring[k].my;
+        m.square += w * ring[k].square;
+        m.xy += w * ring[k].xy;
+    }
+    return m;
+}
+
+typedef struct {
+    reals mx, xx, xy;
+} Derivatives;
+
+// Returns 1 - SSIM.
+static inline reals differentiate(Moments m, Derivatives *d) {
+    const reals a1 = 2 * m.mx * m.my + SSIM_C1, a2 = 2 * (m.xy - m.mx * m.my) + SSIM_C2;
+    const reals b1 = m.mx * m.mx + m.my * m.my + SSIM_C1, b2 = m.square - m.mx * m.mx - m.my * m.my + SSIM_C2;
+    const reals inv_b = 1 / (b1 * b2), ssim = a1 * a2 * inv_b;
+    d->mx = 2 * inv_b * (m.my * (a2 - a1) - m.mx * ssim * (b2 - b1));
+    d->xx = -ssim * b1 * inv_b;
+    d->xy = 2 * a1 * inv_b;
+    return 1 - ssim;
+}
+
+// 0 in lanes beside the image.
+static inline reals inside(int length, int column, reals v) {
+    const reals columns = INDICES + (reals)column;
+    return columns >= 0 && columns < (reals)length ? v : (reals)0;
+}
+
 // l1_weight and ssim_weight are (1 - lambda) and lambda over the number of values, 3 W H.
+__kernel void loss_ssim(const int width, const int height, const real l1_weight, const real ssim_weight,
+                        const __global real *image, const __global uchar *photo, const int masked,
+                        const __global uchar *mask, __global real *derivatives, __global real *parts) {
+    const int length = 3 * width, column = (int)get_global_id(0) * VECTORS * LANES - MARGIN;
+    const int begin = get_global_id(1) * BAND, end = begin + BAND < height ? begin + BAND : height;
+    const size_t pitch = get_global_size(0) * VECTORS * LANES;
+    reals l1 = 0, dissimilarity = 0;
+    Moments ring[VECTORS][WINDOW];
+    real x[FETCHED], y[FETCHED];
+    for (int row = begin - RADIUS, newest = 0; row < end + RADIUS; ++row, newest = (newest + 1) % WINDOW) {
+        const bool exists = row >= 0 && row < height;
+        for (int i = 0; exists && i < FETCHED; i += LANES)
+            fetch(length, row, column - STEP * TAP(RADIUS) + STEP * i, image, photo, masked, mask, x + i, y + i);
+        for (int v = 0; v < VECTORS; ++v) {
+            const Moments none = {0, 0, 0, 0};
+            ring[v][newest] = exists ? blur_row(x + v * LANES, y + v * LANES) : none;
+            const int c = column + v * LANES, centre = TAP(RADIUS) + v * LANES;
+            if (row >= begin && row < end) {
+                const reals difference = VECTOR(const, x + centre) - VECTOR(const, y + centre);
+                l1 += inside(length, c, difference < 0 ? -difference : difference);
+            }
+            if (row - RADIUS < begin)
+                continue;
+            Derivatives d;
+            dissimilarity += inside(length, c, differentiate(blur_columns(ring[v], newest), &d));
+            __global real *out = derivatives + (size_t)(row - RADIUS) * 3 * pitch + MARGIN + c;
+            VECTOR(__global, out) = inside(length, c, d.mx);
+            VECTOR(__global, out + pitch) = inside(length, c, d.xx);
+            VECTOR(__global, out + 2 * pitch) = inside(length, c, d.xy);
+        }
+    }
+
+    __local real sums[GROUP];
+    const real part = sum_group(l1_weight * sum_lanes(l1) + ssim_weight * sum_lanes(dissimilarity), sums);
+    if (get_local_id(0) == 0)
+        parts[get_group_id(1) * get_num_groups(0) + get_group_id(0)] = part;
+}
+
+__kernel void loss_sum(const uint count, const __global real *parts, __global real *loss) {
+    __local real sums[GROUP];
+    real sum = 0;
+    for (uint i = get_local_id(0); i < count; i += get_local_size(0))
+        sum += parts[i];
+    sum = sum_group(sum, sums);
+    if (get_local_id(0) == 0)
+        loss[0] = sum;
+}
+
 __kernel void loss_grad(const int width, const int height, const real l1_weight, const real ssim_weight,
-                        const int masked, const __global uchar *mask, const __global real *x, const __global real *y,
-                        const __global real *blurred, __global real *v_image, __global real *l1_sums) {
-    const int column = get_global_id(0) * SEGMENT, row = get_global_id(1), channel = get_global_id(2);
-    const Layout l = layout_of(width, height);
-    const size_t i = plane_index(l, channel, row, column);
-    const real16 a = vload16(0, x + i), b = vload16(0, y + i);
-    const real16 v_ssim = blur_columns(l, blurred, i) + 2 * a * blur_columns(l, blurred + l.plane, i) +
-                          b * blur_columns(l, blurred + 2 * l.plane, i);
-    const real16 v = l1_weight * sign(a - b) - ssim_weight * v_ssim;
-    l1_sums[(channel * height + row) * get_global_size(0) + get_global_id(0)] = sum16(fabs(a - b));
-    const size_t first = (size_t)row * width + column;
-    for (int k = 0; k < min(SEGMENT, width - column); ++k) {
-        const real weight = masked ? mask[first + k] : 1;
-        v_image[3 * (first + k) + channel] = weight * ((const real *)&v)[k];
+                        const __global real *image, const __global uchar *photo, const int masked,
+                        const __global uchar *mask, const __global real *derivatives, __global real *v_image) {
+    const int length = 3 * width, column = (int)get_global_id(0) * VECTORS * LANES - MARGIN;
+    const int begin = get_global_id(1) * BAND, end = begin + BAND < height ? begin + BAND : height;
+    const size_t pitch = get_global_size(0) * VECTORS * LANES;
+    Derivatives ring[VECTORS][WINDOW];
+    for (int row = begin - RADIUS, newest = 0; row < end + RADIUS; ++row, newest = (newest + 1) % WINDOW) {
+        for (int v = 0; v < VECTORS; ++v) {
+            const int c = column + v * LANES;
+            if (c < 0 || c >= length)
+                continue;
+            Derivatives d = {0, 0, 0};
+            if (row >= 0 && row < height) {
+                const __global real *in = derivatives + (size_t)row * 3 * pitch + MARGIN + c;
+#pragma unroll
+                for (int k = 0; k < WINDOW; ++k) {
+                    const int tap = 3 * (k - RADIUS);
+                    d.mx += taps[k] * VECTOR(const __global, in + tap);
+                    d.xx += taps[k] * VECTOR(const __global, in + pitch + tap);
+                    d.xy += taps[k] * VECTOR(const __global, in + 2 * pitch + tap);
+                }
+            }
+            ring[v][newest] = d;
+            const int here = row - RADIUS;
+            if (here < begin)
+                continue;
+
+            Derivatives g = {0, 0, 0};
+#pragma unroll
+            for (int k = 0; k < WINDOW; ++k) {
+                const real w = turned_taps[2 * RADIUS - newest + k];
+                g.mx += w * ring[v][k].mx;
+                g.xx += w * ring[v][k].xx;
+                g.xy += w * ring[v][k].xy;
+            }
+            real x[LANES], y[LANES];
+            fetch(length, here, c, image, photo, masked, mask, x, y);
+            const reals a = VECTOR(const, x), b = VECTOR(const, y);
+            const reals v_l1 = a > b ? (reals)l1_weight : a < b ? (reals)-l1_weight : (reals)0;
+            const reals v_ssim = g.mx + 2 * a * g.xx + b * g.xy;
+            const reals value = v_l1 - ssim_weight * v_ssim;
+            const size_t i = (size_t)here * length + c;
+            if (c + LANES <= length && !masked)
+                VECTOR(__global, v_image + i) = value;
+            else
+                for (int k = 0; k < min(LANES, length - c); ++k)
+                    v_image[i + k] = masked && mask[(i + k) / 3] == 0 ? 0 : ((const real *)&value)[k];
+        }
     }
 }
