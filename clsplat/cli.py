@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from clsplat.bench.commands import Kernels
 from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig, SfmConfig, TrainConfig
 from clsplat.errors import ClsplatError, InputError
 
@@ -347,7 +348,23 @@ class Demo:
         )
 
 
-COMMANDS = Devices | Sfm | Train | Eval | Render | Export | Demo
+@dataclass(frozen=True)
+class Bench:
+    """Measure this installation on this machine."""
+
+    # tyro makes sub-commands of a union; the hidden member makes one of a single class.
+    what: Annotated[
+        Annotated[Kernels, tyro.conf.subcommand("kernels")] | Annotated[None, tyro.conf.Suppress],
+        tyro.conf.arg(name=""),
+    ]
+
+    def run(self) -> None:
+        """Run the command."""
+        if self.what is not None:
+            self.what.run()
+
+
+COMMANDS = Devices | Sfm | Train | Eval | Render | Export | Demo | Bench
 
 
 def main(arguments: list[str] | None = None) -> None:

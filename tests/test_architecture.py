@@ -36,6 +36,11 @@ LAYERS = """
 """.strip().splitlines()
 LAYER = {unit: depth for depth, row in enumerate(LAYERS) for unit in row.split()}
 
+# Kernels of `clsplat bench kernels`, no stages: nothing is rendered or trained by them, and tests/test_bench.py is
+# where they are checked. roof measures the device's limits, which no equation describes; count finds how many pairs a
+# view has.
+BENCH_KERNELS = {"count", "roof"}
+
 # Where a foreign package may be imported at all, whose absence or weight the rest must not feel.
 ONLY_IN = {"pyopencl": {"device", "ops"}, "pycolmap": {"sfm", "lenses"}}
 
@@ -71,7 +76,7 @@ def test_five_files_for_each_stage(stage):
 
 
 def test_no_kernel_without_a_stage():
-    assert {p.stem.split("_")[0] for p in kernel_folder().glob("*.cl")} == set(STAGES)
+    assert {p.stem.split("_")[0] for p in kernel_folder().glob("*.cl")} == set(STAGES) | BENCH_KERNELS
 
 
 def test_ops_and_reference_have_the_same_names():
@@ -134,11 +139,13 @@ DEFINES = {
     "bin": {"TILE": 16},
     "composite_cpu": {"TILE": 8, "CHANNELS": 1},
     "composite_gpu": {"TILE": 8, "CHANNELS": 1, "BATCH": 16},
+    "count": {"TILE": 16},
     "loss": {
         **{"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
         **{"LANES": 16, "VECTORS": 2, "BAND": 8, "GROUP": 32},
     },
     "project": {"CHANNELS": 4, "ANTIALIASED": 1, "VIEWMAT_GRAD": 1, "GROUP": 32},
+    "roof": {"WIDTH": 16},
     "scan": {"GROUP": 32},
     "sort": {"KEY_BITS": 64, "DIGIT_BITS": 4, "GROUP": 32, "BITONIC": 64, "BITONIC_GROUP": 32},
 }
@@ -149,6 +156,7 @@ FORBIDDEN = [
     ("composite_gpu", "TILE", 32),
     ("composite_gpu", "CHANNELS", 0),
     ("composite_gpu", "BATCH", 0),
+    ("count", "TILE", 0),
     ("loss", "RADIUS", 0),
     ("loss", "LANES", 8),
     ("loss", "VECTORS", 0),
@@ -158,6 +166,7 @@ FORBIDDEN = [
     ("project", "ANTIALIASED", 2),
     ("project", "VIEWMAT_GRAD", 2),
     ("project", "GROUP", 0),
+    ("roof", "WIDTH", 3),
     ("scan", "GROUP", 0),
     ("sort", "KEY_BITS", 16),
     ("sort", "DIGIT_BITS", 17),

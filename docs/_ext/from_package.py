@@ -1,7 +1,8 @@
 """Parts of pages made from the package while they are built, so that they cannot disagree with it.
 
 ``{constants}`` lists clsplat/constants.py; ``{config} NAME`` a dataclass of clsplat/config.py; ``{command} NAME``
-is what ``clsplat NAME --help`` prints.
+is what ``clsplat NAME --help`` prints; ``{bench_kernels} FILE [WORKLOAD]`` shows the results that
+``clsplat bench kernels -o FILE`` measured, or the stages of one workload of them.
 """
 
 import ast
@@ -9,9 +10,11 @@ import contextlib
 import dataclasses
 import inspect
 import io
+import json
 import os
 import re
 import typing
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -20,6 +23,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from clsplat import cli, config, constants
+from clsplat.bench import report
 
 HEADER_RULE = "|---"
 
@@ -109,7 +113,7 @@ def help_text(command: str) -> str:
     os.environ["COLUMNS"] = "100"
     try:
         with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-            cli.main([command, "--help"])
+            cli.main([*command.split(), "--help"])
     finally:
         os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
     return re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue())
@@ -140,9 +144,10 @@ class Config(Table):
 
 
 class Command(SphinxDirective):
-    """``{command} NAME``"""
+    """``{command} NAME``; the name of a sub-command follows that of its command."""
 
     required_arguments = 1
+    final_argument_whitespace = True
 
     def run(self) -> list[nodes.Node]:
         self.env.note_dependency(cli.__file__)
@@ -151,8 +156,25 @@ class Command(SphinxDirective):
         return [nodes.literal_block(text, text, language="text")]
 
 
+class BenchKernels(SphinxDirective):
+    """``{bench_kernels} FILE [WORKLOAD]``; the file lies beside the page."""
+
+    required_arguments = 1
+    optional_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        relative, path = self.env.relfn2path(self.arguments[0])
+        self.env.note_dependency(relative)
+        results = json.loads(Path(path).read_text())
+        if len(self.arguments) == 1:
+            return self.parse_text_to_nodes(report.summary(results))
+        workload = next(w for w in results["workloads"] if w["name"] == self.arguments[1])
+        return self.parse_text_to_nodes(report.details(workload))
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("constants", Constants)
     app.add_directive("config", Config)
     app.add_directive("command", Command)
+    app.add_directive("bench_kernels", BenchKernels)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

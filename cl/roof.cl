@@ -1,0 +1,93 @@
+// What the device can do at best: micro-benchmarks of `clsplat bench kernels`, no stage of the pipeline.
+//
+//   roof_fma, roof_exp, roof_exp2   arithmetic on CHAINS values per work-item, none waiting for another
+//   roof_copy, roof_triad           y = a; y = a + factor b
+//   roof_empty                      nothing: what remains is the launch
+//
+// Mapping: a work-item keeps its values in registers for `rounds` rounds, or moves `count` vectors, those
+// first, first + step, ... of the buffers: a piece of its own on a CPU, neighbours of other work-items' on a GPU.
+// The recurrences converge to a number of the order of 1 whatever they start from, and their results are
+// stored: no compiler can leave the work out, and none of it meets infinities or denormal numbers.
+// Without the order to unroll PoCL keeps the values in memory, at a quarter of the speed.
+//
+// Buffers: out[items,WIDTH]; a, b, y[items count,WIDTH]
+// -DWIDTH=1|4|16   width of the vectors
+#include "common.h"
+
+#if WIDTH == 1
+#define REALV          real
+#define LOAD(i, p)     ((p)[i])
+#define STORE(v, i, p) ((p)[i] = (v))
+#elif WIDTH == 4 || WIDTH == 16
+#define REALV CONCATENATE(real, WIDTH)
+#define LOAD  CONCATENATE(vload, WIDTH)
+#define STORE CONCATENATE(vstore, WIDTH)
+#else
+#error "-DWIDTH must be 1, 4 or 16"
+#endif
+
+// Two multiply-adds a cycle that take four cycles each need eight at least; PoCL's exp gains up to 12.
+#define CHAINS 16
+
+static inline void start(REALV *x) {
+    for (int k = 0; k < CHAINS; ++k)
+        x[k] = (REALV)(k + (real)get_global_id(0));
+}
+
+static inline void finish(const REALV *x, __global real *out) {
+    REALV sum = 0;
+    for (int k = 0; k < CHAINS; ++k)
+        sum += x[k];
+    STORE(sum, get_global_id(0), out);
+}
+
+__kernel void roof_fma(const uint rounds, const real factor, const real summand, __global real *out) {
+    REALV x[CHAINS];
+    start(x);
+    for (uint i = 0; i < rounds; ++i)
+#pragma unroll
+        for (int k = 0; k < CHAINS; ++k)
+            x[k] = x[k] * factor + summand; // contracted; PoCL's fma() and mad() are ten times slower
+    finish(x, out);
+}
+
+__kernel void roof_exp(const uint rounds, __global real *out) {
+    REALV x[CHAINS];
+    start(x);
+    for (uint i = 0; i < rounds; ++i)
+#pragma unroll
+        for (int k = 0; k < CHAINS; ++k)
+            x[k] = exp(-x[k]);
+    finish(x, out);
+}
+
+__kernel void roof_exp2(const uint rounds, __global real *out) {
+    REALV x[CHAINS];
+    start(x);
+    for (uint i = 0; i < rounds; ++i)
+#pragma unroll
+        for (int k = 0; k < CHAINS; ++k)
+            x[k] = exp2(-x[k]);
+    finish(x, out);
+}
+
+// Index of a work-item's first vector.
+static inline size_t first_vector(uint count, uint step) {
+    return step == 1 ? (size_t)get_global_id(0) * count : get_global_id(0);
+}
+
+__kernel void roof_copy(const uint count, const uint step, const __global real *a, __global real *y) {
+    size_t i = first_vector(count, step);
+    for (uint k = 0; k < count; ++k, i += step)
+        STORE(LOAD(i, a), i, y);
+}
+
+__kernel void roof_triad(const uint count, const uint step, const real factor, const __global real *a,
+                         const __global real *b, __global real *y) {
+    size_t i = first_vector(count, step);
+    for (uint k = 0; k < count; ++k, i += step)
+        STORE(LOAD(i, a) + factor * LOAD(i, b), i, y);
+}
+
+__kernel void roof_empty(__global real *out) {
+}

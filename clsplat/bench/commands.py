@@ -1,0 +1,83 @@
+"""The sub-commands of `clsplat bench`: a dataclass each, from which tyro makes flags and help."""
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from clsplat.bench.workloads import DEFAULT, Workload, from_files, scaling_names, synthetic
+from clsplat.config import DataConfig, RenderConfig
+from clsplat.errors import InputError
+
+CHART_SUFFIXES = (".png", ".svg", ".pdf")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Time training's step, its stages and their kernels, beside what the device can do at best."""
+
+    workloads: tuple[str, ...] = DEFAULT
+    """Synthetic scenes: number of Gaussians and image size."""
+    scene: Path | None = None
+    """File of Gaussians to time instead; needs --cameras."""
+    cameras: Path | None = None
+    """Dataset whose views the scene is timed with, as given to `train`."""
+    views: int = 1
+    """Views of the dataset, evenly spread, each a workload of its own."""
+    downscale: Literal[1, 2, 4, 8] = 1
+    """Of the dataset's photos, as given to `train`."""
+    scaling: Path | None = None
+    """Also time more numbers of Gaussians and of pixels, and draw the chart in this file (.png, .svg, .pdf)."""
+    repeats: int = 15
+    """Steps of each kind that count: whole, stage by stage, kernel by kernel."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """JSON file for all results."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.bench.kernels import bench_kernels
+        from clsplat.bench.report import details, save_scaling_chart, summary
+        from clsplat.device import Device, select_device
+        from clsplat.io.atomic import replacing
+
+        if self.repeats < 1:
+            raise InputError(f"--repeats: expected 1 or more, found {self.repeats}")
+        if self.scaling is not None and self.scaling.suffix.lower() not in CHART_SUFFIXES:
+            raise InputError(f"--scaling: expected a file named *{', *'.join(CHART_SUFFIXES)}, found {self.scaling}")
+        for path in filter(None, (self.out, self.scaling)):
+            if not path.absolute().parent.is_dir():  # said now, not after minutes of measuring
+                raise InputError(f"{path}: expected a file in a folder that exists, found no folder {path.parent}")
+        workloads = self._workloads()
+        device = Device(select_device(self.device))
+        _say(f"device: {device.label}")
+        results = bench_kernels(workloads, self.render, device, self.repeats, lambda text: _say(f"timing: {text}"))
+        print(summary(results))
+        for workload in results["workloads"]:
+            print(f"\n{details(workload)}")
+        if self.out is not None:
+            with replacing(self.out) as file:
+                file.write((json.dumps(results, indent=1) + "\n").encode())
+            _say(f"results: {self.out}")
+        if self.scaling is not None:
+            save_scaling_chart(results, self.scaling)
+            _say(f"chart: {self.scaling}")
+
+    def _workloads(self) -> list[Workload]:
+        if (self.scene is None) != (self.cameras is None):
+            raise InputError("--scene and --cameras: expected both or neither, found one of them")
+        if self.scene is not None and self.cameras is not None:
+            if self.scaling is not None:
+                raise InputError("--scaling: expected synthetic workloads, found --scene; leave one of them out")
+            return from_files(self.scene, self.cameras, self.views, DataConfig(downscale=self.downscale))
+        names = [*self.workloads, *(scaling_names() if self.scaling is not None else ())]
+        return [synthetic(name) for name in dict.fromkeys(names)]

@@ -1,0 +1,261 @@
+"""Timings of training's step, of its stages and of their kernels, and what part of the device's limits they reach."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat import ops
+from clsplat.bench.environment import describe
+from clsplat.bench.roof import measure_roof
+from clsplat.bench.workloads import Workload, count_pairs
+from clsplat.checkpoint import State
+from clsplat.config import BACKGROUNDS, OptimConfig, RenderConfig, TrainConfig
+from clsplat.densify import STRATEGIES
+from clsplat.device import Device
+from clsplat.optim import Moments
+from clsplat.render import forward, upload
+from clsplat.train import step
+
+ITERATION = 3001
+"""Of a default run: all bands of the spherical harmonics are trained, densification watches, and no edit is due."""
+
+STILL = OptimConfig(1e-30, 1e-30, 1e-30, 1e-30, 1e-30, 1e-30, 1e-30)
+"""Learning rates that leave every parameter as it is, so that all steps of a measurement do the same work."""
+
+WARM_UP = 2
+"""Steps of each kind before those that count: they build kernels and fill the pool of buffers."""
+
+REAL = 4
+"""Bytes of a real number."""
+
+# Wall time, CPU time of the process, both in seconds.
+Clock = NDArray[np.float64]
+
+
+def _clock() -> Clock:
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+class _Spent:
+    """Time and calls of what has been watched, by name, in the order of first calls."""
+
+    def __init__(self) -> None:
+        self.time: defaultdict[str, Clock] = defaultdict(lambda: np.zeros(2))
+        self.calls: defaultdict[str, int] = defaultdict(int)
+
+
+@contextmanager
+def _watched(device: Device, kernels: bool) -> Iterator[_Spent]:
+    """Time the functions of `clsplat.ops`, or the kernels they launch as STAGE/KERNEL, by waiting after each."""
+    spent, stages = _Spent(), {name: getattr(ops, name) for name in ops.__all__}
+    launch, stage = device.launch, ""
+
+    def timed(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        start = _clock()
+        result = function(*args, **kwargs)
+        device.queue.finish()
+        spent.time[name] += _clock() - start
+        spent.calls[name] += 1
+        return result
+
+    def entered(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        nonlocal stage
+        stage = name
+        return function(*args, **kwargs)
+
+    def timed_launch(folder: str, kernel: str, *args: Any, **kwargs: Any) -> None:
+        timed(f"{stage}/{kernel}", launch, folder, kernel, *args, **kwargs)
+
+    for name, function in stages.items():
+        setattr(ops, name, partial(entered if kernels else timed, name, function))
+    if kernels:
+        vars(device)["launch"] = timed_launch  # shadows the method
+    try:
+        yield spent
+    finally:
+        vars(device).pop("launch", None)
+        for name, function in stages.items():
+            setattr(ops, name, function)
+
+
+def _summary(samples: list[Clock], cores: int | None) -> dict[str, float]:
+    """Median and quartiles of wall times; median CPU time per core where the device's cores are the host's."""
+    wall, cpu = 1e3 * np.array(samples).T
+    q1, median, q3 = np.percentile(wall, [25, 50, 75])
+    result = {"median_ms": median, "q1_ms": q1, "q3_ms": q3}
+    if cores is not None:
+        result["cpu_ms"] = float(np.median(cpu)) / cores
+    return {key: float(value) for key, value in result.items()}
+
+
+def stage_bytes(n: int, sh_degree: int, pixels: int, intersections: int) -> dict[str, int]:
+    """Bytes that a stage bound by memory must move: each input read once, each result written once.
+
+    Parameters
+    ----------
+    n : int
+        Gaussians.
+    sh_degree, pixels, intersections : int
+    """
+    parameters, splat, splat_grads = 11 + 3 * (sh_degree + 1) ** 2, 12, 9
+    return {
+        "project_fwd": REAL * n * (parameters + splat),
+        "bin_splats": REAL * (n * 9 + 2 * intersections),  # without colours; gauss_ids and slots
+        "l1_ssim": pixels * (3 * REAL + 3 + 3 * REAL),  # image, photo in 8 bits, gradient
+        "project_bwd": REAL
+        * n
+        * (2 * parameters + splat_grads + 8),  # extents, conics and colours of the forward pass
+        "adam_step": REAL * n * 7 * parameters,  # gradient; parameter and both moments, read and written
+    }
+
+
+def _roof_fraction(name: str, result: dict[str, Any], accepted: int, roof: dict[str, float]) -> None:
+    """Add rates and the fraction of the roof to the result of a stage."""
+    seconds = result["median_ms"] / 1e3
+    if name in ("composite_fwd", "composite_bwd"):
+        result["gpairs_per_s"] = 1e-9 * accepted / seconds
+        result["roof"] = "exp"
+        result["roof_fraction"] = result["gpairs_per_s"] / max(roof["exp_gops"], roof["exp2_gops"])
+    elif "bytes" in result:
+        result["gb_per_s"] = 1e-9 * result["bytes"] / seconds
+        result["roof"] = "bandwidth"
+        result["roof_fraction"] = result["gb_per_s"] / max(roof["copy_gbs"], roof["triad_gbs"])
+
+
+def bench_workload(workload: Workload, render: RenderConfig, device: Device, repeats: int) -> dict[str, Any]:
+    """Time training's step on a workload, as a whole and by stages and kernels, in turn.
+
+    Returns
+    -------
+    dict
+        name, gaussians, width, height, sh_degree, counts; step: a summary; stages: by function of `clsplat.ops`,
+        each with the summaries of its kernels. A summary holds median_ms, q1_ms and q3_ms, on CPUs also cpu_ms, the
+        CPU time over the number of cores.
+    """
+    gaussians, view = workload.gaussians, workload.view
+    config = TrainConfig(render=render, optim=STILL)
+    background = BACKGROUNDS[config.data.background]
+    run = forward(device, upload(device, gaussians), view.camera, render, background, gaussians.sh_degree)
+    evaluated, accepted = (int(a.sum(dtype=np.uint64)) for a in count_pairs(device, run.splats, run.bins))
+    counts = {
+        "visible": int((run.splats.extents.get()[:, 0] > 0).sum()),
+        "intersections": int(run.bins.gauss_ids.shape[0]),
+        "pairs_evaluated": evaluated,
+        "pairs_accepted": accepted,
+    }
+    del run
+
+    photo = device.upload("photo", view.image, np.uint8)
+    mask = None if view.mask is None else device.upload("mask", view.mask, np.uint8)
+    moments = Moments.zeros(gaussians)
+    state = State(
+        ITERATION - 1,
+        0.0,
+        workload.extent,
+        upload(device, gaussians),
+        Moments(upload(device, moments.first), upload(device, moments.second)),
+        STRATEGIES[config.strategy](config, workload.extent, len(gaussians)),
+    )
+
+    def one_step() -> None:
+        step(state, ITERATION, view, lambda _: (photo, mask), config, device)  # type: ignore[arg-type]
+        device.queue.finish()
+
+    steps: list[Clock] = []
+    samples: defaultdict[str, list[Clock]] = defaultdict(list)
+    calls: dict[str, int] = {}
+    for repeat in range(-WARM_UP, repeats):
+        start = _clock()
+        one_step()
+        whole = _clock() - start
+        for kernels in (False, True):
+            with _watched(device, kernels) as spent:
+                one_step()
+            if repeat >= 0:
+                calls |= spent.calls
+                for name, clock in spent.time.items():
+                    samples[name].append(clock)
+        if repeat >= 0:
+            steps.append(whole)
+
+    cores = device.cl_device.max_compute_units if device.is_cpu else None
+    stages: dict[str, dict[str, Any]] = {}
+    for name, clocks in samples.items():
+        stage, _, kernel = name.partition("/")
+        if kernel:
+            stages[stage]["kernels"][kernel] = {"launches": calls[name], **_summary(clocks, cores)}
+        else:
+            stages[stage] = {**_summary(clocks, cores), "kernels": {}}
+    pixels = view.camera.width * view.camera.height
+    for name, moved in stage_bytes(len(gaussians), gaussians.sh_degree, pixels, counts["intersections"]).items():
+        if name in stages:
+            stages[name]["bytes"] = moved
+    return {
+        "name": workload.name,
+        "gaussians": len(gaussians),
+        "width": view.camera.width,
+        "height": view.camera.height,
+        "sh_degree": gaussians.sh_degree,
+        "mode": render.mode,
+        "counts": counts,
+        "step": _summary(steps, cores),
+        "stages": stages,
+    }
+
+
+def bench_kernels(
+    workloads: list[Workload],
+    render: RenderConfig,
+    device: Device,
+    repeats: int,
+    progress: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """Measure the device's limits, before and after everything else, and time all workloads.
+
+    Parameters
+    ----------
+    workloads : list of Workload
+    render : RenderConfig
+        Mode, tile size and compositor; a workload's own mode comes before its mode.
+    device : Device
+    repeats : int
+        Steps of each kind (whole, by stages, by kernels) that count; at least 1.
+    progress : callable
+        Told what is being done.
+
+    Returns
+    -------
+    dict
+        What `clsplat bench kernels -o FILE` writes: device, software, date, settings, roof, workloads.
+    """
+    results: dict[str, Any] = {
+        "benchmark": "kernels",
+        **describe(device),
+        "settings": {"repeats": repeats, **asdict(render)},
+    }
+    progress("roof")
+    roof = measure_roof(device)
+    timed = []
+    for workload in workloads:
+        progress(workload.name)
+        timed.append(bench_workload(workload, replace(render, mode=workload.mode), device, repeats))
+    progress("roof")
+    results["roof"] = _better(roof, measure_roof(device))
+    for result in timed:
+        for name, stage in result["stages"].items():
+            _roof_fraction(name, stage, result["counts"]["pairs_accepted"], results["roof"])
+        compositing = sum(result["stages"][name]["median_ms"] for name in ("composite_fwd", "composite_bwd"))
+        result["step_over_compositing"] = result["step"]["median_ms"] / compositing
+    return results | {"workloads": timed}
+
+
+def _better(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:
+    """The better of two measurements of the roof: rates count upwards, times downwards."""
+    return {key: min(a[key], b[key]) if key.endswith("_us") else max(a[key], b[key]) for key in a}

@@ -1,0 +1,108 @@
+"""The device's limits, measured: what the fractions of `clsplat.bench` are fractions of."""
+
+import time
+from collections.abc import Callable
+
+from clsplat.device import Device
+
+CHAINS = 16
+"""Independent values per work-item, as in cl/roof.cl."""
+
+BUFFER_BYTES = 512 * 2**20
+"""Size of each buffer for bandwidth, memory permitting: beyond the caches of all devices but a few CPUs, whose last
+level may hold part of it."""
+
+MEMORY_SHARE = 16
+"""Each buffer takes at most one part in so many of the device's memory."""
+
+SECONDS = 0.02
+"""A measured run lasts at least this long: a thousand times what a launch costs."""
+
+RUNS = 5
+"""The best of so many runs counts: a roof is what nothing disturbed."""
+
+LAUNCHES = 1000
+"""Launches of the empty kernel that are queued one after the other."""
+
+
+def _best(device: Device, run: Callable[[], None], runs: int) -> float:
+    """Seconds of the fastest of some runs, after one that builds the kernel and touches the memory."""
+    seconds = []
+    for _ in range(runs + 1):
+        start = time.perf_counter()
+        run()
+        device.queue.finish()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds[1:])
+
+
+def _arithmetic(device: Device, kernel: str, *scalars: float) -> float:
+    """Results per second."""
+    # A CPU's core wants wide vectors, a GPU scalar work-items in great number.
+    width, group = (16, 1) if device.is_cpu else (1, 256)
+    items = (4 if device.is_cpu else 2048) * device.cl_device.max_compute_units
+    out = device.empty("roof", items * width)
+
+    def run() -> None:
+        device.launch("roof", kernel, (items,), [rounds, *scalars, out], defines={"WIDTH": width}, group=(group,))
+
+    rounds = 64
+    while _best(device, run, 1) < SECONDS:
+        rounds *= 4
+    return items * width * CHAINS * rounds / _best(device, run, RUNS)
+
+
+def _bandwidth(device: Device, kernel: str, buffers: int, *scalars: float) -> tuple[float, int]:
+    """Bytes per second read and written, and the size of each buffer."""
+    width, group = (16, 1) if device.is_cpu else (4, 256)
+    items = (4 if device.is_cpu else 2048) * device.cl_device.max_compute_units
+    limit = min(BUFFER_BYTES, device.cl_device.global_mem_size // MEMORY_SHARE, device.cl_device.max_mem_alloc_size)
+    count = int(limit // (items * width * device.real.itemsize))
+    arrays = [device.empty("roof", items * count * width) for _ in range(buffers)]
+    for array in arrays:
+        array.fill(0)
+    arguments = [count, 1 if device.is_cpu else items, *scalars, *arrays]
+
+    def run() -> None:
+        device.launch("roof", kernel, (items,), arguments, defines={"WIDTH": width}, group=(group,))
+
+    return buffers * arrays[0].nbytes / _best(device, run, RUNS), arrays[0].nbytes
+
+
+def measure_roof(device: Device) -> dict[str, float]:
+    """Measure the device's limits, in a second or two.
+
+    Returns
+    -------
+    dict
+        fma_gflops: multiply-adds, each counted as two operations, in 1e9/s; exp_gops, exp2_gops: 1e9/s;
+        copy_gbs, triad_gbs: 1e9 bytes/s read and written; buffer_mib: size of each buffer of theirs;
+        launch_us: an empty kernel and waiting for it; queued_launch_us: one of many empty kernels in a row.
+    """
+    out = device.empty("roof", 64)
+
+    def launch() -> None:
+        device.launch("roof", "roof_empty", (1,), [out], defines={"WIDTH": 1}, group=(1,))
+
+    def queued() -> None:
+        for _ in range(LAUNCHES):
+            launch()
+
+    def waiting() -> None:
+        for _ in range(LAUNCHES):
+            launch()
+            device.queue.finish()
+
+    copy, size = _bandwidth(device, "roof_copy", 2)
+    triad, _ = _bandwidth(device, "roof_triad", 3, 0.5)
+    return {
+        # x -> 0.999 x + 0.001 converges to 1.
+        "fma_gflops": 2e-9 * _arithmetic(device, "roof_fma", 0.999, 0.001),
+        "exp_gops": 1e-9 * _arithmetic(device, "roof_exp"),
+        "exp2_gops": 1e-9 * _arithmetic(device, "roof_exp2"),
+        "copy_gbs": 1e-9 * copy,
+        "triad_gbs": 1e-9 * triad,
+        "buffer_mib": size / 2**20,
+        "launch_us": 1e6 * _best(device, waiting, RUNS) / LAUNCHES,
+        "queued_launch_us": 1e6 * _best(device, queued, RUNS) / LAUNCHES,
+    }
