@@ -36,6 +36,9 @@ MODEL_CONSTANTS = (
 # PoCL compiles a kernel anew for every size it meets: 0.05 to 0.15 s whenever the number of Gaussians changed.
 GROUP = 64
 
+# Buffers of one name whose sizes differ by no more than this factor are allocated in one size.
+SAME_ORDER = 4
+
 # Safe with every driver tried; -cl-fast-relaxed-math is not: it drops exp to 2e-4 on one and breaks it on another.
 BUILD_OPTIONS = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros"]
 
@@ -144,6 +147,7 @@ class Device:
         self.memory_limit = min(memory_limit or self.cl_device.global_mem_size, self.cl_device.global_mem_size)
         self.memory_peak = 0
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self.queue))
+        self._largest: dict[str, int] = {}
         self._kernels: dict[tuple[str, tuple[Any, ...]], cl.Kernel] = {}
         self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}
 
@@ -169,15 +173,45 @@ class Device:
                 f"{what}: needs a buffer of {nbytes / 2**20:.0f} MiB, but {self.label} allows at most "
                 f"{limit / 2**20:.0f} MiB per buffer; use fewer Gaussians or a smaller image (--downscale)"
             )
-        block = self._pool.alloc_size(self._pool.bin_number(nbytes))
-        if self.memory + block > self.memory_limit:
+
+    def _block(self, nbytes: int) -> int:
+        """Bytes that the pool takes for a buffer of `nbytes`, which it rounds up to a class of sizes."""
+        return int(self._pool.alloc_size(self._pool.bin_number(nbytes)))
+
+    def _capacity(self, what: str, nbytes: int) -> int:
+        """Bytes to allocate for `nbytes`: as many as for the largest of its name so far, if of the same order.
+
+        Lists of intersections differ in length from image to image; in blocks of one size they reuse each other's.
+        """
+        largest = self._largest.get(what, 0)
+        if largest / SAME_ORDER <= nbytes <= largest:
+            return largest
+        if nbytes > largest:
+            self._largest[what] = nbytes
+            if largest and self._block(nbytes) > self._block(largest):
+                self._pool.free_held()  # the smaller blocks
+        return nbytes
+
+    def _allocate(self, what: str, nbytes: int) -> cl.MemoryObjectHolder:
+        capacity = self._capacity(what, nbytes)
+        if self.memory + self._block(capacity) > self.memory_limit:
             self._pool.free_held()
-        if self.memory + block > self.memory_limit:
+            capacity = nbytes
+        if self.memory + self._block(capacity) > self.memory_limit:
             raise DeviceError(
                 f"{what}: needs {nbytes / 2**20:.0f} MiB beside {self.memory / 2**20:.0f} MiB in use, but the limit "
                 f"is {self.memory_limit / 2**20:.0f} MiB (--memory-limit); use fewer Gaussians or a smaller image "
                 "(--downscale)"
             )
+        try:
+            block = self._pool.allocate(capacity)
+        except cl.MemoryError as error:
+            raise DeviceError(
+                f"{what}: {self.label} has no memory left for {nbytes / 2**20:.0f} MiB; use fewer Gaussians or a "
+                "smaller image (--downscale)"
+            ) from error
+        self.memory_peak = max(self.memory_peak, self.memory)
+        return block
 
     def empty(self, what: str, shape: tuple[int, ...] | int, dtype: DTypeLike | None = None) -> cl.array.Array:
         """Uninitialised array of `dtype` (default: real); `what` names it in errors.
@@ -188,16 +222,10 @@ class Device:
             If it exceeds the device's largest buffer, its memory, or the limit.
         """
         dtype = self.real if dtype is None else np.dtype(dtype)
-        self._check_size(what, int(np.prod(shape)) * dtype.itemsize)
-        try:
-            array = cl.array.Array(self.queue, shape, dtype, allocator=self._pool)
-        except cl.MemoryError as error:
-            raise DeviceError(
-                f"{what}: {self.label} has no memory left for {np.prod(shape) * dtype.itemsize / 2**20:.0f} MiB; "
-                "use fewer Gaussians or a smaller image (--downscale)"
-            ) from error
-        self.memory_peak = max(self.memory_peak, self.memory)
-        return array
+        nbytes = int(np.prod(shape)) * dtype.itemsize
+        self._check_size(what, nbytes)
+        data = self._allocate(what, nbytes) if nbytes else None
+        return cl.array.Array(self.queue, shape, dtype, data=data)
 
     def scratch(self, what: str, size: int, layout: Any = None) -> cl.array.Array:
         """The flat array of reals named `what`, kept between calls.

@@ -120,16 +120,47 @@ class TestBuffers:
         device.empty("more", 1 << 20)
         assert device.memory < device.memory_peak <= 10 << 20
 
+    def test_near_the_limit_a_buffer_is_as_small_as_it_can_be(self):
+        device = Device(memory_limit=9 << 20)
+        device.empty("list", 2 << 20)
+        kept = [device.empty("list", 1 << 20) for _ in range(2)]
+        assert len(kept) == 2 and device.memory_peak <= 9 << 20
+
     def test_the_limit_is_at_most_the_memory(self, device):
         memory = device.cl_device.global_mem_size
         assert device.memory_limit == memory
         assert Device(memory_limit=2 * memory).memory_limit == memory
 
+    def test_sizes_that_change_reuse_the_same_memory(self):
+        device = Device()
+        sizes = np.random.default_rng(0).integers(100_000, 300_000, 200)
+        memory = []
+        for size in sizes:
+            pair = [device.empty("list", int(size), np.uint32) for _ in range(2)]
+            np.testing.assert_array_equal(pair[0].fill(3).get(), np.full(size, 3, np.uint32))
+            del pair
+            memory.append(device.memory)
+        # Allocated anew only where a list was longer than all before, by more than the 1/16 of the pool's rounding.
+        assert len(set(memory)) < 12
+        assert memory[-1] <= 1.07 * 2 * 4 * sizes.max()
+
+    def test_sizes_of_another_order_have_memory_of_their_own(self):
+        device = Device()
+        large = device.empty("x", 1 << 20)
+        before = device.memory
+        small = device.empty("x", 1 << 10)
+        assert device.memory - before < 5 << 10
+        assert (large.size, small.size) == (1 << 20, 1 << 10)
+
     def test_no_memory_left(self, device, monkeypatch):
-        def allocate(*arguments, **options):
+        def allocate(size):
             raise cl.MemoryError("clCreateBuffer failed: MEM_OBJECT_ALLOCATION_FAILURE")
 
-        monkeypatch.setattr(cl.array, "Array", allocate)
+        pool = device._pool
+        full = SimpleNamespace(
+            managed_bytes=0, bin_number=pool.bin_number, alloc_size=pool.alloc_size, allocate=allocate
+        )
+        monkeypatch.setattr(device, "_pool", full)
         with pytest.raises(DeviceError, match=r"splats: .* has no memory left for 4 MiB; use fewer Gaussians"):
             device.empty("splats", (1024, 1024))
 
