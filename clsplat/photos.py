@@ -159,4 +159,4 @@ def _rgb(image: Image.Image, background: tuple[float, float, float], path: Path)
         alpha = rgba[..., 3:] / 255
         blended = rgba[..., :3] * alpha + 255 * np.asarray(background, dtype=np.float32) * (1 - alpha)
         return np.rint(blended).astype(np.uint8)
-    return np.array(image.convert("RGB"))
+    return np.array(image if image.mode == "RGB" else image.convert("RGB"))

@@ -280,7 +280,10 @@ def _view(plan: _Plan, reduce: int, background: tuple[float, float, float]) -> V
         image = np.stack([_resample(image[..., channel], positions, 1) for channel in range(3)], axis=-1)
         mask = None if mask is None else _resample(mask, positions, 0)
     if reduce > 1:
-        image = np.rint(_squares(image, camera, reduce).mean(axis=(1, 3))).astype(np.uint8)
+        # Sum by sum: NumPy's mean over two axes of bytes takes several times as long.
+        squares = _squares(image, camera, reduce)
+        total = sum(squares[:, i, :, j].astype(np.uint16) for i in range(reduce) for j in range(reduce))
+        image = np.rint(total / reduce**2).astype(np.uint8)
         # A pixel that is averaged from a masked one does not count either.
         mask = None if mask is None else np.asarray(_squares(mask, camera, reduce).all(axis=(1, 3)))
     return View(photo.name, camera, np.ascontiguousarray(image), mask)
