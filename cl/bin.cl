@@ -1,54 +1,92 @@
 // Stage bin: which splats touch which tile, in depth order.
 //
 // A tile's list holds, by depth and then by index, every splat whose ellipse {alpha >= ALPHA_MIN} may cover
-// the centre of one of its pixels: the test is exact (ellipse.h) but for a slack in the threshold. Steps,
-// with the stages scan and sort between them:
-//   bin_keys    depths as integers that sort like them; invisible splats last
-//   (sort)      order[N], the splats by depth
-//   bin_count   counts[i], the tiles of splat order[i]
-//   (scan)      first_slots[N + 1]
-//   bin_emit    slot by slot: tiles[M] and the splat's index slot_gauss[M], a splat's slots side by side
-//   (sort)      slots[M], the slots by tile, stable: the depth order survives within a tile
-//   bin_ranges  tile_ranges[T,2], begin and end of each tile in the sorted list, and gauss_ids[M]
+// the centre of one of its pixels: the test is exact (ellipse.h) but for a slack in the threshold.
 //
-// Mapping: one work-item per splat (bin_keys, bin_count, bin_emit), per tile or intersection (bin_ranges,
-// bin_gather). Counting and emitting are one function: they cannot disagree.
+// Splats are walked in some order: by depth (scheme "global", after a sort of all splats), or by index (scheme
+// "per_tile", which sorts each tile's list afterwards). Either way a stable distribution to the tiles keeps
+// that order within each list. Steps, with the stages scan and sort between them:
+//   bin_prepare  keys[N], depths as integers that sort like them, invisible splats last; ellipses[N], see ellipse.h
+//   bin_identity or (sort)  order[N], the splats in the order of the walk
+// On a CPU, a counting sort by tile of which work-item w owns the w-th run of splats and counters of its own:
+//   bin_histogram  counters[W,T], entries per run and tile; counts[N], tiles of splat order[i] (GRADIENTS)
+//   bin_totals     totals[T], entries per tile; the counters become entries of the runs before
+//   (scan)         tile_begins[T + 1], their total M, and first_slots[N + 1] (GRADIENTS)
+//   bin_scatter    gauss_ids[M] and slots[M] (GRADIENTS), where the counters say
+// On a GPU, a radix sort by tile, one work-item per splat:
+//   bin_count    counts[N]
+//   (scan)       first_slots[N + 1]
+//   bin_emit     slot by slot: tiles[M] and the splat's index slot_gauss[M], a splat's slots side by side
+//   (sort)       the slots by tile, stable, and with GRADIENTS bin_gather
+//   bin_bisect   tile_begins[T + 1], from the sorted tiles
+// Then bin_ranges: tile_ranges[T,2], begin and end of each tile's list. Scheme per_tile goes on with
+//   bin_list_keys  the depth key of each entry
+//   (sort)         the entries of each tile by it, stable, and bin_gather
 //
-// Buffers: N splats, M intersections, T = tiles_x tiles_y tiles in row-major order; see above and project.cl.
-// -DTILE   edge of a tile, px
+// Counting and emitting are one function, walk_tiles: they cannot disagree.
+//
+// Buffers: N splats, M intersections, T = tiles_x tiles_y tiles in row-major order, W runs; see above and
+// project.cl. A splat's slots lie side by side and are numbered in the order of the walk.
+// -DTILE            edge of a tile, px
+// -DGRADIENTS=0|1   1: bin_histogram and bin_scatter also write what the backward pass needs
 #include "common.h"
 #include "ellipse.h"
 
 #if !defined(TILE) || TILE < 1
 #error "-DTILE must give the edge of a tile in pixels, 1 or more"
 #endif
+#if !defined(GRADIENTS) || GRADIENTS & ~1
+#error "-DGRADIENTS must be 0 or 1"
+#endif
 
-// Walks the tiles of splat g; writes them from slot first on, if emitting. Returns their number.
-static inline uint walk_tiles(uint g, int width, int height, const __global real *means2d,
-                              const __global real *conics, const __global real *extents,
-                              const __global real *opacities, bool emitting, uint first, __global uint *tiles,
-                              __global uint *slot_gauss) {
-    const real2 extent = vload2(g, extents);
-    if (!(extent.x > 0))
+// Rows of tiles looked at together.
+#define ROWS        8
+#define ROW_OFFSETS (TILE * (real8)(0, 1, 2, 3, 4, 5, 6, 7))
+
+// What walk_tiles does with a tile.
+#define COUNT   0 // nothing
+#define LIST    1 // out_a[slot] = tile, out_b[slot] = g
+#define TALLY   2 // ++counters[tile]
+#define SCATTER 3 // out_a[counters[tile]] = g, out_b[counters[tile]++] = slot (GRADIENTS)
+
+// Walks the tiles of splat g, whose slots begin at `slot`. Returns their number.
+static inline uint walk_tiles(const int task, uint g, int width, int height, const __global Ellipse *ellipses,
+                              uint slot, __global uint *counters, __global uint *out_a, __global uint *out_b) {
+    const Ellipse e = ellipses[g];
+    if (!(e.half_height > 0))
         return 0;
-    const real2 centre = vload2(g, means2d);
-    const real3 conic = load3(conics, g);
-    const real r2 = ellipse_r2(opacities[g]);
-    const int tiles_x = (width + TILE - 1) / TILE;
-    const int2 rows = pixels_between(centre.y - extent.y, centre.y + extent.y, height);
+    const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
+    // Rows of tiles within the box; where rounding adds one, no ellipse meets it.
+    const real top = (e.y - e.half_height) / TILE, bottom = (e.y + e.half_height) / TILE;
+    const int begin = top > 0 ? (top < tiles_y ? (int)top : tiles_y) : 0;
+    const int end = bottom > 0 ? (bottom < tiles_y ? (int)bottom + 1 : tiles_y) : 0;
     uint count = 0;
-    for (int ty = rows.x / TILE; ty * TILE <= rows.y; ++ty) {
-        // Distances of the first and the last row of pixel centres in this row of tiles; the image may cut it off.
-        const real lo = ty * TILE + (real)0.5 - centre.y;
-        const real hi = min((ty + 1) * TILE, height) - (real)0.5 - centre.y;
-        const real2 range = ellipse_range(conic, r2, extent, lo, hi);
-        const int2 columns = pixels_between(centre.x + range.x, centre.x + range.y, width);
-        if (range.x > range.y || columns.x > columns.y)
-            continue;
-        for (int tx = columns.x / TILE; tx <= columns.y / TILE; ++tx, ++count) {
-            if (emitting) {
-                tiles[first + count] = ty * tiles_x + tx;
-                slot_gauss[first + count] = g;
+    for (int ty = begin; ty < end; ty += ROWS) {
+        // Distances of the first and the last row of pixel centres in each row of tiles; the image may cut it off.
+        const real8 first_row = ROW_OFFSETS + (ty * TILE + (real)0.5);
+        const real8 image_end = height - (real)0.5, tile_end = first_row + (TILE - 1);
+        const real8 last_row = LESSER(tile_end, image_end);
+        real8 x_min, x_max;
+        const mask8 met = ellipse_ranges8(&e, first_row - e.y, last_row - e.y, &x_min, &x_max);
+        int8 first, last;
+        pixels_between8(e.x + x_min, e.x + x_max, width, &first, &last);
+        const int8 listed = convert_int8(met) & (first <= last);
+        const int8 begins = first / TILE, ends = listed ? last / TILE + 1 : 0;
+        for (int k = 0; k < ROWS && ty + k < end; ++k) {
+            for (int tx = ((const int *)&begins)[k]; tx < ((const int *)&ends)[k]; ++tx, ++count) {
+                const uint tile = (ty + k) * tiles_x + tx;
+                if (task == LIST) {
+                    out_a[slot + count] = tile;
+                    out_b[slot + count] = g;
+                } else if (task == TALLY) {
+                    ++counters[tile];
+                } else if (task == SCATTER) {
+                    const uint position = counters[tile]++;
+                    out_a[position] = g;
+#if GRADIENTS
+                    out_b[position] = slot + count;
+#endif
+                }
             }
         }
     }
@@ -65,57 +103,138 @@ typedef uint depth_key;
 #define LAST   UINT_MAX
 #endif
 
-// The bits of a positive floating-point number order like the number.
-__kernel void bin_keys(const uint n, const __global real *depths, const __global real *extents,
-                       __global depth_key *keys) {
-    const size_t i = get_global_id(0);
+// The bits of a positive floating-point number order like the number. A work-item takes eight splats: on CPUs
+// one vector logarithm costs less than one scalar one.
+__kernel void bin_prepare(const uint n, const __global real *means2d, const __global real *conics,
+                          const __global real *depths, const __global real *extents, const __global real *opacities,
+                          __global depth_key *keys, __global Ellipse *ellipses) {
+    const uint begin = 8 * get_global_id(0);
+    if (begin >= n)
+        return;
+    const uint end = min(n, begin + 8);
+    real8 r2 = 0;
+    for (uint i = begin; i < end; ++i)
+        ((real *)&r2)[i - begin] = opacities[i];
+    r2 = ellipse_r2_8(r2);
+    for (uint i = begin; i < end; ++i) {
+        const real2 centre = (real2)(means2d[2 * i], means2d[2 * i + 1]);
+        const real2 extent = (real2)(extents[2 * i], extents[2 * i + 1]);
+        keys[i] = extent.x > 0 ? AS_KEY(depths[i]) : LAST;
+        ellipses[i] = ellipse_of(centre, load3(conics, i), ((const real *)&r2)[i - begin], extent);
+    }
+}
+
+__kernel void bin_identity(const uint n, __global uint *order) {
+    const uint i = get_global_id(0);
     if (i < n)
-        keys[i] = extents[2 * i] > 0 ? AS_KEY(depths[i]) : LAST;
+        order[i] = i;
+}
+
+static inline uint run_begin(uint n, uint runs, uint run) {
+    return (uint)((ulong)n * run / runs);
+}
+
+__kernel void bin_histogram(const uint n, const uint runs, const uint tile_count, const int width, const int height,
+                            const __global uint *order, const __global Ellipse *ellipses, __global uint *counters,
+                            __global uint *counts) {
+    const uint run = get_global_id(0);
+    if (run >= runs)
+        return;
+    counters += (size_t)tile_count * run;
+    for (uint t = 0; t < tile_count; ++t)
+        counters[t] = 0;
+    const uint end = run_begin(n, runs, run + 1);
+    for (uint i = run_begin(n, runs, run); i < end; ++i) {
+        const uint count = walk_tiles(TALLY, order[i], width, height, ellipses, 0, counters, 0, 0);
+#if GRADIENTS
+        counts[i] = count;
+#endif
+    }
+}
+
+__kernel void bin_totals(const uint runs, const uint tile_count, __global uint *counters, __global uint *totals) {
+    const uint t = get_global_id(0);
+    if (t >= tile_count)
+        return;
+    uint total = 0;
+    for (uint run = 0; run < runs; ++run) {
+        __global uint *counter = counters + (size_t)tile_count * run + t;
+        const uint count = *counter;
+        *counter = total;
+        total += count;
+    }
+    totals[t] = total;
+}
+
+__kernel void bin_scatter(const uint n, const uint runs, const uint tile_count, const int width, const int height,
+                          const __global uint *order, const __global Ellipse *ellipses, __global uint *counters,
+                          const __global uint *tile_begins, const __global uint *first_slots,
+                          __global uint *gauss_ids, __global uint *slots) {
+    const uint run = get_global_id(0);
+    if (run >= runs)
+        return;
+    counters += (size_t)tile_count * run;
+    for (uint t = 0; t < tile_count; ++t)
+        counters[t] += tile_begins[t];
+    const uint end = run_begin(n, runs, run + 1);
+    for (uint i = run_begin(n, runs, run); i < end; ++i) {
+#if GRADIENTS
+        const uint slot = first_slots[i];
+#else
+        const uint slot = 0;
+#endif
+        walk_tiles(SCATTER, order[i], width, height, ellipses, slot, counters, gauss_ids, slots);
+    }
 }
 
 __kernel void bin_count(const uint n, const int width, const int height, const __global uint *order,
-                        const __global real *means2d, const __global real *conics, const __global real *extents,
-                        const __global real *opacities, __global uint *counts) {
-    const size_t i = get_global_id(0);
+                        const __global Ellipse *ellipses, __global uint *counts) {
+    const uint i = get_global_id(0);
     if (i < n)
-        counts[i] = walk_tiles(order[i], width, height, means2d, conics, extents, opacities, false, 0, 0, 0);
+        counts[i] = walk_tiles(COUNT, order[i], width, height, ellipses, 0, 0, 0, 0);
 }
 
 __kernel void bin_emit(const uint n, const int width, const int height, const __global uint *order,
-                       const __global real *means2d, const __global real *conics, const __global real *extents,
-                       const __global real *opacities, const __global uint *first_slots, __global uint *tiles,
+                       const __global Ellipse *ellipses, const __global uint *first_slots, __global uint *tiles,
                        __global uint *slot_gauss) {
-    const size_t i = get_global_id(0);
+    const uint i = get_global_id(0);
     if (i < n)
-        walk_tiles(order[i], width, height, means2d, conics, extents, opacities, true, first_slots[i], tiles,
-                   slot_gauss);
+        walk_tiles(LIST, order[i], width, height, ellipses, first_slots[i], 0, tiles, slot_gauss);
 }
 
-// Index of the first of the m sorted tiles that is not below `tile`.
-static inline uint lower_bound(uint m, const __global uint *sorted_tiles, uint tile) {
+// tile_begins[t]: index of the first of the m sorted tiles that is not below t, for t = 0 to tile_count.
+__kernel void bin_bisect(const uint m, const uint tile_count, const __global uint *sorted_tiles,
+                         __global uint *tile_begins) {
+    const uint t = get_global_id(0);
+    if (t > tile_count)
+        return;
     uint begin = 0, end = m;
     while (begin < end) {
         const uint middle = begin + (end - begin) / 2;
-        if (sorted_tiles[middle] < tile)
+        if (sorted_tiles[middle] < t)
             begin = middle + 1;
         else
             end = middle;
     }
-    return begin;
+    tile_begins[t] = begin;
 }
 
-__kernel void bin_ranges(const uint m, const uint tile_count, const __global uint *sorted_tiles,
-                         __global uint *tile_ranges) {
+__kernel void bin_ranges(const uint tile_count, const __global uint *tile_begins, __global uint *tile_ranges) {
     const uint t = get_global_id(0);
-    if (t >= tile_count)
-        return;
-    tile_ranges[2 * t] = lower_bound(m, sorted_tiles, t);
-    tile_ranges[2 * t + 1] = lower_bound(m, sorted_tiles, t + 1);
+    if (t < tile_count)
+        vstore2((uint2)(tile_begins[t], tile_begins[t + 1]), t, tile_ranges);
 }
 
-__kernel void bin_gather(const uint m, const __global uint *slots, const __global uint *slot_gauss,
-                         __global uint *gauss_ids) {
-    const size_t i = get_global_id(0);
+__kernel void bin_list_keys(const uint m, const __global uint *gauss_ids, const __global depth_key *keys,
+                            __global depth_key *list_keys) {
+    const uint i = get_global_id(0);
     if (i < m)
-        gauss_ids[i] = slot_gauss[slots[i]];
+        list_keys[i] = keys[gauss_ids[i]];
+}
+
+__kernel void bin_gather(const uint m, const __global uint *permutation, const __global uint *in,
+                         __global uint *out) {
+    const uint i = get_global_id(0);
+    if (i < m)
+        out[i] = in[permutation[i]];
 }

@@ -3,30 +3,64 @@
 #ifndef CLSPLAT_ELLIPSE_H
 #define CLSPLAT_ELLIPSE_H
 
+#ifdef USE_DOUBLE
+#define CONVERT_REAL8 convert_double8
+#else
+#define CONVERT_REAL8 convert_float8
+#endif
+
 // r2 in the unit of 2 sigma, the slack of clsplat/constants.py included; not positive: the splat is
 // invisible.
 static inline real ellipse_r2(real opacity) {
     return opacity > ALPHA_MIN ? 2 * (log(opacity / ALPHA_MIN) + EXTENT_SLACK) : 0;
 }
 
-// Exact range [range.x, range.y] of dx over the part of the ellipse with lo <= dy <= hi; range.x > range.y:
-// empty. ex, ey are its half width and half height. The range of dy for given dx follows by exchanging a and
-// c, ex and ey. The leftmost and rightmost points lie at dy = +-(b/c) ex; within the band an extreme is
-// attained there or at the nearer border (Hanson et al. 2024, "Speedy-Splat", AccuTile). With ey^2 = r2 a/(a
-// c - b^2) the determinant of the conic, which cancels for needles, is not needed.
-static inline real2 ellipse_range(real3 conic, real r2, real2 extent, real lo, real hi) {
-    const real a = conic.x, b = conic.y, c = conic.z;
-    lo = fmax(lo, -extent.y);
-    hi = fmin(hi, extent.y);
-    if (!(lo <= hi))
-        return (real2)(1, 0);
-    const real at_right = -b / c * extent.x;
-    const real right = clamp(at_right, lo, hi);
-    const real left = clamp(-at_right, lo, hi);
-    const real t_left = left / extent.y, t_right = right / extent.y;
-    const real x_min = (-b * left - sqrt(a * r2 * fmax(1 - t_left * t_left, (real)0))) / a;
-    const real x_max = (-b * right + sqrt(a * r2 * fmax(1 - t_right * t_right, (real)0))) / a;
-    return (real2)(x_min, x_max);
+// r2 of eight splats. On CPUs a vector logarithm costs less than one scalar one.
+static inline real8 ellipse_r2_8(real8 opacity) {
+    return opacity > (real8)ALPHA_MIN ? 2 * (log(opacity / ALPHA_MIN) + EXTENT_SLACK) : (real8)0;
+}
+
+// A splat's ellipse as its ranges need it; all that is expensive is done once.
+typedef struct {
+    real x, y;                         // centre, px; what follows is relative to it
+    real half_height, inv_half_height; // 0 in the first: the splat is invisible
+    real at_right;                     // y of the rightmost point; the leftmost lies at -at_right
+    real slope, half_sq;               // a chord has its middle at slope y; at y = 0, the square of its half
+    real unused;
+} Ellipse;
+
+static inline Ellipse ellipse_of(real2 centre, real3 conic, real r2, real2 extent) {
+    Ellipse e = {centre.x, centre.y, 0, 0, 0, 0, 0, 0};
+    if (extent.x > 0) {
+        e.half_height = extent.y;
+        e.inv_half_height = 1 / extent.y;
+        e.at_right = -conic.y / conic.z * extent.x;
+        e.slope = -conic.y / conic.x;
+        e.half_sq = r2 / conic.x;
+    }
+    return e;
+}
+
+// Exact range x_min <= x <= x_max over the part of the ellipse with lo <= y <= hi, for eight bands; a lane of the result
+// is true where the ellipse meets the band, and elsewhere its range means nothing. The leftmost and rightmost points
+// lie at y = -+at_right; within the band an extreme is attained there or at the nearer border (Hanson et al. 2024,
+// "Speedy-Splat", AccuTile). With half_height^2 = r2 a/(a c - b^2) the determinant of the conic, which cancels for
+// needles, is not needed. Products that are added stand as fma: nothing is left for a compiler to contract in one
+// place and not in another, so that the same call gives the same bits wherever it is inlined.
+static inline mask8 ellipse_ranges8(const Ellipse *e, real8 lo, real8 hi, real8 *x_min, real8 *x_max) {
+    const real8 bottom = -e->half_height, top = e->half_height, zero = 0;
+    lo = GREATER(lo, bottom);
+    hi = LESSER(hi, top);
+    real8 left = -e->at_right, right = e->at_right;
+    left = GREATER(left, lo);
+    left = LESSER(left, hi);
+    right = GREATER(right, lo);
+    right = LESSER(right, hi);
+    const real8 t_left = left * e->inv_half_height, t_right = right * e->inv_half_height;
+    const real8 rest_left = fma(-t_left, t_left, (real8)1), rest_right = fma(-t_right, t_right, (real8)1);
+    *x_min = fma((real8)e->slope, left, -sqrt(e->half_sq * GREATER(rest_left, zero)));
+    *x_max = fma((real8)e->slope, right, sqrt(e->half_sq * GREATER(rest_right, zero)));
+    return lo <= hi;
 }
 
 // Indices [first, last] of the pixels in [0, size) whose centres lie in [lo, hi]; first > last: none.
@@ -35,6 +69,20 @@ static inline int2 pixels_between(real lo, real hi, int size) {
     const int first = (int)ceil(clamp(lo - (real)0.5, (real)0, (real)size));
     const int last = (int)floor(clamp(hi - (real)0.5, (real)-1, (real)(size - 1)));
     return (int2)(first, last);
+}
+
+// The same for eight intervals, without a call to ceil or floor.
+static inline void pixels_between8(real8 lo, real8 hi, int size, int8 *first, int8 *last) {
+    const real8 zero = 0, end = size;
+    lo -= (real)0.5;
+    hi -= (real)0.5;
+    lo = CLAMP(lo, zero, end);
+    hi = CLAMP(hi, zero - 1, end - 1);
+    // Truncated, then put right: a vector's comparison is -1 where it is true.
+    *first = convert_int8(lo);
+    *first -= convert_int8(CONVERT_REAL8(*first) < lo);
+    *last = convert_int8(hi);
+    *last += convert_int8(CONVERT_REAL8(*last) > hi);
 }
 
 #endif

@@ -9,15 +9,20 @@
 //   sort_count    each work-item counts the digits of its run in local memory; the block's totals go to
 //                 histogram[digit][g]
 //   (stage scan)  turns the histogram, digit-major, into the position of each block's first key of each digit
-//   sort_scatter  counts again, turns the counts of the runs into positions, and writes keys and values in order
+//   sort_scatter  counts again if there are several runs, turns the counts into positions, and writes keys and
+//                 values in order
 // With GROUP = 1 a block is a sequential counting sort, which is what a CPU core does best; on a GPU a block
 // is a work-group. Runs are in the order of work-items, blocks in the order of groups: stable.
 //
 // Bitonic sort of up to BITONIC keys by one work-group in local memory (Batcher 1968), for short lists. It is
 // not stable by itself: the comparison of (key, position) makes it so.
 //
-// Buffers: keys_in[n], values_in[n] (or their positions where first_pass is 1), keys_out[n], values_out[n],
-//          histogram[2^DIGIT_BITS, groups], offsets[2^DIGIT_BITS * groups + 1] its exclusive scan.
+// Segments of an array are sorted by a work-group each, short ones by the bitonic sort, longer ones by passes as above
+// within the work-group: sort_short_segments, sort_long_segments. Each leaves the other's segments alone.
+//
+// Buffers: keys_in[n], values_in[n] (not read where use_positions is 1: the positions 0 to n - 1 instead),
+//          keys_out[n], values_out[n], histogram[2^DIGIT_BITS, groups], offsets[2^DIGIT_BITS * groups + 1] its
+//          exclusive scan; ranges[segments,2], begin and end of each.
 // -DKEY_BITS=32|64   width of a key
 // -DDIGIT_BITS       bits per pass, 1 to 16
 // -DGROUP            work-group size of the radix kernels, at least 1
@@ -83,11 +88,16 @@ __kernel void sort_count(const uint n, const uint groups, const uint shift, cons
     }
 }
 
-__kernel void sort_scatter(const uint n, const uint groups, const uint shift, const uint first_pass,
+__kernel void sort_scatter(const uint n, const uint groups, const uint shift, const uint use_positions,
                            const __global sort_key *keys_in, const __global uint *values_in,
                            const __global uint *offsets, __global sort_key *keys_out, __global uint *values_out) {
     __local uint positions[DIGITS * GROUP];
+#if GROUP > 1 // else the offsets of the block are those of its only run
     count_digits(n, groups, shift, keys_in, positions);
+#else
+    for (uint d = 0; d < DIGITS; ++d)
+        positions[d] = 0;
+#endif
     for (uint d = get_local_id(0); d < DIGITS; d += GROUP) {
         uint position = offsets[d * groups + get_group_id(0)];
         for (uint lane = 0; lane < GROUP; ++lane) {
@@ -103,23 +113,15 @@ __kernel void sort_scatter(const uint n, const uint groups, const uint shift, co
         const sort_key key = keys_in[i];
         const uint position = positions[digit_of(key, shift) * GROUP + lane]++;
         keys_out[position] = key;
-        values_out[position] = first_pass ? i : values_in[i];
+        values_out[position] = use_positions ? i : values_in[i];
     }
 }
 
-__kernel void sort_bitonic(const uint n, const __global sort_key *keys_in, __global sort_key *keys_out,
-                           __global uint *values_out) {
-    __local sort_key keys[BITONIC];
-    __local uint values[BITONIC];
-    for (uint i = get_local_id(0); i < BITONIC; i += BITONIC_GROUP) {
-        // Padding sorts last: no key is larger, and its position breaks the tie with a largest key.
-        keys[i] = i < n ? keys_in[i] : KEY_MAX;
-        values[i] = i;
-    }
-    barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint block = 2; block <= BITONIC; block *= 2) {
+// Sorts `size` pairs of local memory by (key, value), size a power of two; ends with a barrier.
+static inline void bitonic(uint size, __local sort_key *keys, __local uint *values) {
+    for (uint block = 2; block <= size; block *= 2) {
         for (uint stride = block / 2; stride > 0; stride /= 2) {
-            for (uint pair = get_local_id(0); pair < BITONIC / 2; pair += BITONIC_GROUP) {
+            for (uint pair = get_local_id(0); pair < size / 2; pair += BITONIC_GROUP) {
                 const uint low = 2 * stride * (pair / stride) + pair % stride, high = low + stride;
                 const bool ascending = (low & block) == 0;
                 const sort_key a = keys[low], b = keys[high];
@@ -135,8 +137,94 @@ __kernel void sort_bitonic(const uint n, const __global sort_key *keys_in, __glo
             barrier(CLK_LOCAL_MEM_FENCE);
         }
     }
+}
+
+// Loads n <= size keys and their positions; ends with a barrier.
+static inline void bitonic_load(uint n, uint size, const __global sort_key *keys_in, __local sort_key *keys,
+                                __local uint *values) {
+    for (uint i = get_local_id(0); i < size; i += BITONIC_GROUP) {
+        // Padding sorts last: no key is larger, and its position breaks the tie with a largest key.
+        keys[i] = i < n ? keys_in[i] : KEY_MAX;
+        values[i] = i;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+}
+
+__kernel void sort_bitonic(const uint n, const uint use_positions, const __global sort_key *keys_in,
+                           const __global uint *values_in, __global sort_key *keys_out, __global uint *values_out) {
+    __local sort_key keys[BITONIC];
+    __local uint values[BITONIC];
+    bitonic_load(n, BITONIC, keys_in, keys, values);
+    bitonic(BITONIC, keys, values);
     for (uint i = get_local_id(0); i < n; i += BITONIC_GROUP) {
         keys_out[i] = keys[i];
-        values_out[i] = values[i];
+        values_out[i] = use_positions ? values[i] : values_in[values[i]];
+    }
+}
+
+__kernel void sort_short_segments(const uint use_positions, const __global uint *ranges,
+                                  const __global sort_key *keys_in, const __global uint *values_in,
+                                  __global uint *values_out) {
+    __local sort_key keys[BITONIC];
+    __local uint values[BITONIC];
+    const uint begin = ranges[2 * get_group_id(0)], length = ranges[2 * get_group_id(0) + 1] - begin;
+    const uint n = length <= BITONIC ? length : 0; // longer: not for this kernel
+    uint size = 1;
+    while (size < n)
+        size *= 2;
+    bitonic_load(n, size, keys_in + begin, keys, values);
+    bitonic(size, keys, values);
+    for (uint i = get_local_id(0); i < n; i += BITONIC_GROUP) {
+        const uint from = begin + values[i];
+        values_out[begin + i] = use_positions ? from : values_in[from];
+    }
+}
+
+// Passes over one segment, between the outputs and the spare arrays so that the last one ends in the outputs.
+__kernel void sort_long_segments(const uint use_positions, const uint bits, const __global uint *ranges,
+                                 const __global sort_key *keys_in, const __global uint *values_in,
+                                 __global sort_key *keys_out, __global uint *values_out,
+                                 __global sort_key *spare_keys, __global uint *spare_values) {
+    __local uint counts[DIGITS * GROUP];
+    __local uint totals[GROUP];
+    const uint lane = get_local_id(0);
+    const uint begin = ranges[2 * get_group_id(0)], length = ranges[2 * get_group_id(0) + 1] - begin;
+    const uint passes = length > BITONIC ? (bits + DIGIT_BITS - 1) / DIGIT_BITS : 0;
+    const uint run = (length + GROUP - 1) / GROUP;
+    const uint from = begin + min(length, lane * run), to = begin + min(length, lane * run + run);
+    for (uint pass = 0; pass < passes; ++pass) {
+        const bool last = (passes - pass) % 2;
+        const __global sort_key *keys = pass == 0 ? keys_in : last ? spare_keys : keys_out;
+        const __global uint *values = pass == 0 ? values_in : last ? spare_values : values_out;
+        __global sort_key *new_keys = last ? keys_out : spare_keys;
+        __global uint *new_values = last ? values_out : spare_values;
+        const uint shift = pass * DIGIT_BITS;
+        for (uint d = 0; d < DIGITS; ++d)
+            counts[d * GROUP + lane] = 0;
+        for (uint i = from; i < to; ++i)
+            ++counts[digit_of(keys[i], shift) * GROUP + lane];
+        barrier(CLK_LOCAL_MEM_FENCE);
+        // Counts, digit by digit and lane by lane, become positions: each lane takes DIGITS of them.
+        uint total = 0;
+        for (uint k = lane * DIGITS; k < (lane + 1) * DIGITS; ++k)
+            total += counts[k];
+        totals[lane] = total;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        uint position = begin;
+        for (uint left = 0; left < lane; ++left)
+            position += totals[left];
+        for (uint k = lane * DIGITS; k < (lane + 1) * DIGITS; ++k) {
+            const uint count = counts[k];
+            counts[k] = position;
+            position += count;
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (uint i = from; i < to; ++i) {
+            const sort_key key = keys[i];
+            const uint at = counts[digit_of(key, shift) * GROUP + lane]++;
+            new_keys[at] = key;
+            new_values[at] = pass == 0 && use_positions ? i : values[i];
+        }
+        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
     }
 }

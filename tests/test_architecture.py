@@ -136,7 +136,7 @@ def test_no_path_of_a_machine():
 # What each file's header documents, with values it allows.
 DEFINES = {
     "adam": {},
-    "bin": {"TILE": 16},
+    "bin": {"TILE": 16, "GRADIENTS": 1},
     "composite_cpu": {"TILE": 8, "CHANNELS": 1},
     "composite_gpu": {"TILE": 8, "CHANNELS": 1, "BATCH": 16},
     "count": {"TILE": 16},
@@ -151,6 +151,7 @@ DEFINES = {
 }
 FORBIDDEN = [
     ("bin", "TILE", 0),
+    ("bin", "GRADIENTS", 2),
     ("composite_cpu", "TILE", 12),
     ("composite_cpu", "CHANNELS", 0),
     ("composite_gpu", "TILE", 32),

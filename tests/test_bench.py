@@ -263,7 +263,7 @@ class TestReport:
         overview = cells["200-56x24"]
         assert float(overview[1]) == pytest.approx(workload["counts"]["pairs_accepted"] / (56 * 24), abs=0.051)
         assert float(overview[7]) == pytest.approx(workload["step_over_compositing"], abs=0.0051)
-        assert "- bin_count" in cells and "- project_fwd" not in cells
+        assert "- bin_prepare" in cells and "- project_fwd" not in cells
 
     def test_the_chart_shows_every_stage_of_every_workload(self, results):
         tiny = results["workloads"][0]

@@ -1,14 +1,19 @@
 """Stage bin: the lists of the twin to the entry, and by brute force neither a pixel missing nor a tile too many."""
 
+import functools
+
 import numpy as np
 import pytest
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MIN, EXTENT_SLACK
-from clsplat.errors import DeviceError
+from clsplat.device import Device
+from clsplat.errors import DeviceError, InputError
+from clsplat.ops.sort import BITONIC_MAX, CPU_SHORT_SEGMENT
 from clsplat.stages import Bins, Splats
 from clsplat.testing import synthetic_scene
 
+SCHEMES = pytest.mark.parametrize("scheme", ["global", "per_tile"])
 TILE_SIZES = pytest.mark.parametrize("tile_size", [8, 16])
 
 
@@ -26,9 +31,15 @@ def make_splats(n=600, seed=0, width=150, height=110, dtype=np.float32):
     return splats
 
 
-def bins_on(device, splats, width, height, tile_size):
-    bins = ops.bin_splats(device, Splats(*(device.upload("splats", a) for a in splats)), width, height, tile_size)
-    return Bins(*(a.get() for a in bins[:5]), *bins[5:])
+def bins_on(device, splats, width, height, tile_size, **options):
+    arrays = Splats(*(device.upload("splats", a) for a in splats))
+    bins = ops.bin_splats(device, arrays, width, height, tile_size, **options)
+    return Bins(*(None if a is None else a.get() for a in bins[:5]), *bins[5:])
+
+
+def assert_same(actual, expected, fields=Bins._fields[:5]):
+    for name in fields:
+        np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name), err_msg=name)
 
 
 def pairs(bins):
@@ -37,14 +48,67 @@ def pairs(bins):
     return set(zip(tile.tolist(), bins.gauss_ids.tolist(), strict=True))
 
 
+@SCHEMES
 @TILE_SIZES
-def test_double_matches_twin(device64, tile_size):
+def test_double_matches_twin(device64, tile_size, scheme):
     splats = make_splats()
-    actual = bins_on(device64, splats, 150, 110, tile_size)
-    expected = reference.bin_splats(splats, 150, 110, tile_size)
+    actual = bins_on(device64, splats, 150, 110, tile_size, scheme=scheme)
+    expected = reference.bin_splats(splats, 150, 110, tile_size, scheme=scheme)
     assert len(expected.gauss_ids) > 2000
-    for name in Bins._fields[:5]:
-        np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name), err_msg=name)
+    assert_same(actual, expected)
+
+
+@pytest.fixture(scope="module", params=["float32", "float64", "float32 as a GPU", "float64 as a GPU"])
+def each_device(request):
+    """Both precisions, each as the device is and launched like a GPU."""
+    device = Device(real=request.param.split()[0])
+    if "GPU" in request.param:
+        device.is_cpu = False  # shadows the cached property
+    return device
+
+
+@functools.cache
+def crowd():
+    """Splats by the thousand in some tiles of 16 pixels, single ones in others, none in most; many of equal depth."""
+    splats = make_splats(6000, 4, 60, 60)
+    splats.means2d[:, 0] += 300
+    splats.extents[::7] = 0
+    bins = reference.bin_splats(splats, 400, 64, 16)
+    lengths = np.diff(bins.tile_ranges)[:, 0]
+    assert lengths.max() > BITONIC_MAX and 0 in lengths and 0 < np.median(lengths[lengths > 0]) < BITONIC_MAX
+    assert ((lengths > 0) & (lengths <= CPU_SHORT_SEGMENT)).any()
+    assert len(np.unique(splats.depths)) < 0.8 * len(splats.depths)
+    return splats, bins
+
+
+def test_both_schemes_give_the_same_lists(each_device):
+    """To the bit, with and without what gradients need."""
+    splats, expected = crowd()
+    for_all = bins_on(each_device, splats, 400, 64, 16, scheme="global")
+    check_structure(for_all, splats)
+    per_tile = bins_on(each_device, splats, 400, 64, 16, scheme="per_tile")
+    check_structure(per_tile, splats, scheme="per_tile")
+    lists = ("gauss_ids", "tile_ranges")
+    assert_same(per_tile, for_all, lists)
+    for scheme in ("auto", "global", "per_tile"):
+        forward = bins_on(each_device, splats, 400, 64, 16, scheme=scheme, gradients=False)
+        assert forward.slots is None and forward.first_slots is None
+        assert_same(forward, for_all, lists)
+    if each_device.real == np.float64:
+        assert_same(for_all, expected)
+        assert_same(per_tile, reference.bin_splats(splats, 400, 64, 16, scheme="per_tile"))
+
+
+def test_twin_without_gradients():
+    splats = make_splats(50)
+    bins = reference.bin_splats(splats, 150, 110, 16, gradients=False)
+    assert bins.slots is None and bins.first_slots is None
+    assert_same(bins, reference.bin_splats(splats, 150, 110, 16), ("gauss_ids", "tile_ranges", "order"))
+
+
+def test_an_unknown_scheme(device):
+    with pytest.raises(InputError, match="scheme: expected auto, global or per_tile, found 'tiles'"):
+        bins_on(device, make_splats(50), 150, 110, 16, scheme="tiles")
 
 
 @TILE_SIZES
@@ -67,14 +131,14 @@ def test_float_matches_twin_but_for_the_border(device, tile_size):
     check_structure(actual, splats)
 
 
-def check_structure(bins, splats):
+def check_structure(bins, splats, scheme="global"):
     """What the containers promise of each other."""
     visible = splats.extents[:, 0] > 0
-    np.testing.assert_array_equal(np.sort(bins.order), np.arange(len(visible)))
-    np.testing.assert_array_equal(
-        bins.order[: visible.sum()],
-        np.argsort(np.where(visible, splats.depths, np.inf), kind="stable")[: visible.sum()],
-    )
+    by_depth = np.argsort(np.where(visible, splats.depths, np.inf), kind="stable")
+    if scheme == "global":
+        np.testing.assert_array_equal(bins.order, by_depth)
+    else:
+        np.testing.assert_array_equal(bins.order, np.arange(len(visible)))
     m = len(bins.gauss_ids)
     assert bins.first_slots[-1] == m == bins.tile_ranges[-1, 1] and bins.tile_ranges[0, 0] == 0
     np.testing.assert_array_equal(bins.tile_ranges[1:, 0], bins.tile_ranges[:-1, 1])
@@ -83,7 +147,7 @@ def check_structure(bins, splats):
     owner = np.repeat(bins.order, np.diff(bins.first_slots.astype(np.int64)))
     np.testing.assert_array_equal(owner[bins.slots], bins.gauss_ids)
     rank = np.empty(len(visible), dtype=int)
-    rank[bins.order] = np.arange(len(visible))
+    rank[by_depth] = np.arange(len(visible))
     for begin, end in bins.tile_ranges:
         assert (np.diff(rank[bins.gauss_ids[begin:end]]) > 0).all(), "a tile's list is in depth order"
 
@@ -132,15 +196,16 @@ def test_image_sizes(device64, width, height):
     splats = make_splats(200, 2, 60, 60)
     splats = splats._replace(means2d=splats.means2d / 60 * [width, height])
     actual = bins_on(device64, splats, width, height, 16)
-    expected = reference.bin_splats(splats, width, height, 16)
-    for name in Bins._fields[:5]:
-        np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name), err_msg=name)
+    assert_same(actual, reference.bin_splats(splats, width, height, 16))
 
 
+@SCHEMES
 @pytest.mark.parametrize("n", [1, 5])
-def test_nothing_visible(any_device, n):
+def test_nothing_visible(each_device, n, scheme):
     splats = Splats(*(np.zeros(s) for s in ((n, 2), (n, 3), (n,), (n, 2), (n,), (n, 3))))
-    bins = bins_on(any_device, splats, 40, 20, 16)
+    forward = bins_on(each_device, splats, 40, 20, 16, scheme=scheme, gradients=False)
+    assert len(forward.gauss_ids) == 0 and not forward.tile_ranges.any()
+    bins = bins_on(each_device, splats, 40, 20, 16, scheme=scheme)
     assert len(bins.gauss_ids) == len(bins.slots) == 0
     np.testing.assert_array_equal(bins.tile_ranges, 0)
     np.testing.assert_array_equal(bins.first_slots, 0)

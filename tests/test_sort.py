@@ -5,7 +5,7 @@ import pytest
 
 from clsplat import ops, reference
 from clsplat.errors import InputError
-from clsplat.ops.sort import BITONIC_MAX
+from clsplat.ops.sort import BITONIC_MAX, CPU_SHORT_SEGMENT
 
 # Around runs of 16 keys, work-groups of 64, the bitonic sort's capacity, and blocks of 64 x 16 keys.
 SIZES = [1, 2, 15, 16, 17, 63, 64, 65, 1023, 1024, 1025, 4097, 100_000]
@@ -28,12 +28,17 @@ def keys_of(kind, n, bits, dtype):
 
 def check(device, keys, bits, method):
     array = device.upload("keys", keys, keys.dtype)
-    sorted_keys, order = (a.get() for a in ops.argsort(device, array, bits, method))
-    expected_keys, expected_order = reference.argsort(keys, bits)
-    assert sorted_keys.dtype == keys.dtype and order.dtype == np.uint32
-    np.testing.assert_array_equal(order, expected_order)
-    np.testing.assert_array_equal(sorted_keys, expected_keys)
+    payload = np.random.default_rng(1).integers(0, 2**32, len(keys), dtype=np.uint32)
+    on_device = device.upload("values", payload, np.uint32)
+    for values, values_on_device in ((None, None), (payload, on_device)):
+        result = ops.argsort(device, array, bits, method, values=values_on_device)
+        sorted_keys, order = (a.get() for a in result)
+        expected_keys, expected_order = reference.argsort(keys, bits, values=values)
+        assert sorted_keys.dtype == keys.dtype and order.dtype == np.uint32
+        np.testing.assert_array_equal(order, expected_order)
+        np.testing.assert_array_equal(sorted_keys, expected_keys)
     np.testing.assert_array_equal(array.get(), keys, err_msg="the keys were changed")
+    np.testing.assert_array_equal(on_device.get(), payload, err_msg="the values were changed")
 
 
 @pytest.mark.parametrize("kind", ["random", "few", "equal", "largest", "backwards"])
@@ -66,6 +71,36 @@ def test_few_bits(configured_device, bits):
     check(configured_device, keys_of("random", 3000, bits, np.uint32), bits, "radix")
 
 
+# Nothing, both sides of the longest segment that either device gives to the bitonic sort, and of runs per work-item.
+LENGTHS = [0, 1, 2, 3, CPU_SHORT_SEGMENT, CPU_SHORT_SEGMENT + 1, 0, 255, BITONIC_MAX, BITONIC_MAX + 1, 5000]
+
+
+@pytest.mark.parametrize("kind", ["random", "few", "equal", "largest", "backwards"])
+@pytest.mark.parametrize("bits", [1, 9, 31, 32, 63, 64])
+def test_segments(configured_device, bits, kind):
+    """In an order that is not that of memory, with entries before, between and after them that are no one's."""
+    rng = np.random.default_rng(bits)
+    lengths = rng.permutation(LENGTHS)
+    ends = np.cumsum(lengths + 5)
+    ranges = rng.permutation(np.stack([ends - lengths, ends], axis=1)).astype(np.uint32)
+    n = ends[-1] + 5
+    keys = keys_of(kind, n, bits, np.uint32 if bits <= 32 else np.uint64) & np.uint64(2**bits - 1)
+    keys = keys.astype(np.uint32 if bits <= 32 else np.uint64)
+    payload = rng.integers(0, 2**32, n, dtype=np.uint32)
+    arrays = [configured_device.upload("keys", a, a.dtype) for a in (keys, ranges, payload)]
+    inside = np.concatenate([np.arange(begin, end) for begin, end in ranges])
+    for values, values_on_device in ((None, None), (payload, arrays[2])):
+        order = ops.argsort_segments(configured_device, arrays[0], bits, arrays[1], values_on_device).get()
+        expected = reference.argsort_segments(keys, bits, ranges, values)
+        np.testing.assert_array_equal(order[inside], expected[inside])
+    for array, host in zip(arrays, (keys, ranges, payload), strict=True):
+        np.testing.assert_array_equal(array.get(), host, err_msg="an input was changed")
+
+
 def test_twin_is_numpy():
     keys = keys_of("few", 1000, 32, np.uint32)
     np.testing.assert_array_equal(reference.argsort(keys, 32)[1], np.argsort(keys, kind="stable"))
+    # By (segment, key) is the same as within segments.
+    ranges = np.array([[0, 400], [400, 400], [400, 1000]], np.uint32)
+    expected = np.lexsort([keys, np.arange(1000) >= 400])
+    np.testing.assert_array_equal(reference.argsort_segments(keys, 32, ranges), expected)

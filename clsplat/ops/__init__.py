@@ -6,11 +6,12 @@ from clsplat.ops.composite import composite_bwd, composite_fwd
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.project import project_bwd, project_fwd
 from clsplat.ops.scan import exclusive_scan
-from clsplat.ops.sort import argsort
+from clsplat.ops.sort import argsort, argsort_segments
 
 __all__ = [
     "adam_step",
     "argsort",
+    "argsort_segments",
     "bin_splats",
     "composite_bwd",
     "composite_fwd",

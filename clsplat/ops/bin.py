@@ -1,14 +1,29 @@
 """Launch of the stage bin (cl/bin.cl)."""
 
+from typing import Any
+
 import numpy as np
+from pyopencl.array import Array
 
 from clsplat.device import Device
-from clsplat.ops.scan import exclusive_scan
-from clsplat.ops.sort import argsort
+from clsplat.errors import InputError
+from clsplat.ops.scan import checked_total, queue_scan
+from clsplat.ops.sort import argsort, argsort_segments
 from clsplat.stages import Bins, Splats
 
+WHAT = "intersections of Gaussians and tiles"
 
-def bin_splats(device: Device, splats: Splats, width: int, height: int, tile_size: int) -> Bins:
+
+def bin_splats(
+    device: Device,
+    splats: Splats,
+    width: int,
+    height: int,
+    tile_size: int,
+    *,
+    gradients: bool = True,
+    scheme: str = "auto",
+) -> Bins:
     """Lists of splats per tile, by depth and then by index.
 
     Parameters
@@ -18,33 +33,111 @@ def bin_splats(device: Device, splats: Splats, width: int, height: int, tile_siz
         Image size in pixels.
     tile_size : int
         Edge of a tile in pixels.
+    gradients : bool
+        Whether `composite_bwd` will follow; without it first_slots and slots of the result are None.
+    scheme : {"auto", "global", "per_tile"}
+        Sort all splats by depth and distribute them to the tiles, or distribute them and sort each tile's list. The
+        lists are the same; order is by depth or by index.
 
     Raises
     ------
+    InputError
+        If there is no such scheme.
     DeviceError
         If the intersections do not fit the device.
     """
+    if scheme not in ("auto", "global", "per_tile"):
+        raise InputError(f"scheme: expected auto, global or per_tile, found {scheme!r}")
+    by_depth = scheme != "per_tile"
     n = splats.depths.shape[0]
-    defines = {"TILE": tile_size}
+    tile_count = -(-width // tile_size) * -(-height // tile_size)
+    defines = {"TILE": tile_size, "GRADIENTS": int(gradients)}
     # A double's sort key is 64 bits wide; the sign bit of a depth is never set, but that of LAST is.
     keys = device.empty("depth keys", n, np.uint32 if device.real == np.float32 else np.uint64)
-    device.launch("bin", "bin_keys", (n,), [n, splats.depths, splats.extents, keys], defines=defines)
-    _, order = argsort(device, keys, 8 * keys.dtype.itemsize)
+    bits = 8 * keys.dtype.itemsize
+    ellipses = device.empty("ellipses", (n, 8))
+    arguments = [n, splats.means2d, splats.conics, splats.depths, splats.extents, splats.opacities, keys, ellipses]
+    device.launch("bin", "bin_prepare", (-(-n // 8),), arguments, defines=defines)
+    if by_depth:
+        _, order = argsort(device, keys, bits)
+    else:
+        order = device.empty("order", n, np.uint32)
+        device.launch("bin", "bin_identity", (n,), [n, order], defines=defines)
 
-    geometry = [n, width, height, order, splats.means2d, splats.conics, splats.extents, splats.opacities]
-    counts = device.empty("tiles per Gaussian", n, np.uint32)
-    device.launch("bin", "bin_count", (n,), [*geometry, counts], defines=defines)
-    first_slots, m = exclusive_scan(device, counts, "intersections of Gaussians and tiles")
-
-    tile_count = -(-width // tile_size) * -(-height // tile_size)
+    geometry = [width, height, order, ellipses]
+    distribute = _counting_sort if device.is_cpu else _radix_sort
+    gauss_ids, slots, first_slots, tile_begins = distribute(device, n, tile_count, geometry, defines)
     tile_ranges = device.empty("tile ranges", (tile_count, 2), np.uint32)
-    # A buffer cannot be empty: where nothing is visible one unused entry stands in.
-    tiles = device.empty("tile keys", max(m, 1), np.uint32)
-    slot_gauss = device.empty("intersections", max(m, 1), np.uint32)
-    gauss_ids = device.empty("intersections", max(m, 1), np.uint32)
-    device.launch("bin", "bin_emit", (n,), [*geometry, first_slots, tiles, slot_gauss], defines=defines)
-    sorted_tiles, slots = argsort(device, tiles, tile_count.bit_length()) if m else (tiles, slot_gauss)
-    device.launch("bin", "bin_ranges", (tile_count,), [m, tile_count, sorted_tiles, tile_ranges], defines=defines)
+    device.launch("bin", "bin_ranges", (tile_count,), [tile_count, tile_begins, tile_ranges], defines=defines)
+    m = gauss_ids.shape[0]
+    if m and not by_depth:
+        list_keys = device.empty("list keys", m, keys.dtype)
+        device.launch("bin", "bin_list_keys", (m,), [m, gauss_ids, keys, list_keys], defines=defines)
+        if gradients:
+            permutation = argsort_segments(device, list_keys, bits - 1, tile_ranges)
+            gauss_ids, slots = (_gather(device, m, permutation, a, defines) for a in (gauss_ids, slots))
+        else:
+            gauss_ids = argsort_segments(device, list_keys, bits - 1, tile_ranges, gauss_ids)
+    bins = Bins(gauss_ids, tile_ranges, order, first_slots, slots, tile_size, width, height)
+    return bins if gradients else bins._replace(first_slots=None, slots=None)
+
+
+def _list(device: Device, m: int) -> Array:
+    """A list of m entries; a buffer cannot be empty: where nothing is visible one unused entry stands in."""
+    return device.empty("intersections", max(m, 1), np.uint32)[:m]
+
+
+def _gather(device: Device, m: int, permutation: Array, values: Array, defines: dict[str, Any]) -> Array:
+    result = _list(device, m)
+    device.launch("bin", "bin_gather", (m,), [m, permutation, values, result], defines=defines)
+    return result
+
+
+def _counting_sort(
+    device: Device, n: int, tile_count: int, geometry: list[Any], defines: dict[str, Any]
+) -> tuple[Array, Array, Array, Array]:
+    """gauss_ids, slots, first_slots and tile_begins: a core counts in tables of its own."""
+    runs = min(n, 4 * device.cl_device.max_compute_units)
+    head = [n, runs, tile_count, *geometry]
+    counters = device.empty("tile counters", (runs, tile_count), np.uint32)
+    # Where no gradients are asked for the kernels do not touch these.
+    counts = first_slots = slots = counters
+    if defines["GRADIENTS"]:
+        counts = device.empty("tiles per Gaussian", n, np.uint32)
+    device.launch("bin", "bin_histogram", (runs,), [*head, counters, counts], defines=defines, group=(1,))
+    totals = device.empty("tile totals", tile_count, np.uint32)
+    device.launch("bin", "bin_totals", (tile_count,), [runs, tile_count, counters, totals], defines=defines)
+    tile_begins, partial = queue_scan(device, totals)
+    if defines["GRADIENTS"]:
+        first_slots, _ = queue_scan(device, counts)
+    m = checked_total(partial, WHAT)
+    gauss_ids = _list(device, m)
+    if defines["GRADIENTS"]:
+        slots = _list(device, m)
     if m:
-        device.launch("bin", "bin_gather", (m,), [m, slots, slot_gauss, gauss_ids], defines=defines)
-    return Bins(gauss_ids[:m], tile_ranges, order, first_slots, slots[:m], tile_size, width, height)
+        arguments = [*head, counters, tile_begins, first_slots, gauss_ids, slots]
+        device.launch("bin", "bin_scatter", (runs,), arguments, defines=defines, group=(1,))
+    return gauss_ids, slots, first_slots, tile_begins
+
+
+def _radix_sort(
+    device: Device, n: int, tile_count: int, geometry: list[Any], defines: dict[str, Any]
+) -> tuple[Array, Array, Array, Array]:
+    """The same by a radix sort of the tile numbers, which keeps all of a GPU busy."""
+    counts = device.empty("tiles per Gaussian", n, np.uint32)
+    device.launch("bin", "bin_count", (n,), [n, *geometry, counts], defines=defines)
+    first_slots, partial = queue_scan(device, counts)
+    m = checked_total(partial, WHAT)
+    tiles, slot_gauss = _list(device, m), _list(device, m)
+    tile_begins = device.empty("tile begins", tile_count + 1, np.uint32)
+    gauss_ids = slots = slot_gauss
+    if m:
+        arguments = [n, *geometry, first_slots, tiles, slot_gauss]
+        device.launch("bin", "bin_emit", (n,), arguments, defines=defines)
+        if defines["GRADIENTS"]:
+            tiles, slots = argsort(device, tiles, tile_count.bit_length())
+            gauss_ids = _gather(device, m, slots, slot_gauss, defines)
+        else:
+            tiles, gauss_ids = argsort(device, tiles, tile_count.bit_length(), values=slot_gauss)
+    device.launch("bin", "bin_bisect", (tile_count + 1,), [m, tile_count, tiles, tile_begins], defines=defines)
+    return gauss_ids, slots, first_slots, tile_begins

@@ -29,12 +29,17 @@ def exclusive_scan(device: Device, values: Array, what: str = "scan") -> tuple[A
         If the total exceeds 2^32 - 1.
     """
     sums, partial = queue_scan(device, values)
+    return sums, checked_total(partial, what)
+
+
+def checked_total(partial: Array, what: str) -> int:
+    """The total of a `queue_scan`, read back from the device; errors as of `exclusive_scan`."""
     total = int(partial[-1].get())
     if total >= 2**32:
         raise DeviceError(
             f"{what}: expected a total below 2^32, found {total}; use fewer Gaussians or a smaller image"
         )
-    return sums, total
+    return total
 
 
 def queue_scan(device: Device, values: Array) -> tuple[Array, Array]:

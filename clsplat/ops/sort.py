@@ -1,5 +1,7 @@
 """Launch of the stage sort (cl/sort.cl)."""
 
+from typing import Any
+
 import numpy as np
 from pyopencl.array import Array
 
@@ -11,8 +13,24 @@ from clsplat.ops.scan import queue_scan
 # embedded devices.
 BITONIC_MAX = 1024
 
+# Longest segment for which a core takes the bitonic sort.
+CPU_SHORT_SEGMENT = 32
 
-def argsort(device: Device, keys: Array, bits: int, method: str = "auto") -> tuple[Array, Array]:
+
+def _defines(device: Device, keys: Array, **changes: Any) -> dict[str, Any]:
+    return {
+        "KEY_BITS": 8 * keys.dtype.itemsize,
+        # A core counts 2048 digits in its L1 cache; a GPU's work-item keeps 16 counters in local memory.
+        "DIGIT_BITS": 11 if device.is_cpu else 4,
+        "GROUP": 1 if device.is_cpu else 64,
+        "BITONIC": BITONIC_MAX,
+        "BITONIC_GROUP": 64,
+    } | changes
+
+
+def argsort(
+    device: Device, keys: Array, bits: int, method: str = "auto", *, values: Array | None = None
+) -> tuple[Array, Array]:
     """Stable argsort of unsigned keys.
 
     Parameters
@@ -23,12 +41,14 @@ def argsort(device: Device, keys: Array, bits: int, method: str = "auto") -> tup
         Number of low bits that may be set; fewer take fewer passes.
     method : {"auto", "radix", "bitonic"}
         auto takes bitonic for at most `BITONIC_MAX` keys.
+    values : (n,) uint32, optional
+        Permuted instead of the positions 0 to n - 1. Left unchanged.
 
     Returns
     -------
     sorted_keys : (n,) of the keys' type
     order : (n,) uint32
-        sorted_keys = keys[order]; equal keys keep their order.
+        sorted_keys = keys[order]; equal keys keep their order. With `values`: values[order].
 
     Raises
     ------
@@ -38,27 +58,21 @@ def argsort(device: Device, keys: Array, bits: int, method: str = "auto") -> tup
     n = keys.shape[0]
     if method == "bitonic" and n > BITONIC_MAX:
         raise InputError(f"keys: expected at most {BITONIC_MAX} for a bitonic sort, found {n}; use the radix sort")
-    defines = {
-        "KEY_BITS": 8 * keys.dtype.itemsize,
-        # A core counts 2048 digits in its L1 cache; a GPU's work-item keeps 16 counters in local memory.
-        "DIGIT_BITS": 11 if device.is_cpu else 4,
-        "GROUP": 1 if device.is_cpu else 64,
-        "BITONIC": BITONIC_MAX,
-        "BITONIC_GROUP": 64,
-    }
+    defines = _defines(device, keys)
+    positions = int(values is None)
     if method == "bitonic" or (method == "auto" and n <= BITONIC_MAX):
         sorted_keys = device.empty("sort keys", n, keys.dtype)
         order = device.empty("sort order", n, np.uint32)
-        device.launch("sort", "sort_bitonic", (64,), [n, keys, sorted_keys, order], defines=defines, group=(64,))
+        arguments = [n, positions, keys, order if values is None else values, sorted_keys, order]
+        device.launch("sort", "sort_bitonic", (64,), arguments, defines=defines, group=(64,))
         return sorted_keys, order
 
     group, digit_bits = defines["GROUP"], defines["DIGIT_BITS"]
     # Blocks: a few per core, or runs of about 16 keys per work-item.
     groups = 4 * device.cl_device.max_compute_units if device.is_cpu else -(-n // (group * 16))
     histogram = device.empty("sort histogram", groups << digit_bits, np.uint32)
-    values = device.empty("sort order", n, np.uint32)
+    order = device.empty("sort order", n, np.uint32) if values is None else values
     for shift in range(0, max(bits, 1), digit_bits):
-        first = shift == 0
         device.launch(
             "sort",
             "sort_count",
@@ -69,14 +83,64 @@ def argsort(device: Device, keys: Array, bits: int, method: str = "auto") -> tup
         )
         offsets, _ = queue_scan(device, histogram)
         keys_out = device.empty("sort keys", n, keys.dtype)
-        values_out = device.empty("sort order", n, np.uint32)
+        order_out = device.empty("sort order", n, np.uint32)
         device.launch(
             "sort",
             "sort_scatter",
             (groups * group,),
-            [n, groups, shift, int(first), keys, values, offsets, keys_out, values_out],
+            [n, groups, shift, positions, keys, order, offsets, keys_out, order_out],
             defines=defines,
             group=(group,),
         )
-        keys, values = keys_out, values_out
-    return keys, values
+        keys, order, positions = keys_out, order_out, 0
+    return keys, order
+
+
+def argsort_segments(device: Device, keys: Array, bits: int, ranges: Array, values: Array | None = None) -> Array:
+    """Stable argsort of unsigned keys within segments of an array.
+
+    Parameters
+    ----------
+    keys : (n,) uint32 or uint64, n >= 1
+        Left unchanged.
+    bits : int
+        Number of low bits that may be set; fewer take fewer passes.
+    ranges : (s, 2) uint32
+        Begin and end of each segment; they do not overlap.
+    values : (n,) uint32, optional
+        Permuted instead of the positions 0 to n - 1. Left unchanged.
+
+    Returns
+    -------
+    order : (n,) uint32
+        keys[order] is sorted within each segment; equal keys keep their order. With `values`: values[order].
+        Undefined outside all segments.
+    """
+    n, segments = keys.shape[0], ranges.shape[0]
+    defines = _defines(device, keys)
+    if device.is_cpu:
+        defines |= {"DIGIT_BITS": 8, "BITONIC": CPU_SHORT_SEGMENT, "BITONIC_GROUP": 1}
+    positions = int(values is None)
+    order = device.empty("sort order", n, np.uint32)
+    values_in = order if values is None else values
+    group = defines["BITONIC_GROUP"]
+    device.launch(
+        "sort",
+        "sort_short_segments",
+        (segments * group,),
+        [positions, ranges, keys, values_in, order],
+        defines=defines,
+        group=(group,),
+    )
+    group = defines["GROUP"]
+    sorted_keys, spare_keys = (device.empty("sort keys", n, keys.dtype) for _ in range(2))
+    spare = device.empty("sort order", n, np.uint32)
+    device.launch(
+        "sort",
+        "sort_long_segments",
+        (segments * group,),
+        [positions, max(bits, 1), ranges, keys, values_in, sorted_keys, order, spare_keys, spare],
+        defines=defines,
+        group=(group,),
+    )
+    return order

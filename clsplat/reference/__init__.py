@@ -6,11 +6,12 @@ from clsplat.reference.composite import composite_bwd, composite_fwd
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.project import project_bwd, project_fwd
 from clsplat.reference.scan import exclusive_scan
-from clsplat.reference.sort import argsort
+from clsplat.reference.sort import argsort, argsort_segments
 
 __all__ = [
     "adam_step",
     "argsort",
+    "argsort_segments",
     "bin_splats",
     "composite_bwd",
     "composite_fwd",

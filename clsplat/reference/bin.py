@@ -6,15 +6,25 @@ from clsplat.constants import ALPHA_MIN, EXTENT_SLACK
 from clsplat.stages import Bins, Splats
 
 
-def bin_splats(splats: Splats, width: int, height: int, tile_size: int) -> Bins:
-    """Lists of splats per tile; arguments and result as `clsplat.ops.bin_splats`.
+def bin_splats(
+    splats: Splats,
+    width: int,
+    height: int,
+    tile_size: int,
+    *,
+    gradients: bool = True,
+    scheme: str = "auto",
+) -> Bins:
+    """Lists of splats per tile; arguments and result as `clsplat.ops.bin_splats`; auto is global.
 
     A splat belongs to a tile if the ellipse {alpha >= ALPHA_MIN}, cut at the first and the last row of pixel centres
     of the tile, spans a pixel centre of one of the tile's columns.
     """
     tiles_x, tiles_y = -(-width // tile_size), -(-height // tile_size)
     visible = splats.extents[:, 0] > 0
-    order = np.argsort(np.where(visible, splats.depths, np.inf), kind="stable").astype(np.uint32)
+    by_depth = np.argsort(np.where(visible, splats.depths, np.inf), kind="stable").astype(np.uint32)
+    order = np.arange(len(visible), dtype=np.uint32) if scheme == "per_tile" else by_depth
+    rank = np.argsort(by_depth)
     tiles: list[int] = []
     slot_gauss: list[int] = []
     first_slots = [0]
@@ -24,12 +34,13 @@ def bin_splats(splats: Splats, width: int, height: int, tile_size: int) -> Bins:
             tiles += [ty * tiles_x + tx for ty, tx in cells]
             slot_gauss += [g] * len(cells)
         first_slots.append(len(tiles))
-    slots = np.argsort(np.array(tiles, dtype=np.uint32), kind="stable").astype(np.uint32)
-    sorted_tiles = np.array(tiles, dtype=np.uint32)[slots]
+    gauss, tile = (np.array(a, dtype=np.uint32) for a in (slot_gauss, tiles))
+    slots = np.lexsort((rank[gauss], tile)).astype(np.uint32)
+    sorted_tiles = tile[slots]
     edges = np.searchsorted(sorted_tiles, np.arange(tiles_x * tiles_y + 1))
     ranges = np.stack([edges[:-1], edges[1:]], axis=1).astype(np.uint32)
-    gauss_ids = np.array(slot_gauss, dtype=np.uint32)[slots]
-    return Bins(gauss_ids, ranges, order, np.array(first_slots, np.uint32), slots, tile_size, width, height)
+    first, slot = (np.array(first_slots, np.uint32), slots) if gradients else (None, None)
+    return Bins(gauss[slots], ranges, order, first, slot, tile_size, width, height)
 
 
 def _tiles_of(splats: Splats, g: int, width: int, height: int, tile_size: int) -> list[tuple[int, int]]:
