@@ -51,6 +51,15 @@ typedef int16 mask16;
 #define CLAMP(x, lo, hi) ((x) < (lo) ? (lo) : (x) > (hi) ? (hi) : (x))
 #define ABSOLUTE(x)      ((x) < 0 ? -(x) : (x))
 
+static inline real2 load2(const __global real *x, size_t i) {
+    return (real2)(x[2 * i], x[2 * i + 1]);
+}
+
+static inline void store2(__global real *x, size_t i, real2 value) {
+    x[2 * i] = value.x;
+    x[2 * i + 1] = value.y;
+}
+
 static inline real3 load3(const __global real *x, size_t i) {
     return (real3)(x[3 * i], x[3 * i + 1], x[3 * i + 2]);
 }
@@ -59,6 +68,17 @@ static inline void store3(__global real *x, size_t i, real3 value) {
     x[3 * i] = value.x;
     x[3 * i + 1] = value.y;
     x[3 * i + 2] = value.z;
+}
+
+static inline real4 load4(const __global real *x, size_t i) {
+    return (real4)(x[4 * i], x[4 * i + 1], x[4 * i + 2], x[4 * i + 3]);
+}
+
+static inline void store4(__global real *x, size_t i, real4 value) {
+    x[4 * i] = value.x;
+    x[4 * i + 1] = value.y;
+    x[4 * i + 2] = value.z;
+    x[4 * i + 3] = value.w;
 }
 
 #endif

@@ -18,8 +18,6 @@
 #error "-DCHANNELS must give the number of colour channels, 1 or more"
 #endif
 
-#define LOG2_E 1.4426950408889634
-
 // A splat: t = level + a dx^2 + b dx dy + c dy^2. Padded to whole quarters of a cache line of 64 bytes.
 #define SPLAT_REALS ((6 + CHANNELS + 3) / 4 * 4)
 typedef struct {

@@ -36,6 +36,7 @@
 #define REALV real16
 #define MASKV mask16
 #include "composite.h"
+#include "power.h"
 
 // Pixels of a block, in lanes: offsets from its centre, and their products.
 #define U  ((real16)(-1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5))
@@ -59,13 +60,6 @@
 #define BLOCK_Y ((real4)(2, 2, 6, 6))
 #endif
 #define BLOCKS_IN_ROW (TILE / 4)
-
-static inline void store4(__global real *p, real4 v) {
-    p[0] = v.x;
-    p[1] = v.y;
-    p[2] = v.z;
-    p[3] = v.w;
-}
 
 static inline real4 quarters(real16 v) {
     const real8 half_sums = v.lo + v.hi;
@@ -136,23 +130,7 @@ static inline void splat_over_tile(int x0, int y0, Over *over) {
     over->blocks = bits_of(GREATER(on_column, on_row) >= (BLOCKV)(LOG2_ALPHA_MIN - LOG2_E * EXTENT_SLACK));
 }
 
-// 2^t, for t that are seen. In single precision 2^(t - round(t)) by the polynomial of degree 5 with the least largest
-// relative error, 7.5e-8, and the rest through the bits of the exponent: half the time of exp2.
-static inline REALV power_of_two(REALV t) {
-#ifdef USE_DOUBLE
-    return exp2(t);
-#else
-    const real16 shifted = t + (real16)12582912; // 1.5 * 2^23: the sum ends with the bits of round(t)
-    const real16 f = t - (shifted - (real16)12582912);
-    real16 p = (real16)1.3276472e-3;
-    p = p * f + (real16)9.6755413e-3;
-    p = p * f + (real16)5.5507133e-2;
-    p = p * f + (real16)2.4022120e-1;
-    p = p * f + (real16)6.9314697e-1;
-    p = p * f + 1;
-    return as_float16(as_int16(p) + (as_int16(shifted) << 23));
-#endif
-}
+DEFINE_POWER(16)
 
 // t of the splat in block b; `curved` is the part that all blocks share.
 static inline REALV block_exponent(const Over *over, int b, REALV curved) {
@@ -228,7 +206,7 @@ __kernel void composite_fwd(const int width, const int height, const __global Sp
             const REALV curved = curvature(&over->splat);
             for (uint blocks = unfinished & over->blocks; blocks;) {
                 const int b = take_block(&blocks);
-                const REALV t = block_exponent(over, b, curved), alpha = power_of_two(t);
+                const REALV t = block_exponent(over, b, curved), alpha = power16(t);
                 MASKV drawn = splat_seen(&over->splat, t);
                 const REALV weight = splat_over(alpha, &drawn, &transmittance[b]);
                 _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) sums[b][k] += weight * over->splat.color[k];
@@ -294,7 +272,7 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) v_colors[k] = 0;
             for (uint blocks = unfinished & over->blocks; blocks;) {
                 const int b = take_block(&blocks);
-                const REALV t = block_exponent(over, b, curved), alpha = power_of_two(t);
+                const REALV t = block_exponent(over, b, curved), alpha = power16(t);
                 MASKV drawn = splat_seen(s, t);
                 const REALV weight = splat_over(alpha, &drawn, &transmittance[b]);
                 REALV u = 0;
@@ -316,9 +294,9 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
             const REALV sx = mx + U * m, sy = my + V * m;
             const REALV sxx = mxx + U * (mx + sx), sxy = mxy + V * mx + U * sy, syy = myy + V * (my + sy);
             __global real *record = records + (size_t)RECORD * slots[first + j];
-            store4(record, sum_lanes4(m, sx, sy, sxx));
+            store4(record, 0, sum_lanes4(m, sx, sy, sxx));
 #if CHANNELS == 3
-            store4(record + 4, sum_lanes4(sxy, syy, v_colors[0], v_colors[1]));
+            store4(record + 4, 0, sum_lanes4(sxy, syy, v_colors[0], v_colors[1]));
             record[8] = sum_lanes(v_colors[2]);
 #else
             record[4] = sum_lanes(sxy);

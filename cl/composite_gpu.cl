@@ -39,6 +39,7 @@
 #define REALV real
 #define MASKV int
 #include "composite.h"
+#include "power.h"
 
 #define PIXELS (TILE * TILE)
 

@@ -22,8 +22,7 @@ __kernel void composite_pack(const uint n, const __global real *means2d, const _
     s.a = (real)(-0.5 * LOG2_E) * conic.x;
     s.b = (real)-LOG2_E * conic.y;
     s.c = (real)(-0.5 * LOG2_E) * conic.z;
-    // As a vector: the logarithm of a scalar costs ten times as much on some CPUs.
-    s.level = log2((real4)(opacities[i])).x;
+    s.level = logarithm(opacities[i]);
     for (int k = 0; k < CHANNELS; ++k)
         s.color[k] = colors[CHANNELS * i + k];
     splats[i] = s;
@@ -46,7 +45,7 @@ __kernel void composite_sum(const uint n, const __global uint *order, const __gl
     }
     const uint g = order[i];
     const real3 conic = load3(conics, g);
-    vstore2(-(real2)(conic.x * total[1] + conic.y * total[2], conic.y * total[1] + conic.z * total[2]), g, v_means2d);
+    store2(v_means2d, g, -(real2)(conic.x * total[1] + conic.y * total[2], conic.y * total[1] + conic.z * total[2]));
     store3(v_conics, g, (real3)((real)0.5 * total[3], total[4], (real)0.5 * total[5]));
     v_opacities[g] = begin < end ? -total[0] / opacities[g] : 0;
     for (int k = 0; k < CHANNELS; ++k)

@@ -3,6 +3,8 @@
 #ifndef CLSPLAT_ELLIPSE_H
 #define CLSPLAT_ELLIPSE_H
 
+#include "power.h"
+
 #ifdef USE_DOUBLE
 #define CONVERT_REAL8 convert_double8
 #else
@@ -12,7 +14,8 @@
 // r2 in the unit of 2 sigma, the slack of clsplat/constants.py included; not positive: the splat is
 // invisible.
 static inline real ellipse_r2(real opacity) {
-    return opacity > ALPHA_MIN ? 2 * (log(opacity / ALPHA_MIN) + EXTENT_SLACK) : 0;
+    return opacity > ALPHA_MIN ? (real)(2 / LOG2_E) * (logarithm(opacity) - (real)LOG2_ALPHA_MIN) + 2 * EXTENT_SLACK
+                               : 0;
 }
 
 // r2 of eight splats. On CPUs a vector logarithm costs less than one scalar one.

@@ -1,15 +1,29 @@
 // 3x3 matrices, rotations from quaternions and their vector-Jacobian products.
 // For y = f(x), f_vjp(x, v_y) returns v_x, the gradient with respect to x of a scalar whose gradient with
 // respect to y is v_y.
+//
+// dot3 and cross3 stand for the built-in functions, which not every driver inlines (common.h).
 #ifndef CLSPLAT_LINALG_H
 #define CLSPLAT_LINALG_H
+
+static inline real dot3(real3 a, real3 b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+static inline real3 cross3(real3 a, real3 b) {
+    return a.yzx * b.zxy - a.zxy * b.yzx;
+}
+
+static inline real dot4(real4 a, real4 b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z + a.w * b.w;
+}
 
 typedef struct {
     real3 row0, row1, row2;
 } mat3;
 
 static inline real3 mat3_mul(mat3 m, real3 v) {
-    return (real3)(dot(m.row0, v), dot(m.row1, v), dot(m.row2, v));
+    return (real3)(dot3(m.row0, v), dot3(m.row1, v), dot3(m.row2, v));
 }
 
 static inline real3 mat3_tmul(mat3 m, real3 v) {
@@ -23,9 +37,9 @@ static inline mat3 mat3_outer2(real3 a, real3 b, real3 c, real3 d) {
 }
 
 static inline real3 normalize_vjp(real3 v, real3 v_unit) {
-    const real inv_norm = 1 / sqrt(dot(v, v));
+    const real inv_norm = 1 / sqrt(dot3(v, v));
     const real3 unit = v * inv_norm;
-    return (v_unit - unit * dot(unit, v_unit)) * inv_norm;
+    return (v_unit - unit * dot3(unit, v_unit)) * inv_norm;
 }
 
 // Rotation matrix of the unit quaternion q = wxyz (kept in the vector's x, y, z, w in that order).
@@ -47,9 +61,9 @@ static inline real4 rotation_from_quat_vjp(real4 q, mat3 v) {
 }
 
 static inline real4 normalize_quat_vjp(real4 q, real4 v_unit) {
-    const real inv_norm = 1 / sqrt(dot(q, q));
+    const real inv_norm = 1 / sqrt(dot4(q, q));
     const real4 unit = q * inv_norm;
-    return (v_unit - unit * dot(unit, v_unit)) * inv_norm;
+    return (v_unit - unit * dot4(unit, v_unit)) * inv_norm;
 }
 
 #endif

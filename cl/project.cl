@@ -24,6 +24,7 @@
 #include "common.h"
 #include "ellipse.h"
 #include "linalg.h"
+#include "power.h"
 #include "sh.h"
 #include "structs.h"
 
@@ -48,7 +49,8 @@ static inline real2 clamped_slopes(const Camera *camera, real2 slopes) {
     const real2 focal = (real2)(camera->fx, camera->fy), centre = (real2)(camera->cx, camera->cy);
     const real2 size = (real2)(camera->width, camera->height);
     const real2 margin = (real)(0.5 * FRUSTUM_MARGIN) * size / focal;
-    return clamp(slopes, -centre / focal - margin, (size - centre) / focal + margin);
+    const real2 lo = -centre / focal - margin, hi = (size - centre) / focal + margin;
+    return CLAMP(slopes, lo, hi);
 }
 
 // What forward and backward both need of one Gaussian.
@@ -64,7 +66,7 @@ typedef struct {
     real det0, det;  // determinants of cov2d without and with the blur
 } Footprint;
 
-static inline Footprint footprint(const Camera *camera, real3 mean, real3 log_scales, real4 unit_quat) {
+static inline Footprint footprint(const Camera *camera, real3 mean, real3 scales, real4 unit_quat) {
     Footprint f;
     const mat3 view = camera_rotation(camera);
     f.p = mat3_mul(view, mean) + (real3)(camera->translation[0], camera->translation[1], camera->translation[2]);
@@ -75,17 +77,17 @@ static inline Footprint footprint(const Camera *camera, real3 mean, real3 log_sc
     f.t0 = mat3_tmul(view, f.j0);
     f.t1 = mat3_tmul(view, f.j1);
     f.rotation = rotation_from_quat(unit_quat);
-    f.scales = exp(log_scales);
+    f.scales = scales;
     f.b0 = mat3_tmul(f.rotation, f.t0) * f.scales;
     f.b1 = mat3_tmul(f.rotation, f.t1) * f.scales;
-    const real xx = dot(f.b0, f.b0), yy = dot(f.b1, f.b1);
+    const real xx = dot3(f.b0, f.b0), yy = dot3(f.b1, f.b1);
     // |b0 x b1|^2 = xx yy - xy^2 (Lagrange), without the cancellation that makes a needle's determinant
     // negative.
-    const real3 normal = cross(f.b0, f.b1);
-    f.det0 = dot(normal, normal);
+    const real3 normal = cross3(f.b0, f.b1);
+    f.det0 = dot3(normal, normal);
     f.det = f.det0 + BLUR * (xx + yy) + BLUR * BLUR;
     f.xx = xx + BLUR;
-    f.xy = dot(f.b0, f.b1);
+    f.xy = dot3(f.b0, f.b1);
     f.yy = yy + BLUR;
     return f;
 }
@@ -123,7 +125,7 @@ static inline FootprintGrad footprint_vjp(const Camera *camera, const Footprint 
     if (slopes.y == f->slopes.y)
         v_slopes.y -= focal.y * inv_z * v_j1.z;
     v.p.xy = v_slopes * inv_z;
-    v.p.z = v_depth - dot(v_slopes, slopes) * inv_z -
+    v.p.z = v_depth - (v_slopes.x * slopes.x + v_slopes.y * slopes.y) * inv_z -
             inv_z * inv_z * (focal.x * (v_j0.x - f->slopes.x * v_j0.z) + focal.y * (v_j1.y - f->slopes.y * v_j1.z));
 
     // p = W mean + translation
@@ -137,7 +139,7 @@ static inline FootprintGrad footprint_vjp(const Camera *camera, const Footprint 
 // Factor on the opacity, and the gradients of the determinants with respect to it.
 static inline real compensation(real det0, real det) {
 #if ANTIALIASED
-    return sqrt(fmax(det0 / det, (real)(COMPENSATION_MIN * COMPENSATION_MIN)));
+    return sqrt(GREATER(det0 / det, (real)(COMPENSATION_MIN * COMPENSATION_MIN)));
 #else
     return 1;
 #endif
@@ -155,8 +157,14 @@ static inline real2 compensation_vjp(real det0, real det, real v_factor) {
 #endif
 }
 
-static inline real sigmoid(real x) {
-    return 1 / (1 + exp(-x));
+DEFINE_POWER(4)
+
+// Scales in x, y, z and the opacity in w; too large becomes infinity, too small the least normal number, NaN stays.
+static inline real4 activate(real3 log_scales, real logit_opacity) {
+    const real4 t = (real)LOG2_E * (real4)(log_scales, -logit_opacity);
+    real4 e = t == t ? power4(CLAMP(t, (real4)POWER_MIN, (real4)POWER_MAX)) : t;
+    e.w = 1 / (1 + e.w);
+    return e;
 }
 
 // conic (xx, xy, yy) = inverse of cov2d: v_cov = -Q V Q with the symmetric matrix V of (v_xx, v_xy/2, v_yy).
@@ -180,14 +188,15 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
         return;
 
     const real3 mean = load3(means, i);
-    const real4 quat = vload4(i, quats);
-    const real norm2 = dot(quat, quat);
-    const Footprint f = footprint(&camera, mean, load3(log_scales, i), quat / sqrt(norm2));
-    const real opacity = sigmoid(logit_opacities[i]) * compensation(f.det0, f.det);
+    const real4 quat = load4(quats, i);
+    const real norm2 = dot4(quat, quat);
+    const real4 activated = activate(load3(log_scales, i), logit_opacities[i]);
+    const Footprint f = footprint(&camera, mean, activated.xyz, quat / sqrt(norm2));
+    const real opacity = activated.w * compensation(f.det0, f.det);
     const real r2 = ellipse_r2(opacity);
     const real2 centre = (real2)(camera.fx * f.p.x / f.p.z + camera.cx, camera.fy * f.p.y / f.p.z + camera.cy);
     const real2 extent = sqrt(r2 * (real2)(f.xx, f.yy));
-    const real3 direction = normalize(from_camera(&camera, mean));
+    const real3 offset = from_camera(&camera, mean), direction = offset / sqrt(dot3(offset, offset));
     real basis[16];
     sh_basis(direction, sh_degree, basis);
     real3 color = (real)0.5;
@@ -196,19 +205,19 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
 
     // Zero times infinity is NaN: one test finds what is not finite in any term.
     const real any = norm2 + f.det + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
-    bool visible = isfinite(0 * any) && f.p.z > NEAR && norm2 >= QUAT_NORM2_MIN && r2 > 0;
+    bool visible = 0 * any == 0 && f.p.z > NEAR && norm2 >= QUAT_NORM2_MIN && r2 > 0;
     if (visible) {
         const int2 columns = pixels_between(centre.x - extent.x, centre.x + extent.x, camera.width);
         const int2 rows = pixels_between(centre.y - extent.y, centre.y + extent.y, camera.height);
         visible = columns.x <= columns.y && rows.x <= rows.y;
     }
-    vstore2(visible ? centre : (real2)0, i, means2d);
+    store2(means2d, i, visible ? centre : (real2)0);
     store3(conics, i, visible ? (real3)(f.yy, -f.xy, f.xx) / f.det : (real3)0);
     depths[i] = visible ? f.p.z : 0;
-    vstore2(visible ? extent : (real2)0, i, extents);
+    store2(extents, i, visible ? extent : (real2)0);
     opacities[i] = visible ? opacity : 0;
     for (int k = 0; k < 3; ++k)
-        colors[CHANNELS * i + k] = visible ? fmax(((const real *)&color)[k], (real)0) : 0;
+        colors[CHANNELS * i + k] = visible ? GREATER(((const real *)&color)[k], (real)0) : 0;
 #if CHANNELS == 4
     colors[CHANNELS * i + 3] = visible ? f.p.z : 0;
 #endif
@@ -235,11 +244,12 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
         const int active = visible ? (sh_degree + 1) * (sh_degree + 1) : 0;
         if (visible) {
             const real3 mean = load3(means, i);
-            const real4 quat = vload4(i, quats);
-            const real4 unit_quat = quat / sqrt(dot(quat, quat));
-            const Footprint f = footprint(&camera, mean, load3(log_scales, i), unit_quat);
+            const real4 quat = load4(quats, i);
+            const real4 unit_quat = quat / sqrt(dot4(quat, quat));
+            const real4 activated = activate(load3(log_scales, i), logit_opacities[i]);
+            const Footprint f = footprint(&camera, mean, activated.xyz, unit_quat);
 
-            const real opacity = sigmoid(logit_opacities[i]);
+            const real opacity = activated.w;
             const real factor = compensation(f.det0, f.det);
             v_logit = v_opacities[i] * factor * opacity * (1 - opacity);
             const real2 v_det = compensation_vjp(f.det0, f.det, v_opacities[i] * opacity);
@@ -251,7 +261,7 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
 #if CHANNELS == 4
             v_depth = v_colors[CHANNELS * i + 3];
 #endif
-            v = footprint_vjp(&camera, &f, mean, unit_quat, v_cov, vload2(i, v_means2d), v_depth);
+            v = footprint_vjp(&camera, &f, mean, unit_quat, v_cov, load2(v_means2d, i), v_depth);
             v.quat = normalize_quat_vjp(quat, v.quat);
 
             // Colour; where it is clamped at 0 nothing passes.
@@ -260,11 +270,11 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
             v_color.y = colors[CHANNELS * i + 1] > 0 ? v_colors[CHANNELS * i + 1] : 0;
             v_color.z = colors[CHANNELS * i + 2] > 0 ? v_colors[CHANNELS * i + 2] : 0;
             const real3 offset = from_camera(&camera, mean);
-            const real3 direction = normalize(offset);
+            const real3 direction = offset / sqrt(dot3(offset, offset));
             real basis[16], v_basis[16];
             sh_basis(direction, sh_degree, basis);
             for (int k = 0; k < active; ++k) {
-                v_basis[k] = dot(load3(sh, i * sh_stride + k), v_color);
+                v_basis[k] = dot3(load3(sh, i * sh_stride + k), v_color);
                 store3(v_sh, i * sh_stride + k, basis[k] * v_color);
             }
             const real3 v_offset = normalize_vjp(offset, sh_basis_vjp(direction, sh_degree, v_basis));
@@ -282,7 +292,7 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
             store3(v_sh, i * sh_stride + k, (real3)0);
         store3(v_means, i, v.mean);
         store3(v_log_scales, i, v.log_scales);
-        vstore4(v.quat, i, v_quats);
+        store4(v_quats, i, v.quat);
         v_logit_opacities[i] = v_logit;
     }
 
