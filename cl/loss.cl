@@ -14,7 +14,7 @@
 //   loss_sum   adds up the parts
 //   loss_grad  blurs the derivatives (the window is symmetric: its own adjoint), combines them to v_image
 // Mapping: loss_ssim and loss_grad have one work-item for VECTORS neighbouring vectors of LANES values in a band
-// of BAND rows, from MARGIN values before each row to at least MARGIN values behind it; loss_sum is one
+// of `band` rows, from MARGIN values before each row to at least MARGIN values behind it; loss_sum is one
 // work-group. Sums have a fixed order: within a work-item, then a work-group (a tree), then loss_sum.
 //
 // Buffers: image[H,W,3], photo[H,W,3] u8, mask[H,W] u8 (0 or 1; not read where masked is 0), v_image[H,W,3];
@@ -25,7 +25,6 @@
 // -DRADIUS                 half width of the window, px, 1 or more
 // -DLANES=1|16             values per vector: 16 on CPUs, 1 on GPUs, whose work-items touch neighbours together
 // -DVECTORS                vectors per work-item, 1 where LANES is 1
-// -DBAND                   rows per work-item; 2 RADIUS more are blurred along the row
 // -DGROUP                  largest work-group; work-groups are powers of two wide
 #include "common.h"
 
@@ -40,9 +39,6 @@
 #endif
 #if !defined(VECTORS) || VECTORS < 1 || (LANES == 1 && VECTORS != 1)
 #error "-DVECTORS must be 1 or more, and 1 where -DLANES is"
-#endif
-#if !defined(BAND) || BAND < 1
-#error "-DBAND must be 1 or more"
 #endif
 #if !defined(GROUP) || GROUP < 1
 #error "-DGROUP must be 1 or more"
@@ -185,26 +181,28 @@ static inline reals inside(int length, int column, reals v) {
 }
 
 // l1_weight and ssim_weight are (1 - lambda) and lambda over the number of values, 3 W H.
-__kernel void loss_ssim(const int width, const int height, const real l1_weight, const real ssim_weight,
-                        const __global real *image, const __global uchar *photo, const int masked,
-                        const __global uchar *mask, __global real *derivatives, __global real *parts) {
+__kernel void loss_ssim(const int width, const int height, const int band, const real l1_weight,
+                        const real ssim_weight, const __global real *image, const __global uchar *photo,
+                        const int masked, const __global uchar *mask, __global real *derivatives,
+                        __global real *parts) {
     const int length = 3 * width, column = (int)get_global_id(0) * VECTORS * LANES - MARGIN;
-    const int begin = get_global_id(1) * BAND, end = begin + BAND < height ? begin + BAND : height;
+    const int begin = get_global_id(1) * band, end = min(begin + band, height);
     const size_t pitch = get_global_size(0) * VECTORS * LANES;
+    const int vectors = min(VECTORS, (length + MARGIN - column + LANES - 1) / LANES);
     reals l1 = 0, dissimilarity = 0;
     Moments ring[VECTORS][WINDOW];
     real x[FETCHED], y[FETCHED];
     for (int row = begin - RADIUS, newest = 0; row < end + RADIUS; ++row, newest = (newest + 1) % WINDOW) {
         const bool exists = row >= 0 && row < height;
-        for (int i = 0; exists && i < FETCHED; i += LANES)
+        for (int i = 0; exists && i < FETCHED - (VECTORS - vectors) * LANES; i += LANES)
             fetch(length, row, column - STEP * TAP(RADIUS) + STEP * i, image, photo, masked, mask, x + i, y + i);
-        for (int v = 0; v < VECTORS; ++v) {
+        for (int v = 0; v < vectors; ++v) {
             const Moments none = {0, 0, 0, 0};
             ring[v][newest] = exists ? blur_row(x + v * LANES, y + v * LANES) : none;
             const int c = column + v * LANES, centre = TAP(RADIUS) + v * LANES;
             if (row >= begin && row < end) {
                 const reals difference = VECTOR(const, x + centre) - VECTOR(const, y + centre);
-                l1 += inside(length, c, difference < 0 ? -difference : difference);
+                l1 += difference < 0 ? -difference : difference; // both are 0 beside the image
             }
             if (row - RADIUS < begin)
                 continue;
@@ -233,11 +231,12 @@ __kernel void loss_sum(const uint count, const __global real *parts, __global re
         loss[0] = sum;
 }
 
-__kernel void loss_grad(const int width, const int height, const real l1_weight, const real ssim_weight,
-                        const __global real *image, const __global uchar *photo, const int masked,
-                        const __global uchar *mask, const __global real *derivatives, __global real *v_image) {
+__kernel void loss_grad(const int width, const int height, const int band, const real l1_weight,
+                        const real ssim_weight, const __global real *image, const __global uchar *photo,
+                        const int masked, const __global uchar *mask, const __global real *derivatives,
+                        __global real *v_image) {
     const int length = 3 * width, column = (int)get_global_id(0) * VECTORS * LANES - MARGIN;
-    const int begin = get_global_id(1) * BAND, end = begin + BAND < height ? begin + BAND : height;
+    const int begin = get_global_id(1) * band, end = min(begin + band, height);
     const size_t pitch = get_global_size(0) * VECTORS * LANES;
     Derivatives ring[VECTORS][WINDOW];
     for (int row = begin - RADIUS, newest = 0; row < end + RADIUS; ++row, newest = (newest + 1) % WINDOW) {

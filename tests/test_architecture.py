@@ -142,7 +142,7 @@ DEFINES = {
     "count": {"TILE": 16},
     "loss": {
         **{"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
-        **{"LANES": 16, "VECTORS": 2, "BAND": 8, "GROUP": 32},
+        **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
     },
     "project": {"CHANNELS": 4, "ANTIALIASED": 1, "VIEWMAT_GRAD": 1, "GROUP": 32},
     "roof": {"WIDTH": 16},
@@ -161,7 +161,6 @@ FORBIDDEN = [
     ("loss", "RADIUS", 0),
     ("loss", "LANES", 8),
     ("loss", "VECTORS", 0),
-    ("loss", "BAND", 0),
     ("loss", "GROUP", 0),
     ("project", "CHANNELS", 5),
     ("project", "ANTIALIASED", 2),
