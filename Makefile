@@ -1,6 +1,6 @@
 PYTHON = python
 
-.PHONY: test test-slow lint docs check-races
+.PHONY: test test-slow lint docs check-races bench
 
 # The default tests: a few minutes on two cores.
 test:
@@ -25,3 +25,7 @@ docs:
 # The kernels under the simulator Oclgrind: data races, divergent barriers, accesses out of bounds.
 check-races:
 	$(PYTHON) -m pytest tests/check_races.py
+
+# The figures of docs/benchmarks.md, measured anew: some minutes, on a machine that does nothing else.
+bench:
+	$(PYTHON) -m clsplat bench kernels -o docs/results/kernels.json --scaling docs/results/kernels.svg

@@ -3,6 +3,7 @@ measured. Nothing here depends on how fast anything is."""
 
 import json
 import math
+import re
 import subprocess
 from pathlib import Path
 
@@ -14,8 +15,8 @@ from clsplat import ops, reference
 from clsplat.bench import roof
 from clsplat.bench.environment import commit
 from clsplat.bench.kernels import STILL, _watched, bench_kernels, stage_bytes
-from clsplat.bench.report import details, scaling_chart, summary
-from clsplat.bench.workloads import count_pairs, from_files, scaling_names, synthetic
+from clsplat.bench.report import chart_title, details, scaling_chart, summary
+from clsplat.bench.workloads import DEFAULT, count_pairs, from_files, scaling_names, synthetic
 from clsplat.cli import main
 from clsplat.config import DataConfig, RenderConfig
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
@@ -333,3 +334,51 @@ class TestCommand:
         assert "found no folder" in self.fails(capsys, "-o", tmp_path / "missing" / "k.json")
         both = ("--scaling", tmp_path / "c.png", "--scene", "a.ply", "--cameras", tmp_path)
         assert "leave one of them out" in self.fails(capsys, *both)
+
+
+@pytest.fixture
+def measured(project):
+    """The results that the page shows."""
+    return json.loads((project / "docs" / "results" / "kernels.json").read_text())
+
+
+@pytest.fixture
+def page(project):
+    return (project / "docs" / "benchmarks.md").read_text()
+
+
+class TestPage:
+    """docs/benchmarks.md shows what the files beside it hold: tables are made from them while the page is built."""
+
+    def test_results_are_whole(self, measured, results):
+        assert set(measured) == set(results)
+        assert set(measured["roof"]) == set(results["roof"])
+        assert {w["name"] for w in measured["workloads"]} == {*DEFAULT, *scaling_names()}
+        assert set(measured["workloads"][0]) == set(results["workloads"][0])
+        assert measured["software"]["commit"], "figures without a commit cannot be repeated"
+
+    def test_tables_are_of_these_results(self, page, measured):
+        shown = re.findall(r"^```{bench_kernels} (\S+) ?(\S*)$", page, flags=re.M)
+        assert {file for file, _ in shown} == {"results/kernels.json"}
+        assert {"", "100k-640x480"} <= {name for _, name in shown}
+        by_name = {w["name"]: w for w in measured["workloads"]}
+        assert f"{measured['date']}, {measured['settings']['repeats']} repeats" in summary(measured)
+        for name in filter(None, (name for _, name in shown)):
+            assert details(by_name[name]).startswith(f"{name}: {by_name[name]['gaussians']:,} Gaussians")
+
+    def test_the_chart_is_of_these_results(self, page, project, measured):
+        assert "](results/kernels.svg)" in page
+        text = (project / "docs" / "results" / "kernels.svg").read_text()
+        assert f"<dc:title>{chart_title(measured)}</dc:title>" in text
+
+    def test_make_bench_writes_these_files(self, project):
+        recipe = (project / "Makefile").read_text().split("\nbench:\n")[1].splitlines()[0]
+        assert "bench kernels -o docs/results/kernels.json --scaling docs/results/kernels.svg" in recipe
+
+    def test_bytes_are_those_of_the_page(self, page):
+        values = {"N": 7, "P": 59, "M": 11}
+        by_hand = {}
+        for stage, formula in re.findall(r"^\| `(\w+)` \| ([^:]+):", page, flags=re.M):
+            formula = formula.replace("27 per pixel", "27 13")
+            by_hand[stage] = eval(re.sub(r"(?<=[\w)]) (?=[\w(])", "*", formula), values)
+        assert by_hand == stage_bytes(7, 3, 13, 11)

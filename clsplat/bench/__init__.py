@@ -1,0 +1,1 @@
+"""`clsplat bench`: measurements that users can repeat on their own device."""

@@ -61,9 +61,7 @@ class Kernels:
         device = Device(select_device(self.device))
         _say(f"device: {device.label}")
         results = bench_kernels(workloads, self.render, device, self.repeats, lambda text: _say(f"timing: {text}"))
-        print(summary(results))
-        for workload in results["workloads"]:
-            print(f"\n{details(workload)}")
+        # Before anything is printed: a pipe may end early.
         if self.out is not None:
             with replacing(self.out) as file:
                 file.write((json.dumps(results, indent=1) + "\n").encode())
@@ -71,6 +69,9 @@ class Kernels:
         if self.scaling is not None:
             save_scaling_chart(results, self.scaling)
             _say(f"chart: {self.scaling}")
+        print(summary(results))
+        for workload in results["workloads"]:
+            print(f"\n{details(workload)}")
 
     def _workloads(self) -> list[Workload]:
         if (self.scene is None) != (self.cameras is None):

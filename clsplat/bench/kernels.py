@@ -92,7 +92,7 @@ def _summary(samples: list[Clock], cores: int | None) -> dict[str, float]:
     result = {"median_ms": median, "q1_ms": q1, "q3_ms": q3}
     if cores is not None:
         result["cpu_ms"] = float(np.median(cpu)) / cores
-    return {key: float(value) for key, value in result.items()}
+    return {key: round(float(value), 4) for key, value in result.items()}  # to 0.1 us
 
 
 def stage_bytes(n: int, sh_degree: int, pixels: int, intersections: int) -> dict[str, int]:

@@ -47,7 +47,7 @@ def summary(results: Results) -> str:
         f"compositor {settings['compositor']}, tiles of {settings['tile_size']} px",
     ]
     if results["load"] is not None:
-        facts.append(f"{results['load']:.2f} processes ran before")
+        facts.append(f"{results['load']:.2f} processes ran on the machine before it")
     limits = [
         ("multiply-add", "exp", "exp2", "copy", "triad", "buffers", "launch", "queued"),
         (
@@ -155,7 +155,7 @@ def scaling_chart(results: Results, figure: Any) -> None:
         )
         axes.set_title(title, fontsize=10)
         axes.set_xlabel(label)
-        axes.set_xticks(x, [f"{value:,}" for value in x], fontsize=8)
+        axes.set_xticks(x, [f"{value / 1e6:.2g}M" if value >= 1e6 else f"{value / 1e3:.3g}k" for value in x])
         axes.minorticks_off()
         axes.grid(color="0.92")
         axes.set_axisbelow(True)
@@ -164,6 +164,11 @@ def scaling_chart(results: Results, figure: Any) -> None:
     figure.axes[0].set_ylabel("median time, ms")
     figure.axes[1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=9)
     figure.suptitle(f"{results['device']['label']}, {results['date'][:10]}", fontsize=9, color="0.4")
+
+
+def chart_title(results: Results) -> str:
+    """What a chart's file says it shows: device and date of the results."""
+    return f"{results['benchmark']}: {results['device']['label']}, {results['date']}"
 
 
 def save_scaling_chart(results: Results, path: Path) -> None:
@@ -179,4 +184,4 @@ def save_scaling_chart(results: Results, path: Path) -> None:
     figure = Figure(figsize=(10, 4.6), dpi=150, layout="constrained")
     scaling_chart(results, figure)
     with replacing(path) as file:
-        figure.savefig(file, format=path.suffix[1:].lower())
+        figure.savefig(file, format=path.suffix[1:].lower(), metadata={"Title": chart_title(results)})
