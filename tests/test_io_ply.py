@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.io import FORMATS, load_gaussians, save_gaussians
+from clsplat.io import load_gaussians
 from clsplat.io.ply import LOG_SCALE_MIN, LOGIT_MAX, REQUIRED, load_ply, save_ply
 
 TYPES = {"f4": "float", "f8": "double"}
@@ -59,20 +59,6 @@ def assert_equal(found, expected):
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "scene.ply"
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_every_format_round_trips(tmp_path, suffix, degree):
-    gaussians = random_gaussians(n=1000, degree=degree)
-    save_gaussians(tmp_path / f"a{suffix}", gaussians, "antialiased")
-    found, mode, offset = load_gaussians(tmp_path / f"a{suffix}")
-    assert_equal(found, gaussians)
-    assert mode == "antialiased" and not offset.any()
-    # Identical input, identical bytes.
-    save_gaussians(tmp_path / f"b{suffix}", found, mode, offset)
-    assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
-    assert sorted(p.name for p in tmp_path.iterdir()) == [f"a{suffix}", f"b{suffix}"]
 
 
 def test_the_layout_is_the_originals(path):
@@ -203,7 +189,7 @@ def broken_files():
         "overflow": (ply_bytes(good | {"y": np.full(7, 1e300)}, dtype="f8"), r"y = inf in Gaussian 0 .7 of 7"),
         "points": (ply_bytes(points), "point cloud of 7 points"),
         "mesh": (ply_bytes(points).replace(b"end_header", face), "mesh of 7 points"),
-        "packed": (ply_bytes(packed), "compressed.ply of PlayCanvas"),
+        "packed": (ply_bytes(packed), "compressed PLY of PlayCanvas"),
     }
 
 
@@ -231,7 +217,7 @@ def test_files_that_cannot_be_read(tmp_path):
     for path in (tmp_path / "missing.ply", tmp_path):
         with pytest.raises(InputError, match=re.escape(f"{path}: expected")):
             load_ply(path)
-    with pytest.raises(InputError, match=r"\*\.ply, found suffix '\.txt'"):
+    with pytest.raises(InputError, match=r"\*\.ply, .* found suffix '\.txt'"):
         load_gaussians(tmp_path / "a.txt")
 
 

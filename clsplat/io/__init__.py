@@ -9,22 +9,30 @@ from numpy.typing import ArrayLike, NDArray
 from clsplat.config import Mode
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.io.compressed_ply import load_compressed_ply, save_compressed_ply
 from clsplat.io.dataset import load_scene
 from clsplat.io.ply import load_ply, save_ply
+from clsplat.io.sog import META, load_sog, save_sog
+from clsplat.io.splat import load_splat, save_splat
+from clsplat.io.spz import load_spz, save_spz
 
 __all__ = ["FORMATS", "load_gaussians", "load_scene", "save_gaussians"]
 
 Loader = Callable[[str | Path], tuple[Gaussians, Mode, NDArray[np.float64]]]
 Saver = Callable[[str | Path, Gaussians, Mode, ArrayLike | None], None]
 
-# Suffix of the file name -> (load, save).
+# Suffix of the file name -> (load, save); of several that fit, the longest counts.
 FORMATS: dict[str, tuple[Loader, Saver]] = {
     ".ply": (load_ply, save_ply),
+    ".compressed.ply": (load_compressed_ply, save_compressed_ply),
+    ".splat": (load_splat, save_splat),
+    ".spz": (load_spz, save_spz),
+    ".sog": (load_sog, save_sog),
 }
 
 
 def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
-    """Read Gaussians from a file in a format of `FORMATS`, told by its suffix.
+    """Read Gaussians from a file in a format of `FORMATS`, told by its suffix, or from a folder with an unpacked SOG.
 
     Returns
     -------
@@ -40,7 +48,8 @@ def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float6
     InputError
         If no format has this suffix, or the file is not of its format.
     """
-    return _format(path)[0](path)
+    unpacked = Path(path).is_dir() or Path(path).name == META
+    return load_sog(path) if unpacked else _format(path)[0](path)
 
 
 def save_gaussians(
@@ -67,10 +76,16 @@ def save_gaussians(
     _format(path)[1](path, gaussians, mode, offset)
 
 
+def suffix_of(path: str | Path) -> str:
+    """The suffix in `FORMATS` that a file's name ends with; empty if none."""
+    name = Path(path).name.lower()
+    return max((suffix for suffix in FORMATS if name.endswith(suffix)), key=len, default="")
+
+
 def _format(path: str | Path) -> tuple[Loader, Saver]:
-    suffix = Path(path).suffix.lower()
-    if suffix not in FORMATS:
+    suffix = suffix_of(path)
+    if not suffix:
         raise InputError(
-            f"{path}: expected a file of Gaussians named *{', *'.join(FORMATS)}, found suffix {suffix!r}"
+            f"{path}: expected a file of Gaussians named *{', *'.join(FORMATS)}, found suffix {Path(path).suffix!r}"
         )
     return FORMATS[suffix]

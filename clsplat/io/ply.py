@@ -102,6 +102,7 @@ def save_ply(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
     from plyfile import PlyData, PlyElement
 
     gaussians.validate()
+    comments = comments_of(mode, offset)
     n, k = gaussians.sh.shape[:2]
     if n == 0:
         raise InputError(f"{path}: expected at least one Gaussian to write, found none")
@@ -114,7 +115,7 @@ def save_ply(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
         rest: gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(n, -1),
         ("opacity",): gaussians.logit_opacities[:, None],
         LOG_SCALES: gaussians.log_scales,
-        QUATS: _normalised(gaussians.quats),
+        QUATS: normalised(gaussians.quats),
     }
     with np.errstate(over="ignore"):  # what overflows float32 is found below
         for group, values in columns.items():
@@ -123,12 +124,6 @@ def save_ply(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
                 table[:, first : first + len(group)] = values
     _check_finite(path, table, names)
 
-    comments = [MIP_COMMENT] if mode == "antialiased" else []
-    shift = np.zeros(3) if offset is None else np.asarray(offset, dtype=np.float64)
-    if shift.shape != (3,) or not np.isfinite(shift).all():
-        raise InputError(f"offset: expected three finite numbers, found {offset!r}")
-    if shift.any():
-        comments.append("offset " + " ".join(repr(float(x)) for x in shift))
     vertices = table.view([(name, "<f4") for name in names])[:, 0]
     ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
     with replacing(path) as out:
@@ -136,8 +131,8 @@ def save_ply(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
 
 
 def _load(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
-    header, size = _read_header(path, file)
-    elements, counts, order, comments = _parse_header(path, header)
+    header, size = read_header(path, file)
+    elements, counts, order, comments = parse_header(path, header)
     _check_elements(path, elements, counts)
     vertex = elements["vertex"]
     names = [prop.name for prop in vertex.properties]
@@ -163,10 +158,10 @@ def _load(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArray[np
     else:
         skipped = sum(n * e.dtype().itemsize for n, e in zip(counts[:before], elements.values(), strict=False))
         data = np.fromfile(file, vertex.dtype(order), counts[before], offset=skipped)
-    return _to_gaussians(path, data, wanted), *_read_comments(comments)
+    return _to_gaussians(path, data, wanted), *read_comments(comments)
 
 
-def _read_header(path: str | Path, file: BinaryIO) -> tuple[bytes, int]:
+def read_header(path: str | Path, file: BinaryIO) -> tuple[bytes, int]:
     """The header with its last line's end, and the size of the file."""
     head = file.read(HEADER_MAX)
     size = file.seek(0, io.SEEK_END)
@@ -179,7 +174,7 @@ def _read_header(path: str | Path, file: BinaryIO) -> tuple[bytes, int]:
     return head[: end.end()], size
 
 
-def _parse_header(path: str | Path, header: bytes) -> tuple[dict[str, "PlyElement"], list[int], str, list[str]]:
+def parse_header(path: str | Path, header: bytes) -> tuple[dict[str, "PlyElement"], list[int], str, list[str]]:
     """Elements with their properties, rows of each, byte order ('<', '>', or '=' for ASCII), comments.
 
     plyfile parses the header with all counts set to 0: it would allocate what the file declares, and would
@@ -214,8 +209,7 @@ def _check_elements(path: str | Path, elements: dict[str, "PlyElement"], counts:
     count = counts[list(elements).index("vertex")]
     if "packed_position" in names:
         raise InputError(
-            f"{path}: is a compressed.ply of PlayCanvas, which is not read; convert it to an uncompressed PLY, "
-            "for example with splat-transform"
+            f"{path}: is a compressed PLY of PlayCanvas, which is told by its name; rename it to *.compressed.ply"
         )
     if names.isdisjoint((*SH0, "opacity", *LOG_SCALES, *QUATS)):
         kind = "a mesh" if "face" in elements else "a point cloud"
@@ -280,11 +274,11 @@ def _to_gaussians(path: str | Path, data: Array, names: list[str]) -> Gaussians:
     _check_finite(path, table, tuple(names))
     n = len(table)
     sh = np.concatenate([sh0[:, None], rest.reshape(n, 3, -1).transpose(0, 2, 1)], axis=1)
-    gaussians = Gaussians(means, log_scales, _normalised(quats), opacity[:, 0], sh)
+    gaussians = Gaussians(means, log_scales, normalised(quats), opacity[:, 0], sh)
     return gaussians.astype(np.float32)
 
 
-def _normalised(quats: Array) -> Array:
+def normalised(quats: Array) -> Array:
     """Unit quaternions, (N, 4): zeros where the renderer finds no direction and culls, NaN where not finite."""
     wide = quats.astype(np.float64)
     norm2 = np.einsum("ni,ni->n", wide, wide)[:, None]
@@ -306,7 +300,24 @@ def _check_finite(path: str | Path, table: Array, names: tuple[str, ...]) -> Non
         )
 
 
-def _read_comments(comments: list[str]) -> tuple[Mode, NDArray[np.float64]]:
+def checked_offset(offset: ArrayLike | None) -> NDArray[np.float64]:
+    """A world offset (3,) as an array, zeros for none; InputError if it is not three finite numbers."""
+    shift = np.zeros(3) if offset is None else np.asarray(offset, dtype=np.float64)
+    if shift.shape != (3,) or not np.isfinite(shift).all():
+        raise InputError(f"offset: expected three finite numbers, found {offset!r}")
+    return shift
+
+
+def comments_of(mode: Mode, offset: ArrayLike | None) -> list[str]:
+    """Comments of a header that say the rendering mode and the world offset, unless they are the default."""
+    comments = [MIP_COMMENT] if mode == "antialiased" else []
+    shift = checked_offset(offset)
+    if shift.any():
+        comments.append("offset " + " ".join(repr(float(x)) for x in shift))
+    return comments
+
+
+def read_comments(comments: list[str]) -> tuple[Mode, NDArray[np.float64]]:
     """Rendering mode and world offset; whatever else the comments say is ignored."""
     offset: NDArray[np.float64] = np.zeros(3)
     for comment in comments:
