@@ -49,10 +49,9 @@
 #define TALLY   2 // ++counters[tile]
 #define SCATTER 3 // out_a[counters[tile]] = g, out_b[counters[tile]++] = slot (GRADIENTS)
 
-// Walks the tiles of splat g, whose slots begin at `slot`. Returns their number.
-static inline uint walk_tiles(const int task, uint g, int width, int height, const __global Ellipse *ellipses,
-                              uint slot, __global uint *counters, __global uint *out_a, __global uint *out_b) {
-    const Ellipse e = ellipses[g];
+// Walks the tiles of splat g with ellipse e, whose slots begin at `slot`. Returns their number.
+static inline uint walk_tiles(const int task, uint g, Ellipse e, int width, int height, uint slot,
+                              __global uint *counters, __global uint *out_a, __global uint *out_b) {
     if (!(e.half_height > 0))
         return 0;
     const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
@@ -134,6 +133,15 @@ static inline uint run_begin(uint n, uint runs, uint run) {
     return (uint)((ulong)n * run / runs);
 }
 
+// Ellipses gathered together: the cache misses of the gather overlap.
+#define BATCH 32
+
+static inline void gather(uint begin, uint end, const __global uint *order, const __global Ellipse *ellipses,
+                          Ellipse *batch) {
+    for (uint i = begin; i < min(end, begin + BATCH); ++i)
+        batch[i - begin] = ellipses[order[i]];
+}
+
 __kernel void bin_histogram(const uint n, const uint runs, const uint tile_count, const int width, const int height,
                             const __global uint *order, const __global Ellipse *ellipses, __global uint *counters,
                             __global uint *counts) {
@@ -143,12 +151,16 @@ __kernel void bin_histogram(const uint n, const uint runs, const uint tile_count
     counters += (size_t)tile_count * run;
     for (uint t = 0; t < tile_count; ++t)
         counters[t] = 0;
+    Ellipse batch[BATCH];
     const uint end = run_begin(n, runs, run + 1);
-    for (uint i = run_begin(n, runs, run); i < end; ++i) {
-        const uint count = walk_tiles(TALLY, order[i], width, height, ellipses, 0, counters, 0, 0);
+    for (uint first = run_begin(n, runs, run); first < end; first += BATCH) {
+        gather(first, end, order, ellipses, batch);
+        for (uint i = first; i < min(end, first + BATCH); ++i) {
+            const uint count = walk_tiles(TALLY, 0, batch[i - first], width, height, 0, counters, 0, 0);
 #if GRADIENTS
-        counts[i] = count;
+            counts[i] = count;
 #endif
+        }
     }
 }
 
@@ -176,14 +188,18 @@ __kernel void bin_scatter(const uint n, const uint runs, const uint tile_count, 
     counters += (size_t)tile_count * run;
     for (uint t = 0; t < tile_count; ++t)
         counters[t] += tile_begins[t];
+    Ellipse batch[BATCH];
     const uint end = run_begin(n, runs, run + 1);
-    for (uint i = run_begin(n, runs, run); i < end; ++i) {
+    for (uint first = run_begin(n, runs, run); first < end; first += BATCH) {
+        gather(first, end, order, ellipses, batch);
+        for (uint i = first; i < min(end, first + BATCH); ++i) {
 #if GRADIENTS
-        const uint slot = first_slots[i];
+            const uint slot = first_slots[i];
 #else
-        const uint slot = 0;
+            const uint slot = 0;
 #endif
-        walk_tiles(SCATTER, order[i], width, height, ellipses, slot, counters, gauss_ids, slots);
+            walk_tiles(SCATTER, order[i], batch[i - first], width, height, slot, counters, gauss_ids, slots);
+        }
     }
 }
 
@@ -191,7 +207,7 @@ __kernel void bin_count(const uint n, const int width, const int height, const _
                         const __global Ellipse *ellipses, __global uint *counts) {
     const uint i = get_global_id(0);
     if (i < n)
-        counts[i] = walk_tiles(COUNT, order[i], width, height, ellipses, 0, 0, 0, 0);
+        counts[i] = walk_tiles(COUNT, 0, ellipses[order[i]], width, height, 0, 0, 0, 0);
 }
 
 __kernel void bin_emit(const uint n, const int width, const int height, const __global uint *order,
@@ -199,7 +215,7 @@ __kernel void bin_emit(const uint n, const int width, const int height, const __
                        __global uint *slot_gauss) {
     const uint i = get_global_id(0);
     if (i < n)
-        walk_tiles(LIST, order[i], width, height, ellipses, first_slots[i], 0, tiles, slot_gauss);
+        walk_tiles(LIST, order[i], ellipses[order[i]], width, height, first_slots[i], 0, tiles, slot_gauss);
 }
 
 // tile_begins[t]: index of the first of the m sorted tiles that is not below t, for t = 0 to tile_count.

@@ -14,7 +14,7 @@ from clsplat.ops.scan import queue_scan
 BITONIC_MAX = 1024
 
 # Longest segment for which a core takes the bitonic sort.
-CPU_SHORT_SEGMENT = 32
+CPU_SHORT_SEGMENT = 16
 
 
 def _defines(device: Device, keys: Array, **changes: Any) -> dict[str, Any]:
