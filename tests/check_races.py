@@ -50,7 +50,8 @@ def device_like_a_gpu():
     assert "oclgrind" in device.label.lower(), f"expected Oclgrind's device, found {device.label}"
     device.is_cpu = False  # Oclgrind says that it is of every type
     # Memory pools round sizes up, and what lies beyond an array but within its block would not be reported.
-    device._pool = cl.tools.ImmediateAllocator(device.queue)
+    allocator = cl.tools.ImmediateAllocator(device.queue)
+    device._allocate = lambda what, nbytes: allocator(nbytes)
     return device
 
 
@@ -69,6 +70,32 @@ def sort(device):
         keys = rng.integers(0, 200, n).astype(dtype)
         _, order = ops.argsort(device, device.upload("keys", keys, dtype), 8, method)
         np.testing.assert_array_equal(order.get(), np.argsort(keys, kind="stable"))
+
+
+def segments(device):
+    """Segments for the bitonic sort and, the last one, for the radix sort."""
+    rng = np.random.default_rng(0)
+    ends = np.cumsum([0, 1, 70, 300, 1100])
+    ranges = np.stack([np.concatenate([[0], ends[:-1]]), ends], axis=1).astype(np.uint32)
+    keys = rng.integers(0, 200, ends[-1]).astype(np.uint32)
+    arrays = [device.upload("keys", a, a.dtype) for a in (keys, ranges)]
+    order = ops.argsort_segments(device, arrays[0], 8, arrays[1])
+    np.testing.assert_array_equal(order.get(), reference.argsort_segments(keys, 8, ranges))
+
+
+def schemes(device):
+    """Both orders of sorting, as on a CPU and as on a GPU, in an image that cuts tiles off."""
+    camera = Camera(np.eye(4), 20, 20, 34, 18, 37, 21)
+    splats = reference.project_fwd(scene(90, -1, 2).astype(np.float64), camera, 1)
+    arrays = type(splats)(*(device.upload("splats", a) for a in splats))
+    for scheme in ("global", "per_tile"):
+        expected = reference.bin_splats(splats, 37, 21, 8, scheme=scheme)
+        for device.is_cpu in (True, False):
+            found = ops.bin_splats(device, arrays, 37, 21, 8, scheme=scheme)
+            for a, b in zip(found[:5], expected[:5], strict=True):
+                np.testing.assert_array_equal(a.get(), b)
+            forward = ops.bin_splats(device, arrays, 37, 21, 8, scheme=scheme, gradients=False)
+            np.testing.assert_array_equal(forward.gauss_ids.get(), expected.gauss_ids)
 
 
 def scan(device):
@@ -138,6 +165,8 @@ def pipeline(device, compositor, tile_size):
 CASES = {
     "control": control,
     "sort": sort,
+    "segments": segments,
+    "schemes": schemes,
     "scan": scan,
     "loss": loss,
     "adam": adam,
