@@ -223,7 +223,7 @@ def bench_kernels(
     ----------
     workloads : list of Workload
     render : RenderConfig
-        Mode, tile size and compositor; a workload's own mode comes before its mode.
+        Mode, tile size and compositor; the mode of a workload from a file comes first.
     device : Device
     repeats : int
         Steps of each kind (whole, by stages, by kernels) that count; at least 1.
@@ -245,7 +245,7 @@ def bench_kernels(
     timed = []
     for workload in workloads:
         progress(workload.name)
-        timed.append(bench_workload(workload, replace(render, mode=workload.mode), device, repeats))
+        timed.append(bench_workload(workload, replace(render, mode=workload.mode or render.mode), device, repeats))
     progress("roof")
     results["roof"] = _better(roof, measure_roof(device))
     for result in timed:

@@ -39,13 +39,16 @@ SEED = 0
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """A view of some Gaussians; its photo is what training compares with. extent: of the scene, in world units."""
+    """A view of some Gaussians; its photo is what training compares with.
+
+    extent: of the scene, in world units; mode: what the Gaussians were trained for, if a file says it.
+    """
 
     name: str
     gaussians: Gaussians
     view: View
     extent: float = 1.0
-    mode: Mode = "classic"
+    mode: Mode | None = None
 
 
 def scaling_names() -> list[str]:
