@@ -104,18 +104,21 @@ class Train:
     data: tyro.conf.Positional[Path]
     """Folder of the dataset, or of photos alone."""
     out: Out
-    """Folder for the scene, its evaluation, checkpoint and log."""
+    """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians (*.spz, say) to write as well,
+    whose name without the suffix becomes the folder."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.io import load_scene
+        from clsplat.io import load_scene, save_gaussians, suffix_of
 
-        if not self.resume and (self.out / "checkpoint.npz").exists():
+        suffix = "" if self.out.is_dir() else suffix_of(self.out)
+        out = self.out.with_name(self.out.name[: -len(suffix)]) if suffix else self.out
+        if not self.resume and (out / "checkpoint.npz").exists():
             raise InputError(
-                f"{self.out}: holds a run already; --resume continues it, another folder after -o starts a new one"
+                f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
             )
         config = self.config
         if config.data.masks is not None:
@@ -123,9 +126,12 @@ class Train:
         device = open_device(config.device)
         scene = load_scene(self.data, config.data)
         say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
-        new_folder(self.out)
-        write_json(self.out / "config.json", {"data_path": str(self.data.resolve()), **asdict(config)})
-        train_and_report(scene, config, device, self.out, self.resume)
+        new_folder(out)
+        write_json(out / "config.json", {"data_path": str(self.data.resolve()), **asdict(config)})
+        gaussians = train_and_report(scene, config, device, out, self.resume)
+        if suffix:
+            save_gaussians(self.out, gaussians, config.render.mode, scene.offset)
+            say(f"{self.out}: {self.out.stat().st_size / 1e6:.3g} MB")
 
 
 def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out: Path, resume: bool) -> "Gaussians":

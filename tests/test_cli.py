@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from PIL import Image
 from clsplat.camera import Camera
 from clsplat.cli import main
 from clsplat.gaussians import Gaussians
-from clsplat.io import load_gaussians, save_gaussians
+from clsplat.io import FORMATS, load_gaussians, save_gaussians
 from clsplat.metrics import to_uint8
 from clsplat.render import render
 from clsplat.testing import synthetic_scene
@@ -81,6 +82,24 @@ def trained(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out")
     run("train", dataset, "-o", out, *TRAIN)
     return out
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_export_knows_every_format(trained: Path, tmp_path: Path, suffix: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what the format cannot hold
+        run("export", trained / "scene.ply", "-o", tmp_path / f"a{suffix}")
+        run("export", tmp_path / f"a{suffix}", "-o", tmp_path / "again.ply")
+    assert len(load_gaussians(tmp_path / "again.ply")[0]) == len(load_gaussians(trained / "scene.ply")[0])
+
+
+def test_train_writes_a_compact_file_beside_its_folder(dataset: Path, tmp_path: Path) -> None:
+    run("train", dataset, "-o", tmp_path / "mine.spz", *TRAIN)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "mine.spz"]
+    scene, compact = (load_gaussians(path)[0] for path in (tmp_path / "mine" / "scene.ply", tmp_path / "mine.spz"))
+    assert len(scene) == len(compact)
+    with pytest.raises(SystemExit):  # the run is there already
+        run("train", dataset, "-o", tmp_path / "mine.spz", *TRAIN)
 
 
 def test_train_leaves_a_scene_and_says_how_good_it_is(trained: Path) -> None:

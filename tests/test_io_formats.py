@@ -220,7 +220,7 @@ def test_files_of_another_format(tmp_path, suffix):
 
 def test_the_longest_suffix_counts(tmp_path):
     assert suffix_of("a.b.compressed.ply") == suffix_of("A.COMPRESSED.PLY") == ".compressed.ply"
-    assert suffix_of("compressed.ply") == ".ply" and suffix_of("a.ply.gz") == suffix_of(".") == ""
+    assert suffix_of("compressed.ply") == ".ply" and suffix_of("a.ply.gz") == suffix_of(".spz") == ""
     path = tmp_path / "scene.ply"
     save(tmp_path / "a.compressed.ply", random_gaussians(3))
     (tmp_path / "a.compressed.ply").rename(path)

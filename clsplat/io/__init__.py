@@ -77,9 +77,9 @@ def save_gaussians(
 
 
 def suffix_of(path: str | Path) -> str:
-    """The suffix in `FORMATS` that a file's name ends with; empty if none."""
+    """The suffix in `FORMATS` that a file's name ends with, and has something before; empty if none."""
     name = Path(path).name.lower()
-    return max((suffix for suffix in FORMATS if name.endswith(suffix)), key=len, default="")
+    return max((suffix for suffix in FORMATS if name[1:].endswith(suffix)), key=len, default="")
 
 
 def _format(path: str | Path) -> tuple[Loader, Saver]:
