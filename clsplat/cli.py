@@ -354,15 +354,16 @@ class Demo:
         )
 
 
+# tyro makes sub-commands of a union; the hidden member makes one of a single class.
+BENCHMARKS = Annotated[Kernels, tyro.conf.subcommand("kernels")] | Annotated[None, tyro.conf.Suppress]
+
+
 @dataclass(frozen=True)
 class Bench:
     """Measure this installation on this machine."""
 
-    # tyro makes sub-commands of a union; the hidden member makes one of a single class.
-    what: Annotated[
-        Annotated[Kernels, tyro.conf.subcommand("kernels")] | Annotated[None, tyro.conf.Suppress],
-        tyro.conf.arg(name=""),
-    ]
+    what: Annotated[BENCHMARKS, tyro.conf.arg(name="")]
+    """What to measure."""
 
     def run(self) -> None:
         """Run the command."""
