@@ -22,7 +22,11 @@ from clsplat.render import fetch
 
 @dataclass
 class State:
-    """All that training changes, which is what a checkpoint holds, and the scene's extent in world units."""
+    """All that training changes, which is what a checkpoint holds, and the scene's extent in world units.
+
+    intersections: the most tiles that a Gaussian has met in a view, on the mean over all Gaussians; it bounds their
+    growth where memory does.
+    """
 
     iteration: int
     seconds: float
@@ -30,11 +34,13 @@ class State:
     gaussians: Gaussians
     moments: Moments
     strategy: Strategy
+    intersections: float = 0.0
 
 
 def save_state(path: Path, state: State, config: TrainConfig) -> None:
     """Write the state to an .npz file, whole or not at all."""
     arrays: dict[str, Any] = {"iteration": state.iteration, "seconds": state.seconds}
+    arrays["intersections"] = state.intersections
     arrays["config"] = json.dumps(asdict(config), sort_keys=True)
     parts = {"gaussians": state.gaussians, "first": state.moments.first, "second": state.moments.second}
     for part, gaussians in parts.items():
@@ -54,7 +60,8 @@ def load_state(path: Path, extent: float, config: TrainConfig) -> State:
     """
     arrays = _load_arrays(path)
     saved, asked = json.loads(str(arrays["config"])), json.loads(json.dumps(asdict(config)))
-    for free in ("device", "checkpoint_every", "eval_every"):  # they do not change the result
+    # They do not change the result, but for a limit that is reached: whoever ran out of memory lowers it.
+    for free in ("device", "checkpoint_every", "eval_every", "memory_limit"):
         saved.pop(free, None), asked.pop(free, None)
     if saved != asked:
         changed = sorted(k for k in asked if asked[k] != saved.get(k))
@@ -67,7 +74,8 @@ def load_state(path: Path, extent: float, config: TrainConfig) -> State:
     strategy = STRATEGIES[config.strategy](config, extent, len(gaussians))
     strategy.statistics = {k: arrays[f"statistics.{k}"] for k in strategy.statistics}
     moments = Moments(part("first"), part("second"))
-    return State(int(arrays["iteration"]), float(arrays["seconds"]), extent, gaussians, moments, strategy)
+    numbers = int(arrays["iteration"]), float(arrays["seconds"]), extent
+    return State(*numbers, gaussians, moments, strategy, float(arrays["intersections"]))
 
 
 def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:

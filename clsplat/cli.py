@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.scene import Scene
 
+STARTED = time.perf_counter()  # of the command, but for the 0.2 s that Python takes to get here
+
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
 
@@ -32,11 +34,11 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def open_device(name: str | None) -> "Device":
+def open_device(name: str | None, memory_limit: int | None = None) -> "Device":
     """The device the user asked for, named."""
     from clsplat.device import Device, select_device
 
-    device = Device(select_device(name))
+    device = Device(select_device(name), memory_limit=memory_limit)
     say(f"device: {device.label}")
     return device
 
@@ -113,6 +115,7 @@ class Train:
     def run(self) -> None:
         """Run the command."""
         from clsplat.io import load_scene, save_gaussians, suffix_of
+        from clsplat.memory import Footprint, parse_size
 
         suffix = "" if self.out.is_dir() else suffix_of(self.out)
         out = self.out.with_name(self.out.name[: -len(suffix)]) if suffix else self.out
@@ -123,9 +126,13 @@ class Train:
         config = self.config
         if config.data.masks is not None:
             config = replace(config, data=replace(config.data, masks=str(Path(config.data.masks).resolve())))
-        device = open_device(config.device)
+        limit = None if config.memory_limit is None else parse_size(config.memory_limit, "--memory-limit")
+        device = open_device(config.device, limit)
         scene = load_scene(self.data, config.data)
         say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
+        need = Footprint.of(scene, config.init.sh_degree, device)
+        start = len(scene.points) or config.init.random_points
+        say(need.describe(start, config.adc.max_gaussians, device.memory_limit))
         new_folder(out)
         write_json(out / "config.json", {"data_path": str(self.data.resolve()), **asdict(config)})
         gaussians = train_and_report(scene, config, device, out, self.resume)
@@ -154,6 +161,8 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
     with tqdm(total=config.iterations, unit="it", dynamic_ncols=True) as bar:
 
         def progress(record: dict[str, Any]) -> None:
+            if bar.n == 0:
+                bar.write(f"first iteration: done {time.perf_counter() - STARTED:.1f} s after the start", sys.stderr)
             bar.update(record["iteration"] - bar.n)
             if interrupted.is_set():
                 say(f"\n{out}: stopped after iteration {record['iteration']}; --resume continues from there")

@@ -149,6 +149,9 @@ class TrainConfig:
     """Iterations between two evaluations on the held-out photos for the training curve (0: none before the end)."""
     device: str | None = None
     """Part of the platform's or device's name; PYOPENCL_CTX is honoured where this is not given."""
+    memory_limit: str | None = None
+    """Device memory that may be used, such as 4GB or 512MiB (default: all there is). The number of Gaussians stops
+    growing where more would exceed it, and photos that do not fit beside them are uploaded anew each time."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     init: InitConfig = field(default_factory=InitConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)

@@ -120,7 +120,8 @@ def rasterization(
     for i in range(cameras):
         camera = Camera(viewmats[i], Ks[i, 0, 0], Ks[i, 1, 1], Ks[i, 0, 2], Ks[i, 1, 2], width, height)
         splats = stage.project_fwd(parameters, camera, sh_degree or 0, antialiased=rasterize_mode == "antialiased")
-        bins = stage.bin_splats(splats, width, height, max(width, height) if device is None else tile_size)
+        edge = max(width, height) if device is None else tile_size
+        bins = stage.bin_splats(splats, width, height, edge, gradients=False)
         values = colors[i] if sh_degree is None else download(splats.colors)
         values = _with_depth(values, download(splats.depths), render_mode)
         background = np.zeros(values.shape[1])
@@ -133,9 +134,7 @@ def rasterization(
             render[:, :, -1:] = np.divide(render[:, :, -1:], alpha, out=np.zeros_like(alpha), where=alpha > 0)
         renders.append(render)
         alphas.append(alpha)
-        order, first = download(bins.order), download(bins.first_slots).astype(np.int64)
-        tiles = np.empty(n, dtype=np.int64)
-        tiles[order] = np.diff(first)
+        tiles = np.bincount(download(bins.gauss_ids), minlength=n)
         meta = {name: download(getattr(splats, name)) for name in ("means2d", "conics", "depths", "opacities")}
         metas.append(meta | {"radii": np.ceil(download(splats.extents)).astype(np.int32), "tiles_per_gauss": tiles})
     stacked: dict[str, Any] = {name: np.stack([meta[name] for meta in metas]) for name in metas[0]}

@@ -64,6 +64,8 @@ def forward(
     config: RenderConfig,
     background: Any,
     sh_degree: int,
+    *,
+    gradients: bool = True,
 ) -> Pass:
     """Run the stages from Gaussians to an image.
 
@@ -74,13 +76,15 @@ def forward(
     gaussians : Gaussians of N >= 1 rows, arrays of the device
     background : (C,) array on the host
         Its length is the number of channels: 3 for RGB, 4 to composite the depth too.
+    gradients : bool
+        Whether `backward` will follow: its lists of intersections are left out otherwise.
     """
     stage = stage_functions(device)
     antialiased = config.mode == "antialiased"
     splats = stage.project_fwd(gaussians, camera, sh_degree, antialiased=antialiased, channels=len(background))
     # The twins work splat by splat and gain nothing from tiles.
     tile_size = max(camera.width, camera.height) if device is None else config.tile_size
-    bins = stage.bin_splats(splats, camera.width, camera.height, tile_size)
+    bins = stage.bin_splats(splats, camera.width, camera.height, tile_size, gradients=gradients)
     image = stage.composite_fwd(splats, bins, background, compositor=config.compositor)
     return Pass(gaussians, camera, config, sh_degree, splats, bins, image)
 
@@ -294,6 +298,6 @@ def _renderings(
             image = np.broadcast_to(background.astype(dtype), (camera.height, camera.width, len(background)))
             yield Rendering(device, None, gaussians, image, np.zeros(image.shape[:2], dtype))
             continue
-        run = forward(device, uploaded, camera, config, background, sh_degree)
+        run = forward(device, uploaded, camera, config, background, sh_degree, gradients=gradients)
         image, alpha = download(run.image.image), download(run.image.alpha)
         yield Rendering(device, run if gradients else None, gaussians, image, alpha)

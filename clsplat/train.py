@@ -1,6 +1,7 @@
 """Training: algorithm 1 of Kerbl et al. 2023."""
 
 import time
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 from clsplat.checkpoint import State, load_state, log_file, save_state
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.densify import STRATEGIES, Edit
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError, DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.initialize import initialize
+from clsplat.memory import INTERSECTIONS, Footprint, Photos
 from clsplat.optim import Moments, adam_settings, sh_degree_at
 from clsplat.randomness import stream
 from clsplat.render import backward, download, fetch, forward, stage_functions, upload
@@ -25,27 +27,6 @@ if TYPE_CHECKING:
 
 # Iterations per line of the log: its loss is their mean, since the loss of single photos says little.
 LOG_EVERY = 10
-# Photos stay on the device up to this share of its memory.
-PHOTO_SHARE = 0.25
-
-
-class _Photos:
-    """Photos and masks on the device, uploaded when first asked for."""
-
-    def __init__(self, device: "Device", views: list[View]):
-        self._device = device
-        self._kept: dict[str, tuple[Any, Any]] = {}
-        self._budget = PHOTO_SHARE * device.cl_device.global_mem_size
-
-    def __call__(self, view: View) -> tuple[Any, Any]:
-        if view.name in self._kept:
-            return self._kept[view.name]
-        photo = self._device.upload("photo", view.image, np.uint8)
-        mask = None if view.mask is None else self._device.upload("mask", view.mask, np.uint8)
-        self._budget -= photo.nbytes + (0 if mask is None else mask.nbytes)
-        if self._budget >= 0:
-            self._kept[view.name] = photo, mask
-        return photo, mask
 
 
 def view_at(iteration: int, views: list[View], seed: int) -> View:
@@ -90,20 +71,42 @@ def train(
     ------
     InputError
         If the scene has no photos to train on, or the checkpoint is of another configuration.
+    DeviceError
+        If the device's memory, or its limit, is exceeded in spite of all.
     ClsplatError
         If the loss stops being finite.
+
+    Warns
+    -----
+    UserWarning
+        If the Gaussians stop growing because more would not fit the device's memory.
     """
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
     state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
-    photos = _Photos(device, scene.train)
+    photos, need = Photos(device), Footprint.of(scene, config.init.sh_degree, device)
     if config.optimizer == "device":
         _move(state, device)
     losses: list[float] = []
     with log_file(out / "log.jsonl", state.iteration) as log:
         started = time.perf_counter() - state.seconds
         for iteration in range(state.iteration + 1, config.iterations + 1):
-            loss = step(state, iteration, view_at(iteration, scene.train, config.seed), photos, config, device)
+            intersections = state.intersections or INTERSECTIONS
+            photos.keep_within(device.memory_limit - need.total(len(state.gaussians), intersections))
+            if state.strategy.due(iteration):
+                fitting = need.most_gaussians(device.memory_limit, intersections)
+                state.strategy.max_gaussians = min(config.adc.max_gaussians, fitting)
+                if len(state.gaussians) >= fitting:
+                    warnings.warn(f"no more than {fitting} Gaussians fit the memory: growth stops", stacklevel=2)
+            try:
+                loss = step(state, iteration, view_at(iteration, scene.train, config.seed), photos, config, device)
+                if state.strategy.due(iteration):
+                    densify(state, device if config.optimizer == "device" else None)
+            except DeviceError as error:
+                raise DeviceError(
+                    f"iteration {iteration}: {error}; the last checkpoint in {out}, if there is one, is intact: "
+                    "--resume with a lower --memory-limit stops growth earlier"
+                ) from error
             if not np.isfinite(loss):
                 raise ClsplatError(
                     f"training diverged: the loss of iteration {iteration} is {loss}; lower the learning rates "
@@ -131,8 +134,8 @@ def train(
     return fetch(state.gaussians)
 
 
-def step(state: State, iteration: int, view: View, photos: _Photos, config: TrainConfig, device: "Device") -> float:
-    """One iteration: render, compare, differentiate, update, densify. Changes `state`, returns the loss."""
+def step(state: State, iteration: int, view: View, photos: Photos, config: TrainConfig, device: "Device") -> float:
+    """One iteration: render, compare, differentiate, update. Changes `state`, returns the loss."""
     camera = view.camera
     sh_degree = sh_degree_at(iteration, config.shortened(config.optim.sh_degree_every), state.gaussians.sh_degree)
     photo, mask = photos(view)
@@ -140,6 +143,7 @@ def step(state: State, iteration: int, view: View, photos: _Photos, config: Trai
     gaussians = state.gaussians if optimizer else upload(device, state.gaussians)
 
     run = forward(device, gaussians, camera, config.render, BACKGROUNDS[config.data.background], sh_degree)
+    state.intersections = max(state.intersections, run.bins.gauss_ids.shape[0] / len(gaussians))
     loss, v_image = stage_functions(device).l1_ssim(run.image.image, photo, config.optim.ssim_weight, mask)
     # No kernel writes this buffer: the loss does not depend on alpha.
     v_alpha = device.scratch("v_alpha", camera.height * camera.width)
@@ -154,13 +158,19 @@ def step(state: State, iteration: int, view: View, photos: _Photos, config: Trai
     stage_functions(optimizer).adam_step(
         state.gaussians, v_gaussians, moments.first, moments.second, settings, sh_degree
     )
-    if state.strategy.due(iteration):
-        _move(state, None)
-        _apply(state.strategy.edit(iteration, state.gaussians), state)
-        if optimizer:
-            _move(state, optimizer)
     state.iteration = iteration
     return loss
+
+
+def densify(state: State, device: "Device | None") -> None:
+    """The edit that is due after an iteration; None: the parameters are on the host. Changes `state`.
+
+    Not a part of `step`, whose arrays of the old size must be gone before those of the new one are allocated.
+    """
+    _move(state, None)
+    _apply(state.strategy.edit(state.iteration, state.gaussians), state)
+    if device:
+        _move(state, device)
 
 
 def _apply(edit: Edit, state: State) -> None:

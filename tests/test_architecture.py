@@ -25,7 +25,7 @@ LAYERS = """
     camera gaussians lenses
     sfm
     scene structs device reference metrics raytrace orbit
-    ops io testing still_life
+    ops io testing still_life memory
     render optim densify initialize report demo
     checkpoint rasterization
     train

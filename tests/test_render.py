@@ -322,6 +322,17 @@ class TestForwardOnly:
         list(render_views(scene[0], cameras, RenderConfig(), device))
         assert [uploads.count(name) for name in FIELDS] == [1] * len(FIELDS)
 
+    def test_lists_are_made_without_what_gradients_need(self, scene, cameras, monkeypatch):
+        asked = []
+        bin_splats = reference.bin_splats
+        monkeypatch.setattr(
+            reference, "bin_splats", lambda *a, gradients=True: asked.append(gradients) or bin_splats(*a)
+        )
+        list(render_views(scene[0], cameras))
+        render(*scene, gradients=False)
+        render(*scene)
+        assert asked == [False] * (len(cameras) + 1) + [True]
+
     def test_cameras_are_asked_for_one_by_one(self, device, scene, cameras):
         asked = []
         views = render_views(scene[0], (asked.append(c) or c for c in cameras), RenderConfig(), device)

@@ -34,6 +34,7 @@ class Adc:
         self.first_edit = -(-self.start // config.adc.every) * config.adc.every
         self.stop = round(config.adc.stop_fraction * config.iterations)
         self.statistics: dict[str, Array] = {}
+        self.max_gaussians = config.adc.max_gaussians
         self._clear(n)
 
     def _clear(self, n: int) -> None:
@@ -79,7 +80,7 @@ class Adc:
         grads = self.statistics["grad_sum"] / np.maximum(self.statistics["seen"], 1)
         chosen = np.flatnonzero(grads >= c.grad_threshold)
         # Each adds one Gaussian; where the cap leaves no room for all, the largest gradients come first.
-        room = max(0, c.max_gaussians - n)
+        room = max(0, self.max_gaussians - n)
         if len(chosen) > room:
             chosen = np.sort(chosen[np.argsort(-grads[chosen], kind="stable")[:room]])
         large = gaussians.scales[chosen].max(axis=1) > c.scale_threshold * self.extent

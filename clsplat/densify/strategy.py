@@ -27,10 +27,12 @@ class Strategy(Protocol):
     """Decides when Gaussians are added and removed, from statistics of the gradients.
 
     A strategy keeps all it remembers between iterations in `statistics`, arrays of one row per Gaussian: checkpoints
-    save and restore them, so that a resumed run continues to the same bits.
+    save and restore them, so that a resumed run continues to the same bits. No edit leaves more than `max_gaussians`,
+    which training lowers to what fits the device.
     """
 
     statistics: dict[str, Array]
+    max_gaussians: int
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         """Statistics of `n` Gaussians in a scene of the given extent, in world units."""

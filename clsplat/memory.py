@@ -1,0 +1,158 @@
+"""Device memory that training takes, predicted from what each stage allocates; photos are kept in what it leaves."""
+
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from clsplat.errors import InputError
+from clsplat.scene import Scene, View
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+INTERSECTIONS = 8.0
+"""Tiles that a Gaussian is assumed to meet: the mean over all Gaussians, in the view where it is largest. Measured: 2
+to 5 in scenes of 25 000 to 110 000 Gaussians at 0.13 to 0.5 megapixels; up to 20 for sparse starts at 0.7, whose
+Gaussians are so few that it does not matter."""
+
+ROUNDING = 17 / 16
+"""The pool rounds a block up to the next of 16 sizes per octave."""
+
+REAL = 4  # bytes of a float32, a uint32 or an index
+
+# What a stage allocates, in values of 4 bytes, as its file in clsplat/ops names them. Blocks of unlike sizes are not
+# shared, so that the buffers of all stages add up.
+PER_GAUSSIAN = {
+    "project": 12,  # means2d 2, conics 3, depths, extents 2, opacities, colors 3
+    "bin": 15,  # depth keys, ellipses 8, sort keys and sort order twice, tiles per Gaussian and their sums
+    "composite": 12 + 9,  # packed splats; v_means2d 2, v_conics 3, v_opacities, v_colors 3
+}
+PER_INTERSECTION = {
+    "bin": 2,  # intersections twice
+    "composite": 9,  # gradients per intersection
+}
+PER_INTERSECTION_GPU = 5  # bin: intersections once more, sort keys and sort order twice
+PER_PIXEL = {
+    "composite": 4,  # image 3, alpha
+    "loss": 3 + 9 + 1,  # v_image, derivatives of SSIM, v_alpha
+    "photo": 1,  # 3 bytes, and one of a mask
+}
+PER_ROW = 3 * 416  # derivatives of SSIM: rows have margins, and end with a work-item
+
+COPIES = 4
+"""Of all parameters: themselves, Adam's two moments, and the gradients, whose blocks an evaluation reuses."""
+
+UNITS = {"MB": 10**6, "GB": 10**9, "MiB": 2**20, "GiB": 2**30}
+
+
+def parse_size(text: str, name: str) -> int:
+    """Bytes of a size such as 4GB, 512MiB, 1.5 GB; `name` is the argument's in errors.
+
+    Raises
+    ------
+    InputError
+        If it is not a positive number with one of the units MB, GB (powers of ten), MiB, GiB (of two).
+    """
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?(MB|GB|MiB|GiB)", text)
+    size = int(float(match[1]) * UNITS[match[2]]) if match else 0
+    if size == 0:
+        raise InputError(f"{name}: expected a size such as 4GB or 512MiB, found {text!r}")
+    return size
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Device memory of training on photos of one size.
+
+    Parameters
+    ----------
+    width, height : int
+        Of the largest photo, px.
+    sh_degree : int
+        Highest degree of the spherical harmonics.
+    gpu : bool
+        The device is no CPU: intersections are sorted in another way.
+    """
+
+    width: int
+    height: int
+    sh_degree: int
+    gpu: bool
+
+    @classmethod
+    def of(cls, scene: Scene, sh_degree: int, device: "Device") -> "Footprint":
+        """That of training on the scene's photos."""
+        cameras = [view.camera for view in scene.train + scene.test]
+        return cls(max(c.width for c in cameras), max(c.height for c in cameras), sh_degree, not device.is_cpu)
+
+    def per_gaussian(self, intersections: float = INTERSECTIONS) -> float:
+        """Bytes per Gaussian that meets so many tiles."""
+        parameters = 11 + 3 * (self.sh_degree + 1) ** 2
+        per_intersection = sum(PER_INTERSECTION.values()) + self.gpu * PER_INTERSECTION_GPU
+        values = COPIES * parameters + sum(PER_GAUSSIAN.values()) + intersections * per_intersection
+        return REAL * ROUNDING * values
+
+    @property
+    def fixed(self) -> int:
+        """Bytes that do not depend on the Gaussians."""
+        return round(REAL * ROUNDING * self.height * (self.width * sum(PER_PIXEL.values()) + PER_ROW))
+
+    def total(self, n: int, intersections: float = INTERSECTIONS) -> int:
+        """Bytes for n Gaussians, each of which meets so many tiles; one photo is on the device."""
+        return self.fixed + round(n * self.per_gaussian(intersections))
+
+    def most_gaussians(self, limit: int, intersections: float = INTERSECTIONS) -> int:
+        """The largest number of Gaussians for which `total` is within `limit` bytes; 0 where none is."""
+        return max(0, int((limit - self.fixed) / self.per_gaussian(intersections)))
+
+    def describe(self, start: int, cap: int, limit: int) -> str:
+        """A sentence on what training takes, from `start` Gaussians to at most `cap`, within `limit` bytes.
+
+        Raises
+        ------
+        InputError
+            If not even the start fits; the message says what does.
+        """
+        if self.total(start) > limit:
+            smaller = {d: replace(self, width=self.width // d, height=self.height // d) for d in (2, 4, 8)}
+            fitting = [f" with all of them: --downscale {d}" for d, f in smaller.items() if f.total(start) <= limit]
+            raise InputError(
+                f"--memory-limit: expected at least {self.total(start) / 1e9:.2f} GB for {start} Gaussians at "
+                f"{self.width}x{self.height}, found {limit / 1e9:.2f} GB; what fits at this size: "
+                f"{self.most_gaussians(limit)} Gaussians{''.join(fitting[:1])}"
+            )
+        return (
+            f"memory: {self.total(start) / 1e9:.2f} GB for {start} Gaussians, {self.total(cap) / 1e9:.2f} GB for "
+            f"{cap} (--adc.max-gaussians), if each meets {INTERSECTIONS:.0f} tiles; limit {limit / 1e9:.2f} GB, "
+            f"enough for {self.most_gaussians(limit)}"
+        )
+
+
+class Photos:
+    """Photos and masks on the device, uploaded when first asked for and kept within a budget of bytes."""
+
+    def __init__(self, device: "Device"):
+        self._device = device
+        self._kept: dict[str, tuple[Any, Any]] = {}
+        self._bytes = 0
+        self._budget = 0
+
+    def keep_within(self, budget: int) -> None:
+        """Drop what exceeds a budget, which counts from now on."""
+        self._budget = budget
+        while self._kept and self._bytes > budget:
+            _, dropped = self._kept.popitem()
+            self._bytes -= sum(array.nbytes for array in dropped if array is not None)
+
+    def __call__(self, view: View) -> tuple[Any, Any]:
+        if view.name in self._kept:
+            return self._kept[view.name]
+        photo = self._device.upload("photo", view.image, np.uint8)
+        mask = None if view.mask is None else self._device.upload("mask", view.mask, np.uint8)
+        size = photo.nbytes + (0 if mask is None else mask.nbytes)
+        if self._bytes + size <= self._budget:
+            self._kept[view.name] = photo, mask
+            self._bytes += size
+        return photo, mask
