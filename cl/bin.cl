@@ -129,6 +129,12 @@ __kernel void bin_identity(const uint n, __global uint *order) {
         order[i] = i;
 }
 
+// The run of a work-item: from both ends in turn, since the last runs of an order by depth hold what is invisible, and
+// neighbouring work-items often share a core.
+static inline uint run_of(uint w, uint runs) {
+    return w % 2 ? runs - 1 - w / 2 : w / 2;
+}
+
 static inline uint run_begin(uint n, uint runs, uint run) {
     return (uint)((ulong)n * run / runs);
 }
@@ -145,9 +151,9 @@ static inline void gather(uint begin, uint end, const __global uint *order, cons
 __kernel void bin_histogram(const uint n, const uint runs, const uint tile_count, const int width, const int height,
                             const __global uint *order, const __global Ellipse *ellipses, __global uint *counters,
                             __global uint *counts) {
-    const uint run = get_global_id(0);
-    if (run >= runs)
+    if (get_global_id(0) >= runs)
         return;
+    const uint run = run_of(get_global_id(0), runs);
     counters += (size_t)tile_count * run;
     for (uint t = 0; t < tile_count; ++t)
         counters[t] = 0;
@@ -182,9 +188,9 @@ __kernel void bin_scatter(const uint n, const uint runs, const uint tile_count, 
                           const __global uint *order, const __global Ellipse *ellipses, __global uint *counters,
                           const __global uint *tile_begins, const __global uint *first_slots,
                           __global uint *gauss_ids, __global uint *slots) {
-    const uint run = get_global_id(0);
-    if (run >= runs)
+    if (get_global_id(0) >= runs)
         return;
+    const uint run = run_of(get_global_id(0), runs);
     counters += (size_t)tile_count * run;
     for (uint t = 0; t < tile_count; ++t)
         counters[t] += tile_begins[t];
