@@ -19,6 +19,7 @@ from clsplat.checkpoint import State
 from clsplat.config import BACKGROUNDS, OptimConfig, RenderConfig, TrainConfig
 from clsplat.densify import STRATEGIES
 from clsplat.device import Device
+from clsplat.memory import Photos
 from clsplat.optim import Moments
 from clsplat.render import forward, upload
 from clsplat.train import step
@@ -152,8 +153,8 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
     }
     del run
 
-    photo = device.upload("photo", view.image, np.uint8)
-    mask = None if view.mask is None else device.upload("mask", view.mask, np.uint8)
+    photos = Photos(device)
+    photos.keep_within(4 * view.image.nbytes)  # the photo and its mask stay on the device
     moments = Moments.zeros(gaussians)
     state = State(
         ITERATION - 1,
@@ -165,7 +166,7 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
     )
 
     def one_step() -> None:
-        step(state, ITERATION, view, lambda _: (photo, mask), config, device)  # type: ignore[arg-type]
+        step(state, ITERATION, view, photos, config, device)
         device.queue.finish()
 
     steps: list[Clock] = []
