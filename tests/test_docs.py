@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat import cli, config, constants, densify, ops
+from clsplat import cli, config, constants, densify, io, ops
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/howto/python.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/howto/python.md", "docs/howto/memory.md"])
 def test_python_examples_run(page, device, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYOPENCL_NO_CACHE", "1")
@@ -72,6 +72,12 @@ def test_every_strategy_is_described():
     page = (DOCS / "howto" / "photos.md").read_text()
     for name in densify.STRATEGIES:
         assert f"`{name}`" in page, name
+
+
+def test_every_format_is_measured():
+    page = (DOCS / "formats.md").read_text()
+    for suffix in io.FORMATS:
+        assert page.count(f"| `{suffix}` |") == 2, suffix  # what is kept, and what it costs
 
 
 def messages():
