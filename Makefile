@@ -1,6 +1,6 @@
 PYTHON = python
 
-.PHONY: test test-slow lint docs check-races bench
+.PHONY: test test-slow lint docs check-races bench formats
 
 # The default tests: a few minutes on two cores.
 test:
@@ -29,3 +29,7 @@ check-races:
 # The figures of docs/benchmarks.md, measured anew: some minutes, on a machine that does nothing else.
 bench:
 	$(PYTHON) -m clsplat bench kernels -o docs/results/kernels.json --scaling docs/results/kernels.svg
+
+# The figures of docs/formats.md: make formats SCENE=scene.ply DATA=dataset OPTIONS="--downscale 2".
+formats:
+	$(PYTHON) tests/measure_formats.py $(SCENE) $(DATA) $(OPTIONS)

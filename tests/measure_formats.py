@@ -1,12 +1,13 @@
 """What each format of `FORMATS` costs: bytes per Gaussian, seconds, and PSNR lost on the held-out photos.
 
-``make formats SCENE=scene.ply DATA=dataset``, the dataset and --downscale as given to ``clsplat train``.
+``make formats SCENE=scene.ply DATA=dataset``, where the dataset and further options in OPTIONS are as given to
+``clsplat train``.
 """
 
 import tempfile
 import time
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,33 +40,37 @@ def main() -> None:
     background = BACKGROUNDS[arguments.data.background]
 
     def renders(candidate):
-        return [to_uint8(render(candidate, v.camera, config, device, background=background).rgb) for v in scene.test]
+        images = (render(candidate, v.camera, config, device, background=background).rgb for v in scene.test)
+        return [to_uint8(image).astype(np.float32) / 255 for image in images]
 
-    before = renders(gaussians)
-    reference = mean_metrics(gaussians, scene.test, config, device, background)["psnr"]
-    print(f"{arguments.scene}: {len(gaussians)} Gaussians, SH degree {gaussians.sh_degree}, PSNR {reference:.2f} dB")
-    print("| format | bytes per Gaussian | smaller than PLY | write s | read s | PSNR lost dB | PSNR to before dB |")
-    print("|---|---|---|---|---|---|---|")
+    def score(candidate):
+        return mean_metrics(candidate, scene.test, config, device, background)["psnr"]
+
+    before, reference, degree = renders(gaussians), score(gaussians), gaussians.sh_degree
+    print(f"{arguments.scene}: {len(gaussians)} Gaussians, SH degree {degree}, PSNR {reference:.2f} dB\n")
+    degrees = " | ".join(f"degree {d}" for d in range(degree + 1))
+    print(f"| format | {degrees} | smaller than PLY | write s | read s | PSNR lost dB | PSNR to before dB |")
+    print("|---" * (degree + 7) + "|")
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as folder:
-        sizes = {}
+        plain = 0
         for suffix in FORMATS:
             path = Path(folder) / f"scene{suffix}"
-            times = [time.perf_counter()]
-            save_gaussians(path, gaussians, mode)
-            times.append(time.perf_counter())
+            sizes = []
+            for cut in range(degree + 1):
+                less = replace(gaussians, sh=gaussians.sh[:, : (cut + 1) ** 2])
+                started = time.perf_counter()
+                save_gaussians(path, less, mode)
+                written = time.perf_counter()
+                sizes.append(path.stat().st_size)
             again = load_gaussians(path)[0]
-            times.append(time.perf_counter())
-            sizes[suffix] = path.stat().st_size
-            after = mean_metrics(again, scene.test, config, device, background)["psnr"]
-            pairs = zip(before, renders(again), strict=True)
-            same = np.mean([psnr(a.astype(np.float32) / 255, b.astype(np.float32) / 255) for a, b in pairs])
-            write, read = np.diff(times)
-            smaller = sizes[".ply"] / sizes[suffix]
-            print(
-                f"| `{suffix}` | {sizes[suffix] / len(gaussians):.1f} | {smaller:.1f} | {write:.2f} | {read:.2f} "
-                f"| {reference - after:.3f} | {same:.1f} |"
-            )
+            read = time.perf_counter()
+            plain = plain or sizes[-1]
+            same = np.mean([psnr(a, b) for a, b in zip(before, renders(again), strict=True)])
+            cells = [f"`{suffix}`", *(f"{size / len(gaussians):.1f}" for size in sizes), f"{plain / sizes[-1]:.1f}"]
+            cells += [f"{written - started:.2f}", f"{read - written:.2f}"]
+            cells += [f"{reference - score(again):.3f}", f"{same:.1f}"]
+            print("| " + " | ".join(cells) + " |", flush=True)
 
 
 if __name__ == "__main__":
