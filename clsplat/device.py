@@ -148,6 +148,7 @@ class Device:
         self.memory_peak = 0
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self.queue))
         self._largest: dict[str, int] = {}
+        self._constants: dict[str, tuple[bytes, cl.array.Array]] = {}
         self._kernels: dict[tuple[str, tuple[Any, ...]], cl.Kernel] = {}
         self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}
 
@@ -244,6 +245,13 @@ class Device:
         result = self.empty(what, host.shape, host.dtype)
         result.set(host)
         return result
+
+    def constant(self, what: str, values: Any) -> cl.array.Array:
+        """Reals named `what` on the device, uploaded when they change: an upload waits for all that is queued."""
+        host = np.ascontiguousarray(values, dtype=self.real)
+        if what not in self._constants or self._constants[what][0] != host.tobytes():
+            self._constants[what] = host.tobytes(), self.upload(what, host)
+        return self._constants[what][1]
 
     def launch(
         self,

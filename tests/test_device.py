@@ -157,12 +157,19 @@ class TestBuffers:
             raise cl.MemoryError("clCreateBuffer failed: MEM_OBJECT_ALLOCATION_FAILURE")
 
         pool = device._pool
-        full = SimpleNamespace(
-            managed_bytes=0, bin_number=pool.bin_number, alloc_size=pool.alloc_size, allocate=allocate
-        )
+        sizes = {"managed_bytes": 0, "bin_number": pool.bin_number, "alloc_size": pool.alloc_size}
+        full = SimpleNamespace(**sizes, allocate=allocate, free_held=lambda: None)
         monkeypatch.setattr(device, "_pool", full)
         with pytest.raises(DeviceError, match=r"splats: .* has no memory left for 4 MiB; use fewer Gaussians"):
             device.empty("splats", (1024, 1024))
+
+    def test_constants_are_uploaded_when_they_change(self, any_device):
+        first = any_device.constant("x", (1, 2, 3))
+        assert any_device.constant("x", np.array([1.0, 2.0, 3.0])) is first
+        second = any_device.constant("x", (1, 2, 4))
+        np.testing.assert_array_equal(second.get(), [1, 2, 4])
+        np.testing.assert_array_equal(first.get(), [1, 2, 3])  # who holds it may still use it
+        assert any_device.constant("y", (1, 2, 4)) is not second
 
     def test_scratch_is_zero_and_kept(self, device):
         first = device.scratch("test", 100, "a")

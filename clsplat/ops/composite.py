@@ -57,7 +57,7 @@ def composite_fwd(device: Device, splats: Splats, bins: Bins, background: Any, *
         device.empty("alpha", (bins.height, bins.width)),
     )
     stage = _variant(device, compositor)
-    arguments = [_packed(device, splats, bins, stage), device.upload("background", background), *result]
+    arguments = [_packed(device, splats, bins, stage), device.constant("background", background), *result]
     _launch(device, stage, "composite_fwd", bins, channels, arguments)
     return result
 
