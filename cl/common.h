@@ -81,4 +81,17 @@ static inline void store4(__global real *x, size_t i, real4 value) {
     x[4 * i + 3] = value.w;
 }
 
+// 16 neighbours at any address.
+typedef struct __attribute__((packed)) {
+    real16 v;
+} Packed16;
+
+static inline real16 load16(const __global real *x) {
+    return ((const __global Packed16 *)x)->v;
+}
+
+static inline void store16(__global real *x, real16 value) {
+    ((__global Packed16 *)x)->v = value;
+}
+
 #endif

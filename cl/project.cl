@@ -22,6 +22,7 @@
 // -DANTIALIASED=0|1   opacity compensation
 // -DVIEWMAT_GRAD=0|1  the backward kernel also writes v_viewmat; needs -DGROUP, the work-group size
 #include "common.h"
+#include "adam.h"
 #include "ellipse.h"
 #include "linalg.h"
 #include "power.h"
@@ -223,6 +224,68 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
 #endif
 }
 
+// Gradients of one visible Gaussian, those with respect to its spherical harmonics as factors: of coefficient k,
+// basis[k] color.
+typedef struct {
+    FootprintGrad geometry;
+    real logit_opacity;
+    real3 color;
+    real basis[16];
+} GaussianGrad;
+
+typedef struct {
+    const __global real *means, *log_scales, *quats, *logit_opacities, *sh;
+} GaussianArrays;
+
+typedef struct {
+    const __global real *conics, *colors, *v_means2d, *v_conics, *v_opacities, *v_colors;
+} SplatArrays;
+
+static inline GaussianGrad gaussian_vjp(size_t i, const Camera *camera, int sh_stride, int sh_degree,
+                                        GaussianArrays gaussians, SplatArrays splats) {
+    GaussianGrad v;
+    const real3 mean = load3(gaussians.means, i);
+    const real4 quat = load4(gaussians.quats, i);
+    const real4 unit_quat = quat / sqrt(dot4(quat, quat));
+    const real4 activated = activate(load3(gaussians.log_scales, i), gaussians.logit_opacities[i]);
+    const Footprint f = footprint(camera, mean, activated.xyz, unit_quat);
+
+    const real opacity = activated.w, factor = compensation(f.det0, f.det), v_opacity = splats.v_opacities[i];
+    v.logit_opacity = v_opacity * factor * opacity * (1 - opacity);
+    const real2 v_det = compensation_vjp(f.det0, f.det, v_opacity * opacity);
+    real3 v_cov = conic_vjp(load3(splats.conics, i), load3(splats.v_conics, i));
+    v_cov += v_det.x * (real3)(f.yy - BLUR, -2 * f.xy, f.xx - BLUR) + v_det.y * (real3)(f.yy, -2 * f.xy, f.xx);
+
+    real v_depth = 0;
+#if CHANNELS == 4
+    v_depth = splats.v_colors[CHANNELS * i + 3];
+#endif
+    v.geometry = footprint_vjp(camera, &f, mean, unit_quat, v_cov, load2(splats.v_means2d, i), v_depth);
+    v.geometry.quat = normalize_quat_vjp(quat, v.geometry.quat);
+
+    // Colour; where it is clamped at 0 nothing passes.
+    const __global real *color = splats.colors + CHANNELS * i, *v_color = splats.v_colors + CHANNELS * i;
+    v.color.x = color[0] > 0 ? v_color[0] : 0;
+    v.color.y = color[1] > 0 ? v_color[1] : 0;
+    v.color.z = color[2] > 0 ? v_color[2] : 0;
+    const real3 offset = from_camera(camera, mean), direction = offset / sqrt(dot3(offset, offset));
+    real v_basis[16];
+    sh_basis(direction, sh_degree, v.basis);
+    for (int k = 0; k < (sh_degree + 1) * (sh_degree + 1); ++k)
+        v_basis[k] = dot3(load3(gaussians.sh, i * sh_stride + k), v.color);
+    const real3 v_offset = normalize_vjp(offset, sh_basis_vjp(direction, sh_degree, v_basis));
+    v.geometry.mean += v_offset;
+
+    // position = -W^-1 translation: v_translation = W v_offset, v_W = (W v_offset) position^T
+    const real3 v_translation = mat3_mul(camera_rotation(camera), v_offset);
+    const real3 position = (real3)(camera->position[0], camera->position[1], camera->position[2]);
+    v.geometry.p += v_translation;
+    v.geometry.view.row0 += v_translation.x * position;
+    v.geometry.view.row1 += v_translation.y * position;
+    v.geometry.view.row2 += v_translation.z * position;
+    return v;
+}
+
 __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
                           const __global real *means, const __global real *log_scales, const __global real *quats,
                           const __global real *logit_opacities, const __global real *extents,
@@ -237,72 +300,30 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
 #endif
 ) {
     const size_t i = get_global_id(0);
-    FootprintGrad v = {0};
-    real v_logit = 0;
+    GaussianGrad v = {0};
     if (i < n) {
         const bool visible = extents[2 * i] > 0;
         const int active = visible ? (sh_degree + 1) * (sh_degree + 1) : 0;
         if (visible) {
-            const real3 mean = load3(means, i);
-            const real4 quat = load4(quats, i);
-            const real4 unit_quat = quat / sqrt(dot4(quat, quat));
-            const real4 activated = activate(load3(log_scales, i), logit_opacities[i]);
-            const Footprint f = footprint(&camera, mean, activated.xyz, unit_quat);
-
-            const real opacity = activated.w;
-            const real factor = compensation(f.det0, f.det);
-            v_logit = v_opacities[i] * factor * opacity * (1 - opacity);
-            const real2 v_det = compensation_vjp(f.det0, f.det, v_opacities[i] * opacity);
-            real3 v_cov = conic_vjp(load3(conics, i), load3(v_conics, i));
-            v_cov +=
-                v_det.x * (real3)(f.yy - BLUR, -2 * f.xy, f.xx - BLUR) + v_det.y * (real3)(f.yy, -2 * f.xy, f.xx);
-
-            real v_depth = 0;
-#if CHANNELS == 4
-            v_depth = v_colors[CHANNELS * i + 3];
-#endif
-            v = footprint_vjp(&camera, &f, mean, unit_quat, v_cov, load2(v_means2d, i), v_depth);
-            v.quat = normalize_quat_vjp(quat, v.quat);
-
-            // Colour; where it is clamped at 0 nothing passes.
-            real3 v_color;
-            v_color.x = colors[CHANNELS * i] > 0 ? v_colors[CHANNELS * i] : 0;
-            v_color.y = colors[CHANNELS * i + 1] > 0 ? v_colors[CHANNELS * i + 1] : 0;
-            v_color.z = colors[CHANNELS * i + 2] > 0 ? v_colors[CHANNELS * i + 2] : 0;
-            const real3 offset = from_camera(&camera, mean);
-            const real3 direction = offset / sqrt(dot3(offset, offset));
-            real basis[16], v_basis[16];
-            sh_basis(direction, sh_degree, basis);
-            for (int k = 0; k < active; ++k) {
-                v_basis[k] = dot3(load3(sh, i * sh_stride + k), v_color);
-                store3(v_sh, i * sh_stride + k, basis[k] * v_color);
-            }
-            const real3 v_offset = normalize_vjp(offset, sh_basis_vjp(direction, sh_degree, v_basis));
-            v.mean += v_offset;
-
-            // position = -W^-1 translation: v_translation = W v_offset, v_W = (W v_offset) position^T
-            const real3 v_translation = mat3_mul(camera_rotation(&camera), v_offset);
-            const real3 position = (real3)(camera.position[0], camera.position[1], camera.position[2]);
-            v.p += v_translation;
-            v.view.row0 += v_translation.x * position;
-            v.view.row1 += v_translation.y * position;
-            v.view.row2 += v_translation.z * position;
+            const GaussianArrays gaussians = {means, log_scales, quats, logit_opacities, sh};
+            const SplatArrays splats = {conics, colors, v_means2d, v_conics, v_opacities, v_colors};
+            v = gaussian_vjp(i, &camera, sh_stride, sh_degree, gaussians, splats);
         }
-        for (int k = active; k < sh_stride; ++k)
-            store3(v_sh, i * sh_stride + k, (real3)0);
-        store3(v_means, i, v.mean);
-        store3(v_log_scales, i, v.log_scales);
-        store4(v_quats, i, v.quat);
-        v_logit_opacities[i] = v_logit;
+        for (int k = 0; k < sh_stride; ++k)
+            store3(v_sh, i * sh_stride + k, k < active ? v.basis[k] * v.color : (real3)0);
+        store3(v_means, i, v.geometry.mean);
+        store3(v_log_scales, i, v.geometry.log_scales);
+        store4(v_quats, i, v.geometry.quat);
+        v_logit_opacities[i] = v.logit_opacity;
     }
 
 #if VIEWMAT_GRAD
     __local real partial[12 * GROUP];
     const uint lane = get_local_id(0);
-    vstore3(v.view.row0, 4 * lane, partial);
-    vstore3(v.view.row1, 4 * lane + 1, partial);
-    vstore3(v.view.row2, 4 * lane + 2, partial);
-    vstore3(v.p, 4 * lane + 3, partial);
+    vstore3(v.geometry.view.row0, 4 * lane, partial);
+    vstore3(v.geometry.view.row1, 4 * lane + 1, partial);
+    vstore3(v.geometry.view.row2, 4 * lane + 2, partial);
+    vstore3(v.geometry.p, 4 * lane + 3, partial);
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint k = lane; k < 12; k += GROUP) {
         real sum = 0;
@@ -311,4 +332,67 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
         v_viewmat[12 * get_group_id(0) + k] = sum;
     }
 #endif
+}
+
+// project_bwd and the step of Adam (adam.cl) in one pass, with the gradients in registers.
+__kernel void project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
+                               const Adam adam, const __global real *extents, const __global real *conics,
+                               const __global real *colors, const __global real *v_means2d,
+                               const __global real *v_conics, const __global real *v_opacities,
+                               const __global real *v_colors, __global real *means, __global real *log_scales,
+                               __global real *quats, __global real *logit_opacities, __global real *sh,
+                               __global real *means_1, __global real *log_scales_1, __global real *quats_1,
+                               __global real *logit_opacities_1, __global real *sh_1, __global real *means_2,
+                               __global real *log_scales_2, __global real *quats_2, __global real *logit_opacities_2,
+                               __global real *sh_2) {
+    const size_t i = get_global_id(0);
+    if (i >= n)
+        return;
+    GaussianGrad v = {0};
+    if (extents[2 * i] > 0) {
+        const GaussianArrays gaussians = {means, log_scales, quats, logit_opacities, sh};
+        const SplatArrays splats = {conics, colors, v_means2d, v_conics, v_opacities, v_colors};
+        v = gaussian_vjp(i, &camera, sh_stride, sh_degree, gaussians, splats);
+    }
+
+    const real16 rates =
+        (real16)((real3)adam.means, (real3)adam.log_scales, (real4)adam.quats, adam.logit_opacities, (real4)0, 0);
+    const real16 g = (real16)(v.geometry.mean, v.geometry.log_scales, v.geometry.quat, v.logit_opacity, (real4)0, 0);
+    real16 p = (real16)(load3(means, i), load3(log_scales, i), load4(quats, i), logit_opacities[i], (real4)0, 0);
+    real16 m =
+        (real16)(load3(means_1, i), load3(log_scales_1, i), load4(quats_1, i), logit_opacities_1[i], (real4)0, 0);
+    real16 w =
+        (real16)(load3(means_2, i), load3(log_scales_2, i), load4(quats_2, i), logit_opacities_2[i], (real4)0, 0);
+    p = adam_update(&adam, rates, p, g, &m, &w);
+    store3(means, i, p.s012);
+    store3(means_1, i, m.s012);
+    store3(means_2, i, w.s012);
+    store3(log_scales, i, p.s345);
+    store3(log_scales_1, i, m.s345);
+    store3(log_scales_2, i, w.s345);
+    store4(quats, i, p.s6789);
+    store4(quats_1, i, m.s6789);
+    store4(quats_2, i, w.s6789);
+    logit_opacities[i] = p.sa;
+    logit_opacities_1[i] = m.sa;
+    logit_opacities_2[i] = w.sa;
+
+    const int width = 3 * (sh_degree + 1) * (sh_degree + 1);
+    real16 v_sh[3];
+    for (int k = 0; k < width; ++k)
+        ((real *)v_sh)[k] = v.basis[k / 3] * ((const real *)&v.color)[k % 3];
+    real16 sh_rates = adam.sh_rest;
+    sh_rates.s012 = adam.sh0;
+    const size_t first = i * 3 * sh_stride;
+    for (int k = 0; k < width; k += 16, sh_rates = adam.sh_rest) {
+        __global real *q = sh + first + k, *q_1 = sh_1 + first + k, *q_2 = sh_2 + first + k;
+        if (k + 16 > width) {
+            adam_update_some(&adam, sh_rates, width - k, v_sh[k / 16], q, q_1, q_2);
+            break;
+        }
+        real16 q_m = load16(q_1), q_v = load16(q_2);
+        store16(q, adam_update(&adam, sh_rates, load16(q), v_sh[k / 16], &q_m, &q_v));
+        store16(q_1, q_m);
+        store16(q_2, q_v);
+    }
 }

@@ -11,4 +11,12 @@ typedef struct {
     int width, height;   // px
 } Camera;
 
+// One step of Adam; rates are divided by 1 - beta1^t, take is 1 - keep.
+typedef struct {
+    real means, log_scales, quats, logit_opacities, sh0, sh_rest; // rates by parameter
+    real keep1, take1, keep2, take2;                              // beta1, beta2
+    real inv_correction2;                                         // 1/(1 - beta2^t)
+    real eps;
+} Adam;
+
 #endif

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config import OptimConfig
+from clsplat.constants import SH_DEGREE_MAX
 from clsplat.gaussians import Gaussians
 from clsplat.stages import AdamStep
 
@@ -40,7 +41,9 @@ def sh_degree_at(iteration: int, every: int, stored: int) -> int:
     return min(stored, (iteration - 1) // every)
 
 
-def adam_settings(iteration: int, iterations: int, extent: float, config: OptimConfig) -> AdamStep:
+def adam_settings(
+    iteration: int, iterations: int, extent: float, config: OptimConfig, sh_degree: int = SH_DEGREE_MAX
+) -> AdamStep:
     """Learning rates and constants of an iteration.
 
     Parameters
@@ -49,6 +52,8 @@ def adam_settings(iteration: int, iterations: int, extent: float, config: OptimC
         The current one, counted from 1, and the last one, at which means_lr_final is reached.
     extent : float
         Scale of the scene in world units: the means' rate is proportional to it.
+    sh_degree : int
+        Highest degree of the spherical harmonics that is trained.
     """
     progress = (iteration - 1) / max(iterations - 1, 1)
     rates = {
@@ -59,4 +64,4 @@ def adam_settings(iteration: int, iterations: int, extent: float, config: OptimC
         "sh0": config.sh0_lr,
         "sh_rest": config.sh_rest_lr,
     }
-    return AdamStep(iteration, rates, config.beta1, config.beta2, config.eps)
+    return AdamStep(iteration, rates, config.beta1, config.beta2, config.eps, sh_degree)

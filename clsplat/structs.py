@@ -5,6 +5,9 @@ from typing import Any
 import numpy as np
 
 from clsplat.camera import Camera
+from clsplat.stages import AdamStep
+
+RATES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "sh_rest")
 
 
 def camera_struct(camera: Camera, real: Any) -> np.ndarray:
@@ -25,3 +28,12 @@ def camera_struct(camera: Camera, real: Any) -> np.ndarray:
     struct["intrinsics"] = camera.fx, camera.fy, camera.cx, camera.cy
     struct["size"] = camera.width, camera.height
     return struct
+
+
+def adam_struct(step: AdamStep, real: Any) -> np.ndarray:
+    """The `Adam` struct of cl/structs.h; differences from 1 are taken in double precision."""
+    correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
+    rates = [step.rates[name] / correction1 for name in RATES]
+    betas = [step.beta1, 1 - step.beta1, step.beta2, 1 - step.beta2]
+    names = (*RATES, "keep1", "take1", "keep2", "take2", "inv_correction2", "eps")
+    return np.array((*rates, *betas, 1 / correction2, step.eps), dtype=[(name, real) for name in names])

@@ -19,8 +19,8 @@ STEPS = 100
 COUNTS = [1, 5, 21, 22, 64, 65, 1000]
 
 
-def settings(t):
-    return adam_settings(t, STEPS, 2.0, CONFIG)
+def settings(t, sh_degree=3):
+    return adam_settings(t, STEPS, 2.0, CONFIG, sh_degree)
 
 
 def start_of(n, *, sh_degree=3):
@@ -41,7 +41,7 @@ def by_twin(state, gradients, sh_degree):
     """Parameters and both moments after one step for each of the gradients."""
     state = [part.astype(np.float64) for part in state]
     for t, gradient in enumerate(gradients, start=1):
-        reference.adam_step(state[0], gradient, *state[1:], settings(t), sh_degree)
+        reference.adam_step(state[0], gradient, *state[1:], settings(t, sh_degree))
     return state
 
 
@@ -49,7 +49,7 @@ def by_kernel(device, state, gradients, sh_degree):
     """As `by_twin`."""
     state = [upload(device, part) for part in state]
     for t, gradient in enumerate(gradients, start=1):
-        ops.adam_step(device, state[0], upload(device, gradient), *state[1:], settings(t), sh_degree)
+        ops.adam_step(device, state[0], upload(device, gradient), *state[1:], settings(t, sh_degree))
     return [fetch(part) for part in state]
 
 

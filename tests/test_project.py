@@ -8,8 +8,10 @@ from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.camera import Camera
+from clsplat.config import OptimConfig
 from clsplat.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN, NEAR
 from clsplat.gaussians import Gaussians, logit
+from clsplat.optim import adam_settings
 from clsplat.render import download, upload
 from clsplat.stages import SplatGrads, Splats
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene, threshold_distances
@@ -89,6 +91,43 @@ def test_backward_matches_twin(device64, antialiased, degree):
         assert_matches("v_viewmat", v_viewmat, v_viewmat_expected, DOUBLE)
     else:
         assert v_viewmat is None and v_viewmat_expected is None
+
+
+def random_moments(gaussians, rng):
+    """Running means as of an optimisation that is under way; second ones are not negative."""
+    shapes = {name: array.shape for name, array in gaussians.arrays().items()}
+    first = Gaussians(**{name: rng.normal(size=shape) for name, shape in shapes.items()})
+    return first, Gaussians(**{name: rng.uniform(0, 2, shape) for name, shape in shapes.items()})
+
+
+@MODES
+@pytest.mark.parametrize(("stored", "degree"), [(0, 0), (1, 0), (1, 1), (2, 1), (2, 2), (3, 0), (3, 2), (3, 3)])
+def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degree):
+    """The gradients in registers are those that project_bwd writes, and each meets its own moments and rate; invisible
+    Gaussians move on by their moments."""
+    gaussians, camera = wide_scene(300)
+    gaussians.sh = gaussians.sh[:, : (stored + 1) ** 2]
+    parts = (gaussians, *random_moments(gaussians, np.random.default_rng(stored)))
+    splats = reference.project_fwd(gaussians, camera, degree, antialiased=antialiased)
+    v_splats = random_grads(splats)
+    step = adam_settings(20, 100, 2.0, OptimConfig(), degree)
+    uploaded = [type(a)(*(any_device.upload("splats", x) for x in a)) for a in (splats, v_splats)]
+    fused, separate = ([upload(any_device, part) for part in parts] for _ in range(2))
+
+    ops.project_bwd_adam(any_device, fused[0], tuple(fused[1:]), camera, *uploaded, step, antialiased=antialiased)
+    v, _ = ops.project_bwd(any_device, separate[0], camera, degree, *uploaded, antialiased=antialiased)
+    ops.adam_step(any_device, separate[0], v, *separate[1:], step)
+    twin = [part.astype(np.float64) for part in parts]
+    reference.project_bwd_adam(twin[0], tuple(twin[1:]), camera, splats, v_splats, step, antialiased=antialiased)
+
+    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    for i, quantity in enumerate(("parameters", "first moments", "second moments")):
+        for name, before in parts[i].arrays().items():
+            found, expected = host(fused[i]).arrays()[name], host(separate[i]).arrays()[name]
+            assert_matches(quantity, found, expected, tolerances)
+            if any_device.real == np.float64:
+                assert_matches(quantity, found, twin[i].arrays()[name], DOUBLE)
+            assert (found != before).reshape(len(before), -1)[:, 0].mean() > 0.9, name
 
 
 @MODES

@@ -7,8 +7,8 @@ import numpy as np
 from clsplat.camera import Camera
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.stages import SplatGrads, Splats
-from clsplat.structs import camera_struct
+from clsplat.stages import AdamStep, SplatGrads, Splats
+from clsplat.structs import adam_struct, camera_struct
 
 # Work-group size of the backward kernel where it adds up the gradient of the viewmat: 3 KiB of local memory.
 VIEWMAT_GROUP = 64
@@ -127,3 +127,41 @@ def project_bwd(
     v_viewmat[:3, :3] = total[:9].reshape(3, 3)
     v_viewmat[:3, 3] = total[9:]
     return v, v_viewmat
+
+
+def project_bwd_adam(
+    device: Device,
+    gaussians: Gaussians,
+    moments: tuple[Gaussians, Gaussians],
+    camera: Camera,
+    splats: Splats,
+    v_splats: SplatGrads,
+    step: AdamStep,
+    *,
+    antialiased: bool = False,
+) -> None:
+    """`project_bwd` and `adam_step` in one pass over the Gaussians, in place; arguments as theirs.
+
+    Parameters
+    ----------
+    moments : (first, second)
+    step : AdamStep
+        Its degree of the spherical harmonics is that of `project_fwd`.
+    """
+    fields = [splats.extents, splats.conics, splats.colors, *v_splats]
+    arrays = [array for part in (gaussians, *moments) for array in part.arrays().values()]
+    device.launch(
+        "project",
+        "project_bwd_adam",
+        (len(gaussians),),
+        [
+            len(gaussians),
+            camera_struct(camera, device.real),
+            gaussians.sh.shape[1],
+            step.sh_degree,
+            adam_struct(step, device.real),
+            *fields,
+            *arrays,
+        ],
+        defines={"CHANNELS": splats.colors.shape[1], "ANTIALIASED": int(antialiased), "VIEWMAT_GRAD": 0},
+    )

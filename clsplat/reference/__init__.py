@@ -4,7 +4,7 @@ from clsplat.reference.adam import adam_step
 from clsplat.reference.bin import bin_splats
 from clsplat.reference.composite import composite_bwd, composite_fwd
 from clsplat.reference.loss import l1_ssim
-from clsplat.reference.project import project_bwd, project_fwd
+from clsplat.reference.project import project_bwd, project_bwd_adam, project_fwd
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
 
@@ -18,5 +18,6 @@ __all__ = [
     "exclusive_scan",
     "l1_ssim",
     "project_bwd",
+    "project_bwd_adam",
     "project_fwd",
 ]

@@ -15,13 +15,13 @@ BLOCK = 32768
 
 
 def adam_step(
-    gaussians: Gaussians, gradients: Gaussians, first: Gaussians, second: Gaussians, step: AdamStep, sh_degree: int
+    gaussians: Gaussians, gradients: Gaussians, first: Gaussians, second: Gaussians, step: AdamStep
 ) -> None:
     """One step of Adam (Kingma and Ba 2015, algorithm 1), in place; arguments as of `clsplat.ops.adam_step`."""
     correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
     for name in SHAPES:
         n = len(gaussians)
-        width = 3 * (sh_degree + 1) ** 2 if name == "sh" else max(1, gaussians.arrays()[name][:1].size)
+        width = 3 * (step.sh_degree + 1) ** 2 if name == "sh" else max(1, gaussians.arrays()[name][:1].size)
         rate: Any
         if name == "sh":
             rate = np.full(width, step.rates["sh_rest"], gaussians.sh.dtype)

@@ -19,8 +19,9 @@ from clsplat.constants import (
     QUAT_NORM2_MIN,
 )
 from clsplat.gaussians import Gaussians, sigmoid
+from clsplat.reference.adam import adam_step
 from clsplat.reference.sh import sh_basis, sh_basis_jacobian
-from clsplat.stages import SplatGrads, Splats
+from clsplat.stages import AdamStep, SplatGrads, Splats
 
 Array = NDArray[np.float64]
 
@@ -195,3 +196,18 @@ def project_bwd(
     v_viewmat[:3, :3] = v_view + v_p.T @ g.means + np.outer(v_translation, camera.position)
     v_viewmat[:3, 3] = v_p.sum(axis=0) + v_translation
     return result, v_viewmat
+
+
+def project_bwd_adam(
+    gaussians: Gaussians,
+    moments: tuple[Gaussians, Gaussians],
+    camera: Camera,
+    splats: Splats,
+    v_splats: SplatGrads,
+    step: AdamStep,
+    *,
+    antialiased: bool = False,
+) -> None:
+    """`project_bwd`, then `adam_step`; arguments as of `clsplat.ops.project_bwd_adam`."""
+    v, _ = project_bwd(gaussians, camera, step.sh_degree, splats, v_splats, antialiased=antialiased)
+    adam_step(gaussians, v, *moments, step)
