@@ -136,6 +136,7 @@ def test_no_path_of_a_machine():
 # What each file's header documents, with values it allows.
 DEFINES = {
     "adam": {},
+    "observe": {},
     "bin": {"TILE": 16, "GRADIENTS": 1},
     "composite_cpu": {"TILE": 8, "CHANNELS": 1},
     "composite_gpu": {"TILE": 8, "CHANNELS": 1, "BATCH": 16},

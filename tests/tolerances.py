@@ -36,6 +36,7 @@ DOUBLE = {
     "parameters": _UPDATED,
     "first moments": _UPDATED,
     "second moments": _UPDATED,
+    "grad_sum": _UPDATED,
     "moved world": Tolerance(1e-9, 1e-11, "float64: translations of 10 units and scales of 40 cost three digits"),
 }
 
@@ -68,4 +69,5 @@ FLOAT = {
     "parameters": Tolerance(1e-6, 1e-5, "float32: a hundred updates, each rounded"),
     "first moments": Tolerance(1e-6, 2e-6, "float32: gradients of both signs cancel"),
     "second moments": Tolerance(2e-6, 0, "float32: a hundred updates, each rounded"),
+    "grad_sum": Tolerance(1e-6, 0, "float32: a root and a sum of positive numbers, each rounded"),
 }

@@ -4,6 +4,7 @@ from clsplat.ops.adam import adam_step
 from clsplat.ops.bin import bin_splats
 from clsplat.ops.composite import composite_bwd, composite_fwd
 from clsplat.ops.loss import l1_ssim
+from clsplat.ops.observe import observe
 from clsplat.ops.project import project_bwd, project_bwd_adam, project_fwd
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
@@ -17,6 +18,7 @@ __all__ = [
     "composite_fwd",
     "exclusive_scan",
     "l1_ssim",
+    "observe",
     "project_bwd",
     "project_bwd_adam",
     "project_fwd",

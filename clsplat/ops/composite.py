@@ -35,9 +35,7 @@ def _launch(device: Device, stage: str, kernel: str, bins: Bins, channels: int, 
     if stage == "composite_gpu":
         group = bins.tile_size**2 if kernel == "composite_fwd" else GPU_BATCH
     arguments = [bins.width, bins.height, arguments[0], bins.gauss_ids, bins.tile_ranges, *arguments[1:]]
-    device.launch(
-        stage, kernel, (tiles * group,), arguments, defines=_defines(bins, channels, stage), group=(group,)
-    )
+    device.launch(stage, kernel, (tiles * group,), arguments, defines=_defines(bins, channels, stage), group=(group,))
 
 
 def composite_fwd(device: Device, splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto") -> Image:

@@ -4,6 +4,7 @@ from clsplat.reference.adam import adam_step
 from clsplat.reference.bin import bin_splats
 from clsplat.reference.composite import composite_bwd, composite_fwd
 from clsplat.reference.loss import l1_ssim
+from clsplat.reference.observe import observe
 from clsplat.reference.project import project_bwd, project_bwd_adam, project_fwd
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
@@ -17,6 +18,7 @@ __all__ = [
     "composite_fwd",
     "exclusive_scan",
     "l1_ssim",
+    "observe",
     "project_bwd",
     "project_bwd_adam",
     "project_fwd",

@@ -1,0 +1,27 @@
+"""Launch of the stage observe (cl/observe.cl)."""
+
+import numpy as np
+from pyopencl.array import Array
+
+from clsplat.device import Device
+
+
+def observe(
+    device: Device, extents: Array, v_means2d: Array, width: int, height: int, grad_sum: Array, seen: Array
+) -> None:
+    """Add an iteration to the statistics of densification, in place.
+
+    Parameters
+    ----------
+    extents, v_means2d : (N, 2) real
+        Of the splats, and the gradient with respect to their centres, per pixel.
+    width, height : int
+        Size of the image in pixels.
+    grad_sum : (N,) real
+        Sum of the norms of the positional gradient, in normalised device coordinates.
+    seen : (N,) int32
+        Number of iterations in which the Gaussian was visible.
+    """
+    n = seen.shape[0]
+    half_size = np.array([width / 2, height / 2], device.real)
+    device.launch("observe", "observe", (n,), [n, half_size, extents, v_means2d, grad_sum, seen])

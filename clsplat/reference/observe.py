@@ -1,0 +1,15 @@
+"""Twin of the stage observe."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+def observe(extents: Array, v_means2d: Array, width: int, height: int, grad_sum: Array, seen: Array) -> None:
+    """Add an iteration to the statistics, in place; arguments as of `clsplat.ops.observe`."""
+    visible = extents[:, 0] > 0
+    grad_sum[visible] += np.hypot(v_means2d[visible, 0] * (width / 2), v_means2d[visible, 1] * (height / 2))
+    seen[visible] += 1
