@@ -17,7 +17,7 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
 from clsplat.optim import Moments
-from clsplat.render import fetch
+from clsplat.render import download, fetch
 
 
 @dataclass
@@ -45,7 +45,7 @@ def save_state(path: Path, state: State, config: TrainConfig) -> None:
     parts = {"gaussians": state.gaussians, "first": state.moments.first, "second": state.moments.second}
     for part, gaussians in parts.items():
         arrays |= {f"{part}.{name}": array for name, array in fetch(gaussians).arrays().items()}
-    arrays |= {f"statistics.{name}": array for name, array in state.strategy.statistics.items()}
+    arrays |= {f"statistics.{name}": download(array) for name, array in state.strategy.statistics.items()}
     with replacing(path) as file:
         np.savez(file, **arrays)
 

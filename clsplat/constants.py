@@ -15,8 +15,8 @@ LOG2_ALPHA_MIN = log2(ALPHA_MIN)
 """The compositing kernels compare exponents of two."""
 
 EXPONENT_SLACK = 1e-5
-"""By how much an exponent of two may exceed that of the opacity: float32 rounding where sigma is 0, no more. What lies
-beyond has sigma < 0, which only an indefinite conic brings about, and is skipped (original)."""
+"""By how much an exponent of two may exceed that of the opacity: float32 rounding where sigma is 0, no more. What
+lies beyond has sigma < 0, which only an indefinite conic brings about, and is skipped (original)."""
 
 ALPHA_MAX = 0.99
 """Alpha is clamped here so that 1/(1 - alpha) stays bounded in the backward pass (original)."""

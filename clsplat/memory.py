@@ -28,6 +28,7 @@ PER_GAUSSIAN = {
     "project": 12,  # means2d 2, conics 3, depths, extents 2, opacities, colors 3
     "bin": 15,  # depth keys, ellipses 8, sort keys and sort order twice, tiles per Gaussian and their sums
     "composite": 12 + 9,  # packed splats; v_means2d 2, v_conics 3, v_opacities, v_colors 3
+    "observe": 2,  # grad_sum, seen
 }
 PER_INTERSECTION = {
     "bin": 2,  # intersections twice
@@ -42,7 +43,7 @@ PER_PIXEL = {
 PER_ROW = 3 * 416  # derivatives of SSIM: rows have margins, and end with a work-item
 
 COPIES = 4
-"""Of all parameters: themselves, Adam's two moments, and the gradients, whose blocks an evaluation reuses."""
+"""Of all parameters: themselves, Adam's two moments, and what an evaluation uploads."""
 
 UNITS = {"MB": 10**6, "GB": 10**9, "MiB": 2**20, "GiB": 2**30}
 

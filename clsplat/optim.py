@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config import OptimConfig
-from clsplat.constants import SH_DEGREE_MAX
 from clsplat.gaussians import Gaussians
 from clsplat.stages import AdamStep
 
@@ -41,9 +40,7 @@ def sh_degree_at(iteration: int, every: int, stored: int) -> int:
     return min(stored, (iteration - 1) // every)
 
 
-def adam_settings(
-    iteration: int, iterations: int, extent: float, config: OptimConfig, sh_degree: int = SH_DEGREE_MAX
-) -> AdamStep:
+def adam_settings(iteration: int, iterations: int, extent: float, config: OptimConfig, sh_degree: int) -> AdamStep:
     """Learning rates and constants of an iteration.
 
     Parameters

@@ -14,7 +14,7 @@ from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.stages import Bins, Image, Splats
+from clsplat.stages import Bins, Image, SplatGrads, Splats
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -89,11 +89,19 @@ def forward(
     return Pass(gaussians, camera, config, sh_degree, splats, bins, image)
 
 
+def backward_to_splats(device: "Device | None", run: Pass, v_image: Image) -> SplatGrads:
+    """The first half of `backward`: gradients with respect to the splats."""
+    stage = stage_functions(device)
+    v_splats: SplatGrads = stage.composite_bwd(
+        run.splats, run.bins, run.image, v_image, compositor=run.config.compositor
+    )
+    return v_splats
+
+
 def backward(device: "Device | None", run: Pass, v_image: Image, *, viewmat_grad: bool = False) -> Gradients:
     """Gradients of a forward pass, from the gradients with respect to its image and alpha."""
-    stage = stage_functions(device)
-    v_splats = stage.composite_bwd(run.splats, run.bins, run.image, v_image, compositor=run.config.compositor)
-    v_gaussians, v_viewmat = stage.project_bwd(
+    v_splats = backward_to_splats(device, run, v_image)
+    v_gaussians, v_viewmat = stage_functions(device).project_bwd(
         run.gaussians,
         run.camera,
         run.sh_degree,

@@ -61,8 +61,8 @@ class Image(NamedTuple):
 class AdamStep(NamedTuple):
     """One step of the optimiser: its number, counted from 1, and its constants.
 
-    rates: learning rate by field of `clsplat.gaussians.Gaussians`, with sh0 and sh_rest in the place of sh. sh_degree:
-    bands above it have had no gradient yet, and are left alone.
+    rates: learning rate by field of `clsplat.gaussians.Gaussians`, with sh0 and sh_rest in the place of sh.
+    sh_degree: bands above it have had no gradient yet, and are left alone.
     """
 
     iteration: int

@@ -18,7 +18,7 @@ from clsplat.initialize import initialize
 from clsplat.memory import INTERSECTIONS, Footprint, Photos
 from clsplat.optim import Moments, adam_settings, sh_degree_at
 from clsplat.randomness import stream
-from clsplat.render import backward, download, fetch, forward, stage_functions, upload
+from clsplat.render import backward_to_splats, download, fetch, forward, stage_functions, upload
 from clsplat.scene import Scene, View
 from clsplat.stages import Image
 
@@ -86,7 +86,7 @@ def train(
     state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
     photos, need = Photos(device), Footprint.of(scene, config.init.sh_degree, device)
     if config.optimizer == "device":
-        _move(state, device)
+        move(state, device)
     losses: list[float] = []
     with log_file(out / "log.jsonl", state.iteration) as log:
         started = time.perf_counter() - state.seconds
@@ -147,17 +147,23 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
     loss, v_image = stage_functions(device).l1_ssim(run.image.image, photo, config.optim.ssim_weight, mask)
     # No kernel writes this buffer: the loss does not depend on alpha.
     v_alpha = device.scratch("v_alpha", camera.height * camera.width)
-    gradients = backward(device, run, Image(v_image, v_alpha))
+    v_splats = backward_to_splats(device, run, Image(v_image, v_alpha))
 
     if state.strategy.watches(iteration):
-        visible = download(run.splats.extents)[:, 0] > 0
-        state.strategy.observe(download(gradients.means2d), visible, camera.width, camera.height)
-    settings = adam_settings(iteration, config.iterations, state.extent, config.optim)
-    v_gaussians = gradients.gaussians if optimizer else fetch(gradients.gaussians)
-    moments = state.moments
-    stage_functions(optimizer).adam_step(
-        state.gaussians, v_gaussians, moments.first, moments.second, settings, sh_degree
-    )
+        extents, v_means2d = run.splats.extents, v_splats.means2d
+        if not optimizer:
+            extents, v_means2d = download(extents), download(v_means2d)
+        state.strategy.observe(stage_functions(optimizer), extents, v_means2d, camera.width, camera.height)
+    settings = adam_settings(iteration, config.iterations, state.extent, config.optim, sh_degree)
+    moments, antialiased = (state.moments.first, state.moments.second), config.render.mode == "antialiased"
+    if optimizer:
+        update = stage_functions(device).project_bwd_adam
+        update(gaussians, moments, camera, run.splats, v_splats, settings, antialiased=antialiased)
+    else:
+        v_gaussians, _ = stage_functions(device).project_bwd(
+            gaussians, camera, sh_degree, run.splats, v_splats, antialiased=antialiased
+        )
+        stage_functions(None).adam_step(state.gaussians, fetch(v_gaussians), *moments, settings)
     state.iteration = iteration
     return loss
 
@@ -167,10 +173,10 @@ def densify(state: State, device: "Device | None") -> None:
 
     Not a part of `step`, whose arrays of the old size must be gone before those of the new one are allocated.
     """
-    _move(state, None)
+    move(state, None)
     _apply(state.strategy.edit(state.iteration, state.gaussians), state)
     if device:
-        _move(state, device)
+        move(state, device)
 
 
 def _apply(edit: Edit, state: State) -> None:
@@ -180,11 +186,14 @@ def _apply(edit: Edit, state: State) -> None:
         state.moments.second.logit_opacities[:] = 0
 
 
-def _move(state: State, device: "Device | None") -> None:
-    """Parameters and moments to the device, or to the host for None."""
-    move = partial(upload, device) if device else fetch
-    state.gaussians = move(state.gaussians)
-    state.moments = Moments(move(state.moments.first), move(state.moments.second))
+def move(state: State, device: "Device | None") -> None:
+    """Parameters, moments and statistics to the device, or to the host for None."""
+    place = partial(upload, device) if device else fetch
+    state.gaussians = place(state.gaussians)
+    state.moments = Moments(place(state.moments.first), place(state.moments.second))
+    statistics = state.strategy.statistics
+    for name, array in statistics.items():
+        statistics[name] = device.upload(name, array, array.dtype) if device else download(array)
 
 
 def initial_state(scene: Scene, config: TrainConfig) -> State:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from clsplat import reference
 from clsplat.config import AdcConfig, TrainConfig
 from clsplat.densify import STRATEGIES
 from clsplat.densify.adc import CHILD_SHRINK, Adc
@@ -29,7 +30,7 @@ def observed(config: TrainConfig = CONFIG, rows: slice = slice(0, N), strategy: 
     result = STRATEGIES[strategy](config, 1.0, N)
     v_means2d = np.zeros((N, 2), np.float32)
     v_means2d[rows, 0] = 2 * config.adc.grad_threshold / (SIZE[0] / 2)
-    result.observe(v_means2d, np.ones(N, bool), *SIZE)
+    result.observe(reference, np.ones((N, 2)), v_means2d, *SIZE)
     return result, scene()
 
 
@@ -81,7 +82,7 @@ def test_splits_are_distributed_as_the_parent() -> None:
     gaussians = scene().take(np.full(4000, N - 1))
     gaussians.quats[:] = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]  # a quarter turn about z: x goes to y
     strategy = Adc(CONFIG, 1.0, len(gaussians))
-    strategy.observe(np.full((4000, 2), 1.0), np.ones(4000, bool), *SIZE)
+    strategy.observe(reference, np.ones((4000, 2)), np.full((4000, 2), 1.0), *SIZE)
     edit = strategy.edit(100, gaussians)
     spread = (edit.gaussians.means - gaussians.means[0]).std(axis=0)
     # 8000 draws: the standard deviation is known to 1/sqrt(16000) = 0.8 %, four of which are 3 %.
@@ -143,6 +144,6 @@ def test_nothing_changes_outside_its_time() -> None:
 
 def test_gradients_count_in_normalised_device_coordinates() -> None:
     strategy = Adc(CONFIG, 1.0, 2)
-    strategy.observe(np.array([[3.0, 0.0], [0.0, 4.0]]), np.array([True, False]), 20, 10)
+    strategy.observe(reference, np.array([[1.0, 2], [1, 1]]), np.array([[3.0, 0.0], [0.0, 4.0]]), 20, 10)
     assert strategy.statistics["grad_sum"].tolist() == [30, 20]
-    assert strategy.statistics["seen"].tolist() == [1, 0]
+    assert strategy.statistics["seen"].tolist() == [1, 1]

@@ -14,7 +14,9 @@ from clsplat.checkpoint import load_state
 from clsplat.config import AdcConfig, OptimConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
+from clsplat.gaussians import Gaussians
 from clsplat.memory import INTERSECTIONS, Footprint, Photos, parse_size
+from clsplat.render import render_views
 from clsplat.scene import Scene, View
 from clsplat.train import train
 
@@ -56,8 +58,13 @@ def test_what_is_predicted_is_allocated(tmp_path: Path, gpu: bool, n: int, width
     if gpu:
         device.is_cpu = False  # type: ignore[misc]  # shadows the cached property
     scene = make_scene(n, width, height)
-    config = TrainConfig(iterations=6, adc=FIXED_N)
-    train(scene, config, device, tmp_path)
+    config = TrainConfig(iterations=6, eval_every=3, adc=FIXED_N)
+
+    def evaluate(gaussians: Gaussians) -> dict[str, float]:
+        return {"mean": float(np.mean([r.rgb.mean() for r in render_views(gaussians, cameras, device=device)]))}
+
+    cameras = [view.camera for view in scene.train]
+    train(scene, config, device, tmp_path, evaluate=evaluate)
     met = load_state(tmp_path / "checkpoint.npz", scene.extent, config).intersections
     photos = sum(view.image.nbytes for view in scene.train)
     predicted = Footprint.of(scene, 3, device).total(n, met) + photos

@@ -103,8 +103,8 @@ def random_moments(gaussians, rng):
 @MODES
 @pytest.mark.parametrize(("stored", "degree"), [(0, 0), (1, 0), (1, 1), (2, 1), (2, 2), (3, 0), (3, 2), (3, 3)])
 def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degree):
-    """The gradients in registers are those that project_bwd writes, and each meets its own moments and rate; invisible
-    Gaussians move on by their moments."""
+    """The gradients in registers are those that project_bwd writes, and each meets its own moments and rate;
+    invisible Gaussians move on by their moments."""
     gaussians, camera = wide_scene(300)
     gaussians.sh = gaussians.sh[:, : (stored + 1) ** 2]
     parts = (gaussians, *random_moments(gaussians, np.random.default_rng(stored)))

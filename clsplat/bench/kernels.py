@@ -22,7 +22,7 @@ from clsplat.device import Device
 from clsplat.memory import Photos
 from clsplat.optim import Moments
 from clsplat.render import forward, upload
-from clsplat.train import step
+from clsplat.train import move, step
 
 ITERATION = 3001
 """Of a default run: all bands of the spherical harmonics are trained, densification watches, and no edit is due."""
@@ -110,10 +110,9 @@ def stage_bytes(n: int, sh_degree: int, pixels: int, intersections: int) -> dict
         "project_fwd": REAL * n * (parameters + splat),
         "bin_splats": REAL * (n * 9 + 2 * intersections),  # without colours; gauss_ids and slots
         "l1_ssim": pixels * (3 * REAL + 3 + 3 * REAL),  # image, photo in 8 bits, gradient
-        "project_bwd": REAL
-        * n
-        * (2 * parameters + splat_grads + 8),  # extents, conics and colours of the forward pass
-        "adam_step": REAL * n * 7 * parameters,  # gradient; parameter and both moments, read and written
+        "observe": REAL * n * 8,  # extents and gradient; both statistics, read and written
+        # Splats' gradients; extents, conics, colours; parameters and both moments, read and written.
+        "project_bwd_adam": REAL * n * (splat_grads + 8 + 6 * parameters),
     }
 
 
@@ -155,15 +154,15 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
 
     photos = Photos(device)
     photos.keep_within(4 * view.image.nbytes)  # the photo and its mask stay on the device
-    moments = Moments.zeros(gaussians)
     state = State(
         ITERATION - 1,
         0.0,
         workload.extent,
-        upload(device, gaussians),
-        Moments(upload(device, moments.first), upload(device, moments.second)),
+        gaussians,
+        Moments.zeros(gaussians),
         STRATEGIES[config.strategy](config, workload.extent, len(gaussians)),
     )
+    move(state, device)
 
     def one_step() -> None:
         step(state, ITERATION, view, photos, config, device)

@@ -33,7 +33,7 @@ class Adc:
         self.white = config.data.background == "white"
         self.first_edit = -(-self.start // config.adc.every) * config.adc.every
         self.stop = round(config.adc.stop_fraction * config.iterations)
-        self.statistics: dict[str, Array] = {}
+        self.statistics: dict[str, Any] = {}
         self.max_gaussians = config.adc.max_gaussians
         self._clear(n)
 
@@ -44,11 +44,9 @@ class Adc:
         """See `clsplat.densify.Strategy`."""
         return iteration < self.stop
 
-    def observe(self, v_means2d: Array, visible: Array, width: int, height: int) -> None:
+    def observe(self, stage: Any, extents: Any, v_means2d: Any, width: int, height: int) -> None:
         """See `clsplat.densify.Strategy`."""
-        # One unit of normalised device coordinates is half the image.
-        self.statistics["grad_sum"] += np.hypot(v_means2d[:, 0] * (width / 2), v_means2d[:, 1] * (height / 2))
-        self.statistics["seen"] += visible
+        stage.observe(extents, v_means2d, width, height, **self.statistics)
 
     def _densifies(self, iteration: int) -> bool:
         return self.start <= iteration < self.stop and iteration % self.config.every == 0

@@ -31,18 +31,27 @@ class Strategy(Protocol):
     which training lowers to what fits the device.
     """
 
-    statistics: dict[str, Array]
+    statistics: dict[str, Any]
     max_gaussians: int
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         """Statistics of `n` Gaussians in a scene of the given extent, in world units."""
 
     def watches(self, iteration: int) -> bool:
-        """Whether `observe` is to be told of an iteration, counted from 1: it costs copies from the device."""
+        """Whether `observe` is to be told of an iteration, counted from 1."""
 
-    def observe(self, v_means2d: Array, visible: Array, width: int, height: int) -> None:
-        """Take in one iteration: gradients (N, 2) with respect to the splats' centres in pixels, whether each splat
-        is on screen (N,), and the image's size in pixels."""
+    def observe(self, stage: Any, extents: Any, v_means2d: Any, width: int, height: int) -> None:
+        """Take in one iteration.
+
+        Parameters
+        ----------
+        stage : namespace
+            The stage functions that work where the arrays and the statistics lie: `clsplat.render.stage_functions`.
+        extents, v_means2d : (N, 2)
+            Of the splats, and the gradients with respect to their centres, per pixel.
+        width, height : int
+            The image's size in pixels.
+        """
 
     def due(self, iteration: int) -> bool:
         """Whether an edit is due after an iteration, counted from 1."""
