@@ -63,6 +63,11 @@ def parse_size(text: str, name: str) -> int:
     return size
 
 
+def size_text(size: int) -> str:
+    """A number of bytes as people read it, in GB or MB of powers of ten."""
+    return f"{size / 1e9:.2f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
+
+
 @dataclass(frozen=True)
 class Footprint:
     """Device memory of training on photos of one size.
@@ -120,13 +125,13 @@ class Footprint:
             smaller = {d: replace(self, width=self.width // d, height=self.height // d) for d in (2, 4, 8)}
             fitting = [f" with all of them: --downscale {d}" for d, f in smaller.items() if f.total(start) <= limit]
             raise InputError(
-                f"--memory-limit: expected at least {self.total(start) / 1e9:.2f} GB for {start} Gaussians at "
-                f"{self.width}x{self.height}, found {limit / 1e9:.2f} GB; what fits at this size: "
+                f"--memory-limit: expected at least {size_text(self.total(start))} for {start} Gaussians at "
+                f"{self.width}x{self.height}, found {size_text(limit)}; what fits at this size: "
                 f"{self.most_gaussians(limit)} Gaussians{''.join(fitting[:1])}"
             )
         return (
-            f"memory: {self.total(start) / 1e9:.2f} GB for {start} Gaussians, {self.total(cap) / 1e9:.2f} GB for "
-            f"{cap} (--adc.max-gaussians), if each meets {INTERSECTIONS:.0f} tiles; limit {limit / 1e9:.2f} GB, "
+            f"memory: {size_text(self.total(start))} for {start} Gaussians, {size_text(self.total(cap))} for "
+            f"{cap} (--adc.max-gaussians), if each meets {INTERSECTIONS:.0f} tiles; limit {size_text(limit)}, "
             f"enough for {self.most_gaussians(limit)}"
         )
 

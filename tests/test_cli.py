@@ -1,6 +1,7 @@
 """The command line end to end on a tiny dataset, and one clear sentence for each kind of bad input."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -176,6 +177,23 @@ def test_a_run_is_not_overwritten(trained: Path, dataset: Path, capsys: pytest.C
     message = fails(capsys, "train", dataset, "-o", trained, *TRAIN)
     assert "holds a run already" in message
     assert "--resume" in message
+
+
+def test_train_says_what_memory_it_takes_and_when_it_has_begun(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("train", dataset, "-o", tmp_path / "out", *TRAIN, "--iterations", 2, "--memory-limit", "20MB")
+    said = capsys.readouterr().err
+    assert re.search(r"^memory: \d\.\d MB for 200 Gaussians, .* limit 20\.0 MB, enough for \d{4,5}$", said, re.M)
+    assert len(re.findall(r"^\r?.*first iteration: done \d+\.\d s after the start", said, re.M)) == 1
+
+
+def test_memory_limits_that_cannot_be_kept(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ("train", dataset, "-o", tmp_path / "out", *TRAIN, "--memory-limit")
+    assert "expected a size such as 4GB" in fails(capsys, *command, "12")
+    message = fails(capsys, *command, "0.3MB")
+    assert re.search(r"expected at least \d\.\d MB for 200 Gaussians at 40x32, .* size: \d+ Gaussians", message)
+    assert not (tmp_path / "out").exists()
 
 
 def test_bad_folders(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

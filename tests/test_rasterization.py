@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from clsplat import reference
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.device import Device
@@ -55,6 +56,21 @@ def test_it_agrees_with_render(scene: tuple[Gaussians, list[Camera]], device64: 
         np.testing.assert_allclose(image[i, :, :, :3], expected.rgb, atol=1e-10)
         np.testing.assert_allclose(image[i, :, :, 3], expected.depth, atol=1e-9)
         np.testing.assert_allclose(alpha[i, :, :, 0], expected.alpha, atol=1e-10)
+
+
+def test_lists_are_made_without_what_gradients_need(
+    scene: tuple[Gaussians, list[Camera]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+    bin_splats = reference.bin_splats
+
+    def spy(*arguments: Any, gradients: bool = True) -> Any:
+        asked.append(gradients)
+        return bin_splats(*arguments, gradients=gradients)
+
+    monkeypatch.setattr(reference, "bin_splats", spy)
+    rasterization(**arguments(*scene), sh_degree=0)
+    assert asked == [False, False]
 
 
 def test_every_render_mode(scene: tuple[Gaussians, list[Camera]]) -> None:
