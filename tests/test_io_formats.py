@@ -1,5 +1,6 @@
 """Every format of `FORMATS`: within its stated quantisation, nothing cut off in silence, no damaged file taken."""
 
+import errno
 import re
 import warnings
 
@@ -168,6 +169,21 @@ def test_files_that_cannot_be_reached(tmp_path, suffix):
 
 
 @EACH_FORMAT
+def test_a_failed_write_leaves_the_old_file(tmp_path, suffix, monkeypatch):
+    path = tmp_path / f"a{suffix}"
+    save(path, random_gaussians(5, degree=0))
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(InputError, match=f"{re.escape(str(path))}.*No space left"):
+        save_gaussians(path, random_gaussians(5, degree=0, seed=1))
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@EACH_FORMAT
 def test_no_truncated_file_is_taken(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     save(path, random_gaussians(2, degree=1 if suffix in HOLDS_SH else 0))
@@ -233,6 +249,15 @@ def test_an_expansion_beyond_any_scene_is_refused(monkeypatch):
     compact.check_expansion("a", 100 * compact.EXPANSION_FREE, compact.EXPANSION_FREE)
     with pytest.raises(InputError, match="exhaust memory"):
         compact.check_expansion("a", 100 * compact.EXPANSION_FREE + 1, compact.EXPANSION_FREE)
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog"])
+def test_neighbours_follow_each_other(tmp_path, suffix):
+    gaussians = random_gaussians(1000, degree=0)
+    save(tmp_path / f"a{suffix}", gaussians)
+    found = load_gaussians(tmp_path / f"a{suffix}")[0]
+    before, after = (np.linalg.norm(np.diff(g.means, axis=0), axis=1).mean() for g in (gaussians, found))
+    assert after < before / 3
 
 
 def test_morton_order_keeps_neighbours_together():

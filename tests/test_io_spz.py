@@ -28,8 +28,12 @@ def header(version=3, n=1, degree=1, bits=8, flags=0, last=0, magic=b"NGSP"):
     return magic + struct.pack("<IIBBBB", version, n, degree, bits, flags, last)
 
 
-def version4(streams, n=1, degree=1, flags=0, extension=b"", table=None):
-    packed = [zstandard.ZstdCompressor().compress(stream) for stream in streams]
+def unsized(stream):
+    return zstandard.ZstdCompressor(write_content_size=False).compress(stream)
+
+
+def version4(streams, n=1, degree=1, flags=0, extension=b"", table=None, sized=True):
+    packed = [zstandard.ZstdCompressor().compress(s) if sized else unsized(s) for s in streams]
     start = 32 + len(extension)
     table = table or [(len(p), len(s)) for p, s in zip(packed, streams, strict=True)]
     head = header(4, n, degree, flags=flags, last=len(streams)) + struct.pack("<I", start) + bytes(12)
@@ -88,6 +92,7 @@ def test_what_is_written(tmp_path):
     gaussians = load_spz(path)[0]
     gaussians.sh[0, 1:] *= 4  # to multiples of the step
     save_spz(path, gaussians)
+    assert path.read_bytes()[4:8] == bytes(4), "no time of writing"
     written = gzip.decompress(path.read_bytes())
     bits = fractional_bits(path, gaussians)
     assert written[:16] == header(bits=bits)
@@ -124,7 +129,15 @@ def small(scale, far):
 
 @pytest.mark.parametrize(
     ("scale", "far", "bits"),
-    [(1.0, 1.0, 3), (1e-3, 1.0, 13), (1e-9, 1.0, 22), (1e-3, 4095.0, 11), (1e-3, -4096.0, 10), (1e3, 1.0, 0)],
+    [
+        (1.0, 1.0, 3),
+        (1e-3, 1.0, 13),
+        (1e-9, 1.0, 22),
+        (1e-3, 4095.0, 11),
+        (1e-3, -4096.0, 10),
+        (1e-3, 4095.9998, 10),
+        (1e3, 1.0, 0),
+    ],
 )
 def test_positions_keep_the_bits_that_the_scene_calls_for(tmp_path, scale, far, bits):
     gaussians = small(scale, far)
@@ -146,6 +159,7 @@ def broken_files():
     streams = [POSITION, OPACITY, COLORS, SCALES, ROTATION, REST]
     sizes = [(5, len(s)) for s in streams]
     whole = gzip.compress(header() + BODY)
+    shorter = [(len(unsized(s)), len(s)) for s in streams[:5]] + [(len(unsized(REST[:5])), 9)]
     bomb = zstandard.ZstdCompressor().compress(bytes(1 << 20))
     lying = version4(streams, table=[(len(bomb), 9), *sizes[1:]])
     wrong_sum = bytearray(whole)
@@ -169,6 +183,7 @@ def broken_files():
         "five streams": (version4(streams[:5]), "expected streams of"),
         "table beyond the end": (header(4, last=6) + struct.pack("<I", 10**9) + bytes(12), "table of streams"),
         "frame declares more": (lying[:128] + bomb, "declares another size"),
+        "a short stream": (version4([*streams[:5], REST[:5]], table=shorter, sized=False), "5 bytes instead of 9"),
         "no frame": (version4(streams)[:128] + bytes(99), "truncated"),
     }
 
