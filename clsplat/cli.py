@@ -130,7 +130,7 @@ class Train:
         device = open_device(config.device, limit)
         scene = load_scene(self.data, config.data)
         say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
-        need = Footprint.of(scene, config.init.sh_degree, device)
+        need = Footprint.of(scene, config, device)
         start = len(scene.points) or config.init.random_points
         say(need.describe(start, config.adc.max_gaussians, device.memory_limit))
         new_folder(out)

@@ -30,6 +30,10 @@ class RenderConfig:
     """Edge of a tile in pixels; changes speed, not the image."""
     compositor: Literal["auto", "cpu", "gpu"] = "auto"
     """Kernel variant of the compositing stage; auto takes the one for the device's type."""
+    sort: Literal["auto", "global", "per_tile"] = "auto"
+    """How splats are brought into the order of their depths: all of them before they are distributed to tiles
+    (global), or within each tile afterwards. Changes speed, not the image; auto takes global, the faster one where
+    measured."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 from clsplat.scene import Scene, View
 
@@ -35,6 +36,7 @@ PER_INTERSECTION = {
     "composite": 9,  # gradients per intersection
 }
 PER_INTERSECTION_GPU = 5  # bin: intersections once more, sort keys and sort order twice
+PER_INTERSECTION_PER_TILE = 4  # bin: list keys; of the sorts, what is not shared with the sort by depth
 PER_PIXEL = {
     "composite": 4,  # image 3, alpha
     "loss": 3 + 9 + 1,  # v_image, derivatives of SSIM, v_alpha
@@ -80,23 +82,28 @@ class Footprint:
         Highest degree of the spherical harmonics.
     gpu : bool
         The device is no CPU: intersections are sorted in another way.
+    per_tile : bool
+        ``--sort per_tile``.
     """
 
     width: int
     height: int
     sh_degree: int
     gpu: bool
+    per_tile: bool = False
 
     @classmethod
-    def of(cls, scene: Scene, sh_degree: int, device: "Device") -> "Footprint":
+    def of(cls, scene: Scene, config: TrainConfig, device: "Device") -> "Footprint":
         """That of training on the scene's photos."""
         cameras = [view.camera for view in scene.train + scene.test]
-        return cls(max(c.width for c in cameras), max(c.height for c in cameras), sh_degree, not device.is_cpu)
+        width, height = max(c.width for c in cameras), max(c.height for c in cameras)
+        return cls(width, height, config.init.sh_degree, not device.is_cpu, config.render.sort == "per_tile")
 
     def per_gaussian(self, intersections: float = INTERSECTIONS) -> float:
         """Bytes per Gaussian that meets so many tiles."""
         parameters = 11 + 3 * (self.sh_degree + 1) ** 2
-        per_intersection = sum(PER_INTERSECTION.values()) + self.gpu * PER_INTERSECTION_GPU
+        per_intersection = sum(PER_INTERSECTION.values())
+        per_intersection += self.gpu * PER_INTERSECTION_GPU + self.per_tile * PER_INTERSECTION_PER_TILE
         values = COPIES * parameters + sum(PER_GAUSSIAN.values()) + intersections * per_intersection
         return REAL * ROUNDING * values
 

@@ -84,7 +84,7 @@ def forward(
     splats = stage.project_fwd(gaussians, camera, sh_degree, antialiased=antialiased, channels=len(background))
     # The twins work splat by splat and gain nothing from tiles.
     tile_size = max(camera.width, camera.height) if device is None else config.tile_size
-    bins = stage.bin_splats(splats, camera.width, camera.height, tile_size, gradients=gradients)
+    bins = stage.bin_splats(splats, camera.width, camera.height, tile_size, gradients=gradients, scheme=config.sort)
     image = stage.composite_fwd(splats, bins, background, compositor=config.compositor)
     return Pass(gaussians, camera, config, sh_degree, splats, bins, image)
 

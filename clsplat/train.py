@@ -84,7 +84,7 @@ def train(
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
     state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
-    photos, need = Photos(device), Footprint.of(scene, config.init.sh_degree, device)
+    photos, need = Photos(device), Footprint.of(scene, config, device)
     if config.optimizer == "device":
         move(state, device)
     losses: list[float] = []

@@ -5,6 +5,7 @@ import json
 import math
 import re
 import subprocess
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -225,7 +226,7 @@ class TestResults:
     def test_what_belongs_beside_figures(self, results, device):
         assert results["device"]["label"] == device.label
         assert results["device"]["driver"] and results["device"]["opencl"].startswith("OpenCL ")
-        assert results["settings"] == {"repeats": 3, "mode": "classic", "tile_size": 16, "compositor": "auto"}
+        assert results["settings"] == {"repeats": 3, **asdict(RenderConfig())}
         assert json.loads(json.dumps(results)) == results
 
     def test_bytes_of_a_gaussian(self):

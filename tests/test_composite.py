@@ -6,6 +6,7 @@ from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, EXTENT_SLACK, TRANSMITTANCE_MIN
+from clsplat.errors import InputError
 from clsplat.stages import Bins, Image, SplatGrads, Splats
 from clsplat.testing import ambiguous_pixels, assert_matches, gradcheck, synthetic_scene
 
@@ -305,3 +306,11 @@ def test_same_bits_twice_and_for_every_tiling(device, compositor):
     v = [backward(device, compositor, splats, bins[16], images[0], v_image) for _ in range(2)]
     for name in SplatGrads._fields:
         np.testing.assert_array_equal(getattr(v[0], name), getattr(v[1], name), err_msg=name)
+
+
+def test_lists_without_slots_have_no_gradients(device):
+    splats, width, height = make_splats(3)
+    bins = reference.bin_splats(splats, width, height, 16, gradients=False)
+    image = Image(np.zeros((height, width, 4)), np.zeros((height, width)))
+    with pytest.raises(InputError, match=r"^bins: expected lists made with gradients=True"):
+        ops.composite_bwd(device, splats, bins, image, image)

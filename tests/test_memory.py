@@ -4,14 +4,14 @@ import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
 from clsplat.camera import Camera
 from clsplat.checkpoint import load_state
-from clsplat.config import AdcConfig, OptimConfig, TrainConfig
+from clsplat.config import AdcConfig, OptimConfig, RenderConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
@@ -51,14 +51,17 @@ def test_no_size(text: str) -> None:
         parse_size(text, "--memory-limit")
 
 
+@pytest.mark.parametrize("sort", ["auto", "per_tile"])
 @pytest.mark.parametrize("gpu", [False, True], ids=["as it is", "as a GPU"])
 @pytest.mark.parametrize(("n", "width", "height"), [(20_000, 160, 120), (5_000, 400, 300)])
-def test_what_is_predicted_is_allocated(tmp_path: Path, gpu: bool, n: int, width: int, height: int) -> None:
+def test_what_is_predicted_is_allocated(
+    tmp_path: Path, gpu: bool, n: int, width: int, height: int, sort: Literal["auto", "per_tile"]
+) -> None:
     device = Device()
     if gpu:
         device.is_cpu = False  # type: ignore[misc]  # shadows the cached property
     scene = make_scene(n, width, height)
-    config = TrainConfig(iterations=6, eval_every=3, adc=FIXED_N)
+    config = TrainConfig(iterations=6, eval_every=3, adc=FIXED_N, render=RenderConfig(sort=sort))
 
     def evaluate(gaussians: Gaussians) -> dict[str, float]:
         return {"mean": float(np.mean([r.rgb.mean() for r in render_views(gaussians, cameras, device=device)]))}
@@ -67,7 +70,7 @@ def test_what_is_predicted_is_allocated(tmp_path: Path, gpu: bool, n: int, width
     train(scene, config, device, tmp_path, evaluate=evaluate)
     met = load_state(tmp_path / "checkpoint.npz", scene.extent, config).intersections
     photos = sum(view.image.nbytes for view in scene.train)
-    predicted = Footprint.of(scene, 3, device).total(n, met) + photos
+    predicted = Footprint.of(scene, config, device).total(n, met) + photos
     assert device.memory_peak <= predicted <= 1.2 * device.memory_peak
 
 

@@ -166,6 +166,12 @@ class TestInvariances:
         np.testing.assert_array_equal(v.means2d, w.means2d)
         np.testing.assert_array_equal(v.viewmat, w.viewmat)
 
+    def test_sort(self, device, scene):
+        """To the bit: the lists are the same."""
+        images = [render(*scene, RenderConfig(sort=sort), device).rgb for sort in ("auto", "global", "per_tile")]
+        np.testing.assert_array_equal(images[1], images[0])
+        np.testing.assert_array_equal(images[2], images[0])
+
     @COMPOSITORS
     def test_tile_size(self, device64, scene, compositor):
         """To rounding, for distances to a pixel count from its tile; test_composite has the case without rounding."""
@@ -326,7 +332,7 @@ class TestForwardOnly:
         asked = []
         bin_splats = reference.bin_splats
         monkeypatch.setattr(
-            reference, "bin_splats", lambda *a, gradients=True: asked.append(gradients) or bin_splats(*a)
+            reference, "bin_splats", lambda *a, gradients=True, **k: asked.append(gradients) or bin_splats(*a, **k)
         )
         list(render_views(scene[0], cameras))
         render(*scene, gradients=False)

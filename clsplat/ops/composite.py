@@ -3,6 +3,7 @@
 from typing import Any
 
 from clsplat.device import Device
+from clsplat.errors import InputError
 from clsplat.stages import Bins, Image, SplatGrads, Splats
 
 # Work-items of the GPU variant's backward kernel, one splat each: two or four subgroups on the GPUs known.
@@ -73,7 +74,16 @@ def composite_bwd(
         Its result.
     v_image : Image
         Gradients with respect to the image and to alpha.
+
+    Raises
+    ------
+    InputError
+        If the lists were made without what gradients need.
     """
+    if bins.slots is None:
+        raise InputError(
+            "bins: expected lists made with gradients=True, found lists without slots; bin the splats anew"
+        )
     n, channels = splats.colors.shape
     m = bins.gauss_ids.shape[0]
     records = device.empty("gradients per intersection", (max(m, 1), 6 + channels))
