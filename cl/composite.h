@@ -32,12 +32,12 @@ static inline MASKV splat_seen(const Splat *s, REALV t) {
 }
 
 // Composites a splat over a group of pixels. *drawn goes from where it is seen to where it is drawn; alpha = 2^t, not
-// clamped, counts nowhere else. A pixel whose transmittance would fall too low is finished: its transmittance stays,
-// and from then on is kept negated. Returns the weight alpha T, 0 where the splat is not drawn.
-static inline REALV splat_over(REALV alpha, MASKV *drawn, REALV *transmittance) {
+// clamped, counts nowhere else. A pixel whose transmittance would fall to `stop` or below is finished: its transmittance
+// stays, and from then on is kept negated. Returns the weight alpha T, 0 where the splat is not drawn.
+static inline REALV splat_over(REALV alpha, real stop, MASKV *drawn, REALV *transmittance) {
     const REALV before = *transmittance, weight = LESSER(alpha, (REALV)ALPHA_MAX) * before, behind = before - weight;
     const MASKV seen = *drawn;
-    *drawn = seen & (behind > (REALV)TRANSMITTANCE_MIN);
+    *drawn = seen & (behind > (REALV)stop);
     *transmittance = *drawn ? behind : seen ? LESSER(before, -before) : before;
     return *drawn ? weight : (REALV)0;
 }

@@ -85,7 +85,7 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
             const Splat s = staged[j];
             const real t = exponent_at(&s, pixel.x + (real)0.5 - s.x, pixel.y + (real)0.5 - s.y);
             int drawn = splat_seen(&s, t);
-            const real weight = splat_over(exp2(t), &drawn, &transmittance);
+            const real weight = splat_over(exp2(t), TRANSMITTANCE_MIN, &drawn, &transmittance);
             for (int k = 0; k < CHANNELS; ++k)
                 sums[k] += weight * s.color[k];
         }
@@ -152,7 +152,7 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
                 const real t = exponent_at(&s, dx, dy), alpha = exp2(t);
                 real after = transmittance[p];
                 int drawn = splat_seen(&s, t);
-                const real weight = splat_over(alpha, &drawn, &after);
+                const real weight = splat_over(alpha, TRANSMITTANCE_MIN, &drawn, &after);
                 any_live |= after > 0;
                 transmittance[p] = after;
                 if (drawn) {

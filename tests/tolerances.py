@@ -37,6 +37,10 @@ DOUBLE = {
     "first moments": _UPDATED,
     "second moments": _UPDATED,
     "grad_sum": _UPDATED,
+    "errors": _CANCELS,
+    "weights": _REORDERED,
+    "squares": _REORDERED,
+    "pulls": _CANCELS,
     "moved world": Tolerance(1e-9, 1e-11, "float64: translations of 10 units and scales of 40 cost three digits"),
 }
 
@@ -66,6 +70,12 @@ FLOAT = {
     "v_logit_opacities": Tolerance(1e-4, 2e-5, _SUM),
     "v_sh": Tolerance(1e-4, 5e-6, _SUM),
     "v_viewmat": Tolerance(1e-4, 2e-5, _SUM),
+    "errors": Tolerance(
+        1e-4, 1e-5, "float32: what lies behind is what earlier splats left of the whole, times up to 99"
+    ),
+    "weights": Tolerance(1e-5, 1e-6, _SUM),
+    "squares": Tolerance(1e-5, 1e-6, _SUM),
+    "pulls": Tolerance(1e-5, 2e-6, _SUM),
     "parameters": Tolerance(1e-6, 1e-5, "float32: a hundred updates, each rounded"),
     "first moments": Tolerance(1e-6, 2e-6, "float32: gradients of both signs cancel"),
     "second moments": Tolerance(2e-6, 0, "float32: a hundred updates, each rounded"),

@@ -6,6 +6,7 @@ from clsplat.ops.composite import composite_bwd, composite_fwd
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.observe import observe
 from clsplat.ops.project import project_bwd, project_bwd_adam, project_fwd
+from clsplat.ops.removal import removal
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
 
@@ -22,4 +23,5 @@ __all__ = [
     "project_bwd",
     "project_bwd_adam",
     "project_fwd",
+    "removal",
 ]

@@ -10,7 +10,8 @@ from clsplat.stages import Bins, Image, SplatGrads, Splats
 GPU_BATCH = 64
 
 
-def _variant(device: Device, compositor: str) -> str:
+def variant(device: Device, compositor: str = "auto") -> str:
+    """The stage of the kernels' variant."""
     if compositor == "auto":
         compositor = "cpu" if device.is_cpu else "gpu"
     return f"composite_{compositor}"
@@ -21,13 +22,13 @@ def _defines(bins: Bins, channels: int, stage: str) -> dict[str, Any]:
     return {"TILE": bins.tile_size, "CHANNELS": channels} | batch
 
 
-def _packed(device: Device, splats: Splats, bins: Bins, stage: str) -> Any:
+def packed(device: Device, splats: Splats, bins: Bins, stage: str) -> Any:
     """The splats as the kernels read them: SPLAT_REALS each (cl/composite.h)."""
     n, channels = splats.colors.shape
-    packed = device.empty("packed splats", (n, -(-(6 + channels) // 4) * 4))
+    result = device.empty("packed splats", (n, -(-(6 + channels) // 4) * 4))
     geometry = [splats.means2d, splats.conics, splats.extents, splats.opacities, splats.colors]
-    device.launch(stage, "composite_pack", (n,), [n, *geometry, packed], defines=_defines(bins, channels, stage))
-    return packed
+    device.launch(stage, "composite_pack", (n,), [n, *geometry, result], defines=_defines(bins, channels, stage))
+    return result
 
 
 def _launch(device: Device, stage: str, kernel: str, bins: Bins, channels: int, arguments: list[Any]) -> None:
@@ -55,8 +56,8 @@ def composite_fwd(device: Device, splats: Splats, bins: Bins, background: Any, *
         device.empty("image", (bins.height, bins.width, channels)),
         device.empty("alpha", (bins.height, bins.width)),
     )
-    stage = _variant(device, compositor)
-    arguments = [_packed(device, splats, bins, stage), device.constant("background", background), *result]
+    stage = variant(device, compositor)
+    arguments = [packed(device, splats, bins, stage), device.constant("background", background), *result]
     _launch(device, stage, "composite_fwd", bins, channels, arguments)
     return result
 
@@ -87,8 +88,8 @@ def composite_bwd(
     n, channels = splats.colors.shape
     m = bins.gauss_ids.shape[0]
     records = device.empty("gradients per intersection", (max(m, 1), 6 + channels))
-    stage = _variant(device, compositor)
-    arguments = [_packed(device, splats, bins, stage), bins.slots, *image, *v_image, records]
+    stage = variant(device, compositor)
+    arguments = [packed(device, splats, bins, stage), bins.slots, *image, *v_image, records]
     _launch(device, stage, "composite_bwd", bins, channels, arguments)
     v = SplatGrads(
         device.empty("v_means2d", (n, 2)),

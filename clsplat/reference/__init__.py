@@ -6,6 +6,7 @@ from clsplat.reference.composite import composite_bwd, composite_fwd
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.observe import observe
 from clsplat.reference.project import project_bwd, project_bwd_adam, project_fwd
+from clsplat.reference.removal import removal
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
 
@@ -22,4 +23,5 @@ __all__ = [
     "project_bwd",
     "project_bwd_adam",
     "project_fwd",
+    "removal",
 ]

@@ -16,7 +16,7 @@ from clsplat.stages import Bins, Image, SplatGrads, Splats
 Array = NDArray[np.float64]
 
 
-class _Hit(NamedTuple):
+class Hit(NamedTuple):
     """One splat over the box of its extents within a tile; arrays of the box's shape (h, w)."""
 
     splat: int
@@ -27,7 +27,9 @@ class _Hit(NamedTuple):
     before: Array  # transmittance in front of the splat
 
 
-def _hits(splats: Splats, bins: Bins, transmittance: Array) -> Iterator[_Hit]:
+def hits(
+    splats: Splats, bins: Bins, transmittance: Array, transmittance_min: float = TRANSMITTANCE_MIN
+) -> Iterator[Hit]:
     """Yield hits tile by tile, front to back; `transmittance` (H, W) is brought from 1 to its end."""
     transmittance[:] = 1
     live = np.ones(transmittance.shape, dtype=bool)
@@ -50,17 +52,17 @@ def _hits(splats: Splats, bins: Bins, transmittance: Array) -> Iterator[_Hit]:
             before = transmittance[box].copy()
             behind = before * (1 - np.minimum(alpha, ALPHA_MAX))
             reached = live[box] & (alpha >= ALPHA_MIN) & (sigma >= 0)
-            drawn = reached & (behind > TRANSMITTANCE_MIN)
+            drawn = reached & (behind > transmittance_min)
             live[box] &= ~reached | drawn
             transmittance[box] = np.where(drawn, behind, before)
-            yield _Hit(int(g), box, dx, dy, np.where(drawn, alpha, 0), before)
+            yield Hit(int(g), box, dx, dy, np.where(drawn, alpha, 0), before)
 
 
 def composite_fwd(splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto") -> Image:
     """Composite splats front to back; arguments and result as `clsplat.ops.composite_fwd`."""
     transmittance = np.empty((bins.height, bins.width))
     image = np.zeros((bins.height, bins.width, splats.colors.shape[1]))
-    for hit in _hits(splats, bins, transmittance):
+    for hit in hits(splats, bins, transmittance):
         weight = np.minimum(hit.alpha, ALPHA_MAX) * hit.before
         image[hit.box] += weight[:, :, None] * splats.colors[hit.splat]
     return Image(image + transmittance[:, :, None] * np.asarray(background, dtype=np.float64), 1 - transmittance)
@@ -77,7 +79,7 @@ def composite_bwd(
     v = SplatGrads(*(np.zeros_like(a) for a in (splats.means2d, splats.conics, splats.opacities, splats.colors)))
     transmittance = np.empty((bins.height, bins.width))
     behind = (image.image * v_image.image).sum(axis=2) - (1 - image.alpha) * v_image.alpha
-    for hit in _hits(splats, bins, transmittance):
+    for hit in hits(splats, bins, transmittance):
         g, dx, dy = hit.splat, hit.dx, hit.dy
         clamped = np.minimum(hit.alpha, ALPHA_MAX)
         weight = clamped * hit.before

@@ -1,0 +1,137 @@
+// Stage removal: what becomes of the squared error of an image if one splat alone is removed, or changes its colour.
+//
+// In a pixel splat i has the weight w = alpha T and colour c; S is what of the image lies behind it, background
+// included. Without it the image is less by
+//   D = w c - S alpha/(1 - alpha) = w (c - B),   B = S/(T (1 - alpha)), the colour that would be seen in its place,
+// and the sum of squared errors more by sum_pixels |D|^2 - 2 r.D, with r = image - target. Another colour c + d changes
+// it by sum_pixels w^2 |d|^2 + 2 w r.d. docs/stages/removal.md; clsplat/reference/removal.py is the twin.
+//
+// Without the splat a pixel goes on to what lies beyond its stop: here pixels stop only where the transmittance would
+// fall to (1 - ALPHA_MAX) TRANSMITTANCE_MIN, so that S/(1 - alpha) misses no more than a pixel's stop leaves out.
+//
+// Mapping: one work-item per tile, its pixels in blocks (composite_blocks.h). A first pass over its splats sums up the
+// colour, of which a second one, front to back as well, takes away each splat's part to find what is behind: nothing is
+// divided by a transmittance, and alpha/(1 - alpha) is at most 99. A splat's sums over the tile go, as a record, to its
+// slot of the unsorted list; removal_sum adds a splat's records in a fixed order, one work-item per splat: no atomics.
+// It runs once per view in a pruning of many rounds, not in training: one variant serves all devices.
+//
+// Buffers: N, M, T, C and splats as in composite_cpu.cl, order[N], first_slots[N+1], slots[M] as in bin.cl
+//   in   splats[N], gauss_ids[M], tile_ranges[T,2], slots[M], background[C]; residuals[H,W,C], image - target;
+//        mask[H,W] uchar, 1 where pixels count
+//   out  records[M,3+C]; sums[N,3+C]: change of the squared error, sum of w, of w^2, of w r
+// -DTILE=8|16   edge of a tile, px
+// -DCHANNELS    colour channels, 1 or more
+#include "common.h"
+#include "composite_blocks.h"
+
+#define STOP ((real)(TRANSMITTANCE_MIN * (1 - ALPHA_MAX)))
+
+// Reals of a record.
+#define SUMS (3 + CHANNELS)
+
+__kernel void removal(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
+                      const __global uint *tile_ranges, const __global uint *slots, const __global real *background,
+                      const __global real *residuals, const __global uchar *mask, __global real *records) {
+    const uint t = get_global_id(0);
+    const int tiles_x = (width + TILE - 1) / TILE;
+    const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
+    const int rows = LESSER(TILE, height - y0), columns = LESSER(TILE, width - x0);
+
+    // `counts` is 1 in pixels that count and 0 elsewhere.
+    REALV transmittance[BLOCKS], behind[BLOCKS][CHANNELS], residual[BLOCKS][CHANNELS], counts[BLOCKS];
+    for (int b = 0; b < BLOCKS; ++b) {
+        transmittance[b] = transmittance_at_first(b, rows, columns);
+        counts[b] = 0;
+        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) behind[b][k] = residual[b][k] = 0;
+    }
+    for (int r = 0; r < rows; ++r) {
+        const size_t first = (size_t)(y0 + r) * width + x0;
+        for (int x = 0; x < columns; ++x) {
+            const int b = r / 4 * BLOCKS_IN_ROW + x / 4, lane = r % 4 * 4 + x % 4;
+            if (!mask[first + x])
+                continue;
+            ((real *)&counts[b])[lane] = 1;
+            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k)((real *)&residual[b][k])[lane] =
+                residuals[CHANNELS * (first + x) + k];
+        }
+    }
+
+    const uint begin = tile_ranges[2 * t], end = tile_ranges[2 * t + 1];
+    Over batch[BATCH];
+    for (uint first = begin; first < end; first += BATCH) {
+        const uint unfinished = unfinished_blocks(transmittance);
+        if (!unfinished)
+            break;
+        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
+        for (uint j = 0; j < count; ++j) {
+            const Over *over = &batch[j];
+            const REALV curved = curvature(&over->splat);
+            for (uint blocks = unfinished & over->blocks; blocks;) {
+                const int b = take_block(&blocks);
+                const REALV exponent = block_exponent(over, b, curved), alpha = power16(exponent);
+                MASKV drawn = splat_seen(&over->splat, exponent);
+                const REALV weight = splat_over(alpha, STOP, &drawn, &transmittance[b]);
+                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) behind[b][k] += weight * over->splat.color[k];
+            }
+        }
+    }
+    for (int b = 0; b < BLOCKS; ++b) {
+        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) behind[b][k] +=
+            ABSOLUTE(transmittance[b]) * background[k];
+        transmittance[b] = transmittance_at_first(b, rows, columns);
+    }
+
+    uint first = begin;
+    for (; first < end; first += BATCH) {
+        const uint unfinished = unfinished_blocks(transmittance);
+        if (!unfinished)
+            break;
+        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
+        for (uint j = 0; j < count; ++j) {
+            const Over *over = &batch[j];
+            const REALV curved = curvature(&over->splat);
+            REALV change = 0, weights = 0, squares = 0, pulls[CHANNELS];
+            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pulls[k] = 0;
+            for (uint blocks = unfinished & over->blocks; blocks;) {
+                const int b = take_block(&blocks);
+                const REALV exponent = block_exponent(over, b, curved), alpha = power16(exponent);
+                MASKV drawn = splat_seen(&over->splat, exponent);
+                const REALV weight = splat_over(alpha, STOP, &drawn, &transmittance[b]);
+                const REALV clamped = LESSER(alpha, (REALV)ALPHA_MAX);
+                const REALV ratio = drawn ? clamped / (1 - clamped) : (REALV)0;
+                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
+                    const REALV part = weight * over->splat.color[k];
+                    behind[b][k] -= part;
+                    const REALV less = part - ratio * behind[b][k];
+                    change += less * (counts[b] * less - 2 * residual[b][k]);
+                    pulls[k] += weight * residual[b][k];
+                }
+                const REALV counted = weight * counts[b];
+                weights += counted;
+                squares += weight * counted;
+            }
+            __global real *record = records + (size_t)SUMS * slots[first + j];
+            record[0] = sum_lanes(change);
+            record[1] = sum_lanes(weights);
+            record[2] = sum_lanes(squares);
+            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[3 + k] = sum_lanes(pulls[k]);
+        }
+    }
+    for (uint i = first; i < end; ++i) {
+        for (int k = 0; k < SUMS; ++k)
+            records[(size_t)SUMS * slots[i] + k] = 0;
+    }
+}
+
+__kernel void removal_sum(const uint n, const __global uint *order, const __global uint *first_slots,
+                          const __global real *records, __global real *sums) {
+    const size_t i = get_global_id(0);
+    if (i >= n)
+        return;
+    for (int k = 0; k < SUMS; ++k) {
+        real total = 0;
+        for (uint slot = first_slots[i]; slot < first_slots[i + 1]; ++slot)
+            total += records[(size_t)SUMS * slot + k];
+        sums[(size_t)SUMS * order[i] + k] = total;
+    }
+}

@@ -1,0 +1,48 @@
+"""Launch of the stage removal (cl/removal.cl)."""
+
+from typing import Any
+
+import numpy as np
+
+from clsplat.device import Device
+from clsplat.ops.composite import packed, variant
+from clsplat.stages import Bins, Removal, Splats
+
+
+def removal(
+    device: Device, splats: Splats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
+) -> Removal:
+    """What becomes of an image's squared error if one splat alone is removed or changes its colour.
+
+    Parameters
+    ----------
+    splats : Splats with C colour channels
+    bins : Bins of the same splats, made with gradients
+    background : (C,) array on the host
+    residuals : (H, W, C) array on the host, optional
+        Image less target; 0 where not given.
+    mask : (H, W) array of bool on the host, optional
+        True where pixels count; everywhere if not given.
+
+    Returns
+    -------
+    Removal
+        Arrays of the host.
+    """
+    n, channels = splats.colors.shape
+    m, (tiles, _) = bins.gauss_ids.shape[0], bins.tile_ranges.shape
+    size = bins.height, bins.width
+    records = device.empty("prices per intersection", (max(m, 1), 3 + channels))
+    sums = device.empty("prices", (n, 3 + channels))
+    pixels = [
+        device.upload("residuals", np.zeros((*size, channels)) if residuals is None else residuals),
+        device.upload("mask", np.ones(size) if mask is None else mask, np.uint8),
+    ]
+    lists = [packed(device, splats, bins, variant(device)), bins.gauss_ids, bins.tile_ranges, bins.slots]
+    arguments = [bins.width, bins.height, *lists, device.constant("background", background), *pixels, records]
+    defines = {"TILE": bins.tile_size, "CHANNELS": channels}
+    device.launch("removal", "removal", (tiles,), arguments, defines=defines, group=(1,))
+    arguments = [n, bins.order, bins.first_slots, records, sums]
+    device.launch("removal", "removal_sum", (n,), arguments, defines=defines)
+    errors, weights, squares, *pulls = sums.get().T
+    return Removal(errors, weights, squares, np.stack(pulls, axis=1))

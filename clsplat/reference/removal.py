@@ -1,0 +1,39 @@
+"""Twin of the stage removal: without splat i, what lies behind it shines through as bright again."""
+
+from typing import Any
+
+import numpy as np
+
+from clsplat.constants import ALPHA_MAX, TRANSMITTANCE_MIN
+from clsplat.reference.composite import hits
+from clsplat.stages import Bins, Removal, Splats
+
+# Without a splat of the largest alpha, the transmittance at such a stop would be TRANSMITTANCE_MIN.
+STOP = TRANSMITTANCE_MIN * (1 - ALPHA_MAX)
+
+
+def removal(splats: Splats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None) -> Removal:
+    """What becomes of the squared error; arguments and result as `clsplat.ops.removal`."""
+    n, channels = splats.colors.shape
+    transmittance = np.empty((bins.height, bins.width))
+    counts = np.ones(transmittance.shape) if mask is None else np.asarray(mask, dtype=np.float64)
+    r = np.zeros((*counts.shape, channels)) if residuals is None else residuals * counts[:, :, None]
+
+    behind = np.zeros((*counts.shape, channels))  # the whole image at first
+    for hit in hits(splats, bins, transmittance, STOP):
+        weight = np.minimum(hit.alpha, ALPHA_MAX) * hit.before
+        behind[hit.box] += weight[:, :, None] * splats.colors[hit.splat]
+    behind += transmittance[:, :, None] * np.asarray(background, dtype=np.float64)
+
+    out = Removal(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, channels)))
+    for hit in hits(splats, bins, transmittance, STOP):
+        g, alpha = hit.splat, np.minimum(hit.alpha, ALPHA_MAX)
+        weight = alpha * hit.before
+        part = weight[:, :, None] * splats.colors[g]
+        behind[hit.box] -= part
+        less = part - (alpha / (1 - alpha))[:, :, None] * behind[hit.box]
+        out.errors[g] += (counts[hit.box][:, :, None] * less**2 - 2 * r[hit.box] * less).sum()
+        out.weights[g] += (weight * counts[hit.box]).sum()
+        out.squares[g] += (weight**2 * counts[hit.box]).sum()
+        out.pulls[g] += np.einsum("hw,hwc->c", weight, r[hit.box])
+    return out
