@@ -30,7 +30,7 @@ LAYERS = """
     checkpoint rasterization
     train
     evaluate
-    bench viewer
+    bench viewer commands
     cli
     __main__
 """.strip().splitlines()

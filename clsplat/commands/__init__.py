@@ -1,0 +1,1 @@
+"""The commands of the program `clsplat`: a dataclass each, from which tyro makes flags and help."""

@@ -1,0 +1,121 @@
+"""The commands `eval` and `render`."""
+
+import os
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from clsplat.commands.console import Out, moved, new_folder, open_device, say, say_scores
+from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
+from clsplat.errors import InputError
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Compare renders of a scene with the held-out photos: metrics as JSON, and a page of pictures."""
+
+    scene: tyro.conf.Positional[Path]
+    """File of Gaussians."""
+    data: tyro.conf.Positional[Path]
+    """Dataset, as given to `train`."""
+    out: Out
+    """Folder for metrics.json, index.html and the renders."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
+    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.evaluate import evaluate
+        from clsplat.io import load_gaussians, load_scene
+
+        gaussians, mode, offset = load_gaussians(self.scene)
+        device = open_device(self.device)
+        scene = load_scene(self.data, self.data_config)
+        if not scene.test:
+            raise InputError(f"{self.data}: expected held-out photos to compare with, found none; see --test-every")
+        gaussians = moved(gaussians, offset - scene.offset)
+        new_folder(self.out)
+        background = BACKGROUNDS[self.data_config.background]
+        config = replace(self.render, mode=mode)
+        say_scores(evaluate(gaussians, scene.test, self.out, config, device, background=background), self.out)
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a scene as PNG files: the held-out views of its dataset, or an orbit around what its photos show."""
+
+    scene: tyro.conf.Positional[Path]
+    """File of Gaussians."""
+    data: tyro.conf.Positional[Path]
+    """Dataset, as given to `train`; its cameras are the views or lead the orbit."""
+    out: Out
+    """Folder for the pictures."""
+    path: str = "test"
+    """test: the held-out views (all views, where none is held out). orbit: a closed path around the scene."""
+    frames: int = 60
+    """Pictures of an orbit."""
+    depth: bool = False
+    """Also write the expected depth, as 16-bit PNG scaled to the largest depth."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
+    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+
+    def run(self) -> None:
+        """Run the command."""
+        import numpy as np
+        from PIL import Image
+        from tqdm import tqdm
+
+        from clsplat.io import load_gaussians, load_scene
+        from clsplat.io.atomic import replacing
+        from clsplat.metrics import to_uint8
+        from clsplat.orbit import orbit
+        from clsplat.render import Rendering, render_views
+
+        if self.path not in ("test", "orbit"):
+            raise InputError(f"--path: expected test or orbit, found {self.path!r}")
+        gaussians, mode, offset = load_gaussians(self.scene)
+        device = open_device(self.device)
+        scene = load_scene(self.data, self.data_config)
+        gaussians = moved(gaussians, offset - scene.offset)
+        views = scene.test or scene.train
+        if self.path == "test":
+            cameras = {view.name: view.camera for view in views}
+        else:
+            first = scene.train[0].camera
+            path = orbit([view.camera for view in scene.train], self.frames, first.width, first.height)
+            cameras = {f"{i:04d}": camera for i, camera in enumerate(path)}
+        new_folder(self.out)
+        config = replace(self.render, mode=mode)
+        background = BACKGROUNDS[self.data_config.background]
+
+        def write(name: str, rendering: Rendering) -> None:
+            target = (self.out / name).with_suffix(".png")
+            new_folder(target.parent)
+            with replacing(target) as file:
+                Image.fromarray(to_uint8(rendering.rgb)).save(file, format="PNG")
+            if rendering.depth is not None:
+                depth = rendering.depth / max(float(rendering.depth.max()), 1e-12) * 65535
+                with replacing(target.with_name(f"{target.stem}_depth.png")) as file:
+                    Image.fromarray(np.rint(depth).astype(np.uint16)).save(file, format="PNG")
+
+        renderings = render_views(
+            gaussians, cameras.values(), config, device, background=background, depth=self.depth
+        )
+        # PNG compression takes as long as rendering: it runs beside it, a few pictures behind.
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            writing: deque[Future[None]] = deque()
+            for name, rendering in tqdm(zip(cameras, renderings, strict=True), unit="view", total=len(cameras)):
+                writing.append(pool.submit(write, name, rendering))
+                if len(writing) > 2 * (os.cpu_count() or 1):
+                    writing.popleft().result()
+            for picture in writing:
+                picture.result()
+        say(f"{self.out}: {len(cameras)} pictures")

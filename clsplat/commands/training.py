@@ -1,0 +1,148 @@
+"""The commands `train` and `demo`."""
+
+import signal
+import sys
+import threading
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from clsplat.commands.console import STARTED, Out, new_folder, open_device, say, say_scores, write_json
+from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+    from clsplat.gaussians import Gaussians
+    from clsplat.scene import Scene
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train Gaussians on photos: a folder of photos, a COLMAP model with its photos, or a transforms.json."""
+
+    data: tyro.conf.Positional[Path]
+    """Folder of the dataset, or of photos alone."""
+    out: Out
+    """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians (*.spz, say) to write as well,
+    whose name without the suffix becomes the folder."""
+    resume: bool = False
+    """Continue the interrupted run in OUT."""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.io import load_scene, save_gaussians, suffix_of
+        from clsplat.memory import Footprint, parse_size
+
+        suffix = "" if self.out.is_dir() else suffix_of(self.out)
+        out = self.out.with_name(self.out.name[: -len(suffix)]) if suffix else self.out
+        if not self.resume and (out / "checkpoint.npz").exists():
+            raise InputError(
+                f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
+            )
+        config = self.config
+        if config.data.masks is not None:
+            config = replace(config, data=replace(config.data, masks=str(Path(config.data.masks).resolve())))
+        limit = None if config.memory_limit is None else parse_size(config.memory_limit, "--memory-limit")
+        device = open_device(config.device, limit)
+        scene = load_scene(self.data, config.data)
+        say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
+        need = Footprint.of(scene, config, device)
+        start = len(scene.points) or config.init.random_points
+        say(need.describe(start, config.adc.max_gaussians, device.memory_limit))
+        new_folder(out)
+        write_json(out / "config.json", {"data_path": str(self.data.resolve()), **asdict(config)})
+        gaussians = train_and_report(scene, config, device, out, self.resume)
+        if suffix:
+            save_gaussians(self.out, gaussians, config.render.mode, scene.offset)
+            say(f"{self.out}: {self.out.stat().st_size / 1e6:.3g} MB")
+
+
+def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out: Path, resume: bool) -> "Gaussians":
+    """Train with a progress bar; write scene.ply, the evaluation and the training curve to `out`."""
+    from tqdm import tqdm
+
+    from clsplat.evaluate import evaluate, mean_metrics
+    from clsplat.io import save_gaussians
+    from clsplat.report import training_curve
+    from clsplat.train import train
+
+    background = BACKGROUNDS[config.data.background]
+    interrupted = threading.Event()
+
+    def interrupt(*_: object) -> None:
+        interrupted.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # the second Ctrl-C does not wait
+
+    signal.signal(signal.SIGINT, interrupt)
+    with tqdm(total=config.iterations, unit="it", dynamic_ncols=True) as bar:
+
+        def progress(record: dict[str, Any]) -> None:
+            if bar.n == 0:
+                bar.write(f"first iteration: done {time.perf_counter() - STARTED:.1f} s after the start", sys.stderr)
+            bar.update(record["iteration"] - bar.n)
+            if interrupted.is_set():
+                say(f"\n{out}: stopped after iteration {record['iteration']}; --resume continues from there")
+                raise KeyboardInterrupt
+            bar.set_postfix_str(f"loss={record['loss']:.4f}, N={record['num_gaussians']}", refresh=False)
+
+        def held_out(gaussians: "Gaussians") -> dict[str, float]:
+            return mean_metrics(gaussians, scene.test, config.render, device, background)
+
+        gaussians = train(
+            scene, config, device, out, resume=resume, evaluate=held_out if scene.test else None, progress=progress
+        )
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
+    say(f"{out / 'scene.ply'}: {len(gaussians)} Gaussians")
+    training_curve(out / "log.jsonl", out / "training_curve.png")
+    if scene.test:
+        report = evaluate(gaussians, scene.test, out / "eval", config.render, device, background=background)
+        say_scores(report, out / "eval")
+    return gaussians
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Make photos of a still life, recover their cameras, train, evaluate: the whole path in minutes."""
+
+    out: Out = Path("clsplat-demo")
+    """Folder for everything that is made."""
+    iterations: int = 1500
+    """Optimisation steps."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.demo import make_photos
+        from clsplat.io import load_scene
+        from clsplat.render import render_views
+        from clsplat.report import side_by_side
+
+        if self.out.exists() and any(self.out.iterdir()):
+            raise InputError(f"{self.out}: expected an empty or new folder for the demo; choose another with -o")
+        started = time.perf_counter()
+        device = open_device(self.device)
+        photos = self.out / "photos"
+        new_folder(photos)
+        say("photos: ray tracing a still life")
+        make_photos(photos)
+        say("cameras: structure from motion on the photos alone")
+        config = TrainConfig(iterations=self.iterations, eval_every=max(1, self.iterations // 7), device=self.device)
+        scene = load_scene(photos, config.data)
+        say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
+        write_json(self.out / "config.json", asdict(config))
+        gaussians = train_and_report(scene, config, device, self.out, resume=False)
+        renderings = render_views(gaussians, [view.camera for view in scene.test], config.render, device)
+        pairs = [(view.image, rendering.rgb) for view, rendering in zip(scene.test, renderings, strict=True)]
+        side_by_side(self.out / "side_by_side.png", pairs)
+        say(
+            f"done in {time.perf_counter() - started:.0f} s. Look at {self.out / 'side_by_side.png'} (photo and "
+            f"render), {self.out / 'training_curve.png'} and {self.out / 'eval' / 'index.html'}; "
+            f"{self.out / 'scene.ply'} has the format that splat viewers read."
+        )
