@@ -7,6 +7,7 @@ from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from clsplat.errors import InputError
 from clsplat.stages import Bins, Removal, Splats
 from clsplat.testing import ambiguous_pixels, assert_matches
 
@@ -181,3 +182,11 @@ def test_splats_behind_a_finished_tile(any_device):
     assert (found.errors[4:] == 0).all() and (found.weights[4:] == 0).all() and found.weights[3] > 0
     table = DOUBLE if any_device.real == np.float64 else FLOAT
     assert_matches("errors", found.errors, expected.errors, table)
+
+
+def test_lists_without_slots_are_refused(device):
+    splats, width, height = make_splats(5)
+    uploaded = Splats(*(device.upload("splats", a) for a in splats))
+    bins = ops.bin_splats(device, uploaded, width, height, 16, gradients=False)
+    with pytest.raises(InputError, match="bins: expected lists made with gradients=True"):
+        ops.removal(device, uploaded, bins, BACKGROUND)

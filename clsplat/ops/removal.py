@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from clsplat.device import Device
+from clsplat.errors import InputError
 from clsplat.ops.composite import packed, variant
 from clsplat.stages import Bins, Removal, Splats
 
@@ -28,7 +29,14 @@ def removal(
     -------
     Removal
         Arrays of the host.
+
+    Raises
+    ------
+    InputError
+        If the lists were made without what gradients need.
     """
+    if bins.slots is None:
+        raise InputError("bins: expected lists made with gradients=True, found lists without slots; bin the splats anew")
     n, channels = splats.colors.shape
     m, (tiles, _) = bins.gauss_ids.shape[0], bins.tile_ranges.shape
     size = bins.height, bins.width
