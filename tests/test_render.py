@@ -390,7 +390,8 @@ POISON = {
 @MODES
 @COMPOSITORS
 def test_invalid_gaussians_leave_no_trace(any_device, mode, compositor):
-    """Image and gradients of the others are the same bits; the invalid have gradients of 0."""
+    """The image is the same bits, and so are the gradients of the others but for the last: a compiler may round a sum
+    otherwise in the rest of a vector, as Intel's does. The invalid have gradients of 0."""
     gaussians, camera = synthetic_scene(60, 8)
     parts = [gaussians]
     for name, values in POISON.items():
@@ -415,7 +416,8 @@ def test_invalid_gaussians_leave_no_trace(any_device, mode, compositor):
     v, w = (r.backward(*v_images) for r in (expected, actual))
     for name, array in w.gaussians.arrays().items():
         assert (array[:n_bad] == 0).all(), name
-        np.testing.assert_array_equal(array[n_bad:], v.gaussians.arrays()[name], err_msg=name)
+        last_bit = np.finfo(any_device.real).eps * np.abs(v.gaussians.arrays()[name]).max()
+        np.testing.assert_allclose(array[n_bad:], v.gaussians.arrays()[name], rtol=0, atol=last_bit, err_msg=name)
     assert (w.means2d[:n_bad] == 0).all()
 
 
