@@ -3,15 +3,18 @@
 // Mapping: one work-item per run of `width` values, the runs `stride` values apart; values between the end of a run and
 // the next one are left alone. The first `split` values of a run have a rate of their own. So a row of spherical
 // harmonics is a run that ends with the trained bands and starts with degree 0; any other array is cut into runs of 16.
-// project.cl has the same update fused with the gradients, for training.
+// project.cl has the same update fused with the gradients, for training. The penalties of the loss by the sums of all
+// opacities and scales add o (1 - o) and the scale itself to the gradients of their logits and logarithms; each is 0
+// for the other fields.
 //
 // Buffers, `total` values each: in gradients; in and out parameters, first (m), second (v).
 #include "common.h"
 #include "adam.h"
 
 __kernel void adam_step(const uint total, const uint stride, const uint width, const uint split,
-                        const real split_rate, const real rate, const Adam adam, const __global real *gradients,
-                        __global real *parameters, __global real *first, __global real *second) {
+                        const real split_rate, const real rate, const real opacity_penalty, const real scale_penalty,
+                        const Adam adam, const __global real *gradients, __global real *parameters,
+                        __global real *first, __global real *second) {
     const size_t begin = get_global_id(0) * stride;
     if (begin >= total)
         return;
@@ -24,6 +27,14 @@ __kernel void adam_step(const uint total, const uint stride, const uint width, c
         real16 g = 0;
         for (int k = 0; k < count; ++k)
             ((real *)&g)[k] = gradients[i + k];
+        if (opacity_penalty != 0 || scale_penalty != 0) {
+            real16 p = 0;
+            for (int k = 0; k < count; ++k)
+                ((real *)&p)[k] = parameters[i + k];
+            // o (1 - o) for the logit p of o, even in p
+            const real16 e = exp(-ABSOLUTE(p));
+            g += opacity_penalty * e / ((1 + e) * (1 + e)) + (scale_penalty != 0 ? scale_penalty * exp(p) : 0);
+        }
         adam_update_some(&adam, rates, count, g, parameters + i, first + i, second + i);
     }
 }

@@ -354,6 +354,11 @@ __kernel void project_bwd_adam(const uint n, const Camera camera, const int sh_s
         const SplatArrays splats = {conics, colors, v_means2d, v_conics, v_opacities, v_colors};
         v = gaussian_vjp(i, &camera, sh_stride, sh_degree, gaussians, splats);
     }
+    if (adam.opacity_penalty != 0 || adam.scale_penalty != 0) {
+        const real4 activated = activate(load3(log_scales, i), logit_opacities[i]);
+        v.logit_opacity += adam.opacity_penalty * activated.w * (1 - activated.w);
+        v.geometry.log_scales += adam.scale_penalty * activated.xyz;
+    }
 
     const real16 rates =
         (real16)((real3)adam.means, (real3)adam.log_scales, (real4)adam.quats, adam.logit_opacities, (real4)0, 0);

@@ -17,6 +17,7 @@ typedef struct {
     real keep1, take1, keep2, take2;                              // beta1, beta2
     real inv_correction2;                                         // 1/(1 - beta2^t)
     real eps;
+    real opacity_penalty, scale_penalty; // weights in the loss of the sums of all opacities and scales
 } Adam;
 
 #endif

@@ -128,10 +128,34 @@ class AdcConfig:
     """Iterations between two resets of the opacities."""
     reset_opacity: float = 0.01
     """Opacities are lowered to at most this value at a reset; it lies above ALPHA_MIN, so that gradients survive."""
-    max_gaussians: int = 6_000_000
-    """Never exceeded; the candidates with the largest gradients are densified first."""
     min_gaussians: int = 16
     """Pruning never leaves fewer, however transparent they are."""
+
+
+@dataclass(frozen=True)
+class McmcConfig:
+    """3D Gaussian Splatting as Markov chain Monte Carlo (Kheradmand et al. 2024; the original's values)."""
+
+    start: int = 500
+    """First iteration after which Gaussians are relocated or added; sooner in short runs."""
+    stop_fraction: float = 0.83
+    """Fraction of the iterations after which they no longer are (gsplat: 25 000 of 30 000)."""
+    every: int = 100
+    """Iterations between two rounds."""
+    growth: float = 0.05
+    """Gaussians added per round, as a fraction of all; more where the cap would be reached too late otherwise."""
+    full_fraction: float = 0.25
+    """Fraction of the iterations by which the cap is reached (the original: 5200 of 30 000, for 1 million)."""
+    opacity_min: float = 0.005
+    """Gaussians of this opacity or a lower one are dead: they are relocated onto live ones."""
+    noise_lr: float = 1e7
+    """Strength of the noise on the means, in units of their learning rate and per squared extent of the scene (the
+    original's 5e5, in world units, at an extent of 4.5)."""
+    opacity_penalty: float = 0.01
+    """Weight of the mean opacity in the loss."""
+    scale_penalty: float = 0.045
+    """Weight of the mean scale, in extents of the scene, in the loss (the original's 0.01, in world units, at an
+    extent of 4.5)."""
 
 
 @dataclass(frozen=True)
@@ -142,11 +166,13 @@ class TrainConfig:
     """Optimisation steps. In runs shorter than 7000, the paper's shorter setting, the first densification and new
     bands of spherical harmonics come sooner in proportion."""
     seed: int = 0
-    """Of the random start, the order of the photos and the positions of split Gaussians."""
+    """Of the random start, the order of the photos and all that the strategy draws."""
     optimizer: Literal["device", "numpy"] = "device"
     """Where Adam runs: in a kernel, or in NumPy on the host (slower; the same to rounding)."""
     strategy: str = "adc"
     """Densification strategy: a name of clsplat.densify.STRATEGIES."""
+    max_gaussians: int | None = None
+    """Hard cap, under every strategy: in no iteration are there more Gaussians. A start of more is thinned to it."""
     checkpoint_every: int = 1000
     """Iterations between two checkpoints, from which an interrupted run resumes."""
     eval_every: int = 500
@@ -160,6 +186,7 @@ class TrainConfig:
     init: InitConfig = field(default_factory=InitConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     adc: AdcConfig = field(default_factory=AdcConfig)
+    mcmc: McmcConfig = field(default_factory=McmcConfig)
     render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
 
     def shortened(self, interval: int) -> int:

@@ -1,5 +1,7 @@
 """The Gaussians that training starts from: one per sparse point, or random ones where there are no points."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -18,7 +20,7 @@ VARIANCE_MIN = 1e-7
 """Smallest such variance, in squared world units: duplicates would otherwise start with scale 0 (original)."""
 
 
-def initialize(scene: Scene, config: InitConfig, seed: int) -> Gaussians:
+def initialize(scene: Scene, config: InitConfig, seed: int, cap: int | None = None) -> Gaussians:
     """Gaussians to start from: `from_points` where the scene has points, otherwise `random`.
 
     Parameters
@@ -28,16 +30,35 @@ def initialize(scene: Scene, config: InitConfig, seed: int) -> Gaussians:
     config : InitConfig
         Opacity, degree of the spherical harmonics, number and extent of random Gaussians.
     seed : int
-        Of the random ones.
+        Of the random ones, and of the choice of points.
+    cap : int, optional
+        The most Gaussians: of more points, so many are drawn.
 
     Returns
     -------
     Gaussians
         float32, on the host.
+
+    Raises
+    ------
+    InputError
+        If the cap is not positive.
     """
-    if len(scene.points):
-        return from_points(scene.points, scene.colors, config)
-    return random([view.camera for view in scene.train], config, seed)
+    if cap is not None and cap < 1:
+        raise InputError(f"--max-gaussians: expected at least 1, found {cap}")
+    n = start_size(scene, config, cap)
+    if not len(scene.points):
+        return random([view.camera for view in scene.train], replace(config, random_points=n), seed)
+    rows = np.arange(n)
+    if n < len(scene.points):
+        rows = np.sort(stream(seed, "points of the start").permutation(len(scene.points))[:n])
+    return from_points(scene.points[rows], scene.colors[rows], config)
+
+
+def start_size(scene: Scene, config: InitConfig, cap: int | None) -> int:
+    """How many Gaussians `initialize` makes."""
+    wanted = len(scene.points) or config.random_points
+    return wanted if cap is None else min(wanted, cap)
 
 
 def from_points(points: ArrayLike, colors: ArrayLike, config: InitConfig) -> Gaussians:

@@ -120,7 +120,7 @@ class Footprint:
         """The largest number of Gaussians for which `total` is within `limit` bytes; 0 where none is."""
         return max(0, int((limit - self.fixed) / self.per_gaussian(intersections)))
 
-    def describe(self, start: int, cap: int, limit: int) -> str:
+    def describe(self, start: int, cap: int | None, limit: int) -> str:
         """A sentence on what training takes, from `start` Gaussians to at most `cap`, within `limit` bytes.
 
         Raises
@@ -136,10 +136,10 @@ class Footprint:
                 f"{self.width}x{self.height}, found {size_text(limit)}; what fits at this size: "
                 f"{self.most_gaussians(limit)} Gaussians{''.join(fitting[:1])}"
             )
+        capped = "" if cap is None else f" {size_text(self.total(cap))} for {cap} (--max-gaussians),"
         return (
-            f"memory: {size_text(self.total(start))} for {start} Gaussians, {size_text(self.total(cap))} for "
-            f"{cap} (--adc.max-gaussians), if each meets {INTERSECTIONS:.0f} tiles; limit {size_text(limit)}, "
-            f"enough for {self.most_gaussians(limit)}"
+            f"memory: {size_text(self.total(start))} for {start} Gaussians,{capped} if each meets "
+            f"{INTERSECTIONS:.0f} tiles; limit {size_text(limit)}, enough for {self.most_gaussians(limit)}"
         )
 
 

@@ -5,7 +5,15 @@ A resumed run therefore needs no generator's state (Philox: Salmon et al. 2011, 
 
 import numpy as np
 
-PURPOSES = ("initial points", "order of the views", "positions of split Gaussians")
+PURPOSES = (
+    "initial points",
+    "order of the views",
+    "positions of split Gaussians",
+    "points of the start",
+    "sources of relocated Gaussians",
+    "sources of new Gaussians",
+    "surveyed views",
+)
 
 
 def stream(seed: int, purpose: str, index: int = 0) -> np.random.Generator:

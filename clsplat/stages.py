@@ -6,6 +6,10 @@ N Gaussians, M intersections of a splat with a tile, T tiles, C colour channels,
 
 from typing import Any, NamedTuple
 
+GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
+"""Noise on the means fades out where the opacity rises above 0.005, over some hundredths (original code of Kheradmand
+et al. 2024)."""
+
 
 class Splats(NamedTuple):
     """Projected Gaussians; an invisible one has extents 0 and its other fields 0.
@@ -76,7 +80,8 @@ class AdamStep(NamedTuple):
     """One step of the optimiser: its number, counted from 1, and its constants.
 
     rates: learning rate by field of `clsplat.gaussians.Gaussians`, with sh0 and sh_rest in the place of sh.
-    sh_degree: bands above it have had no gradient yet, and are left alone.
+    sh_degree: bands above it have had no gradient yet, and are left alone. penalties: weights of the sum of all
+    opacities and of the sum of all scales in the loss, whose gradients are added to those given.
     """
 
     iteration: int
@@ -85,3 +90,4 @@ class AdamStep(NamedTuple):
     beta2: float
     eps: float
     sh_degree: int
+    penalties: tuple[float, float] = (0.0, 0.0)

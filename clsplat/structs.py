@@ -7,6 +7,7 @@ import numpy as np
 from clsplat.camera import Camera
 from clsplat.stages import AdamStep
 
+PENALTIES = ("opacity_penalty", "scale_penalty")
 RATES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "sh_rest")
 
 
@@ -35,5 +36,6 @@ def adam_struct(step: AdamStep, real: Any) -> np.ndarray:
     correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
     rates = [step.rates[name] / correction1 for name in RATES]
     betas = [step.beta1, 1 - step.beta1, step.beta2, 1 - step.beta2]
-    names = (*RATES, "keep1", "take1", "keep2", "take2", "inv_correction2", "eps")
-    return np.array((*rates, *betas, 1 / correction2, step.eps), dtype=[(name, real) for name in names])
+    names = (*RATES, "keep1", "take1", "keep2", "take2", "inv_correction2", "eps", *PENALTIES)
+    values = (*rates, *betas, 1 / correction2, step.eps, *step.penalties)
+    return np.array(values, dtype=[(name, real) for name in names])

@@ -21,6 +21,7 @@ from clsplat.randomness import stream
 from clsplat.render import backward_to_splats, download, fetch, forward, stage_functions, upload
 from clsplat.scene import Scene, View
 from clsplat.stages import Image
+from clsplat.survey import contributions
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -95,13 +96,13 @@ def train(
             photos.keep_within(device.memory_limit - need.total(len(state.gaussians), intersections))
             if state.strategy.due(iteration):
                 fitting = need.most_gaussians(device.memory_limit, intersections)
-                state.strategy.max_gaussians = min(config.adc.max_gaussians, fitting)
+                state.strategy.max_gaussians = min(config.max_gaussians or fitting, fitting)
                 if len(state.gaussians) >= fitting:
                     warnings.warn(f"no more than {fitting} Gaussians fit the memory: growth stops", stacklevel=2)
             try:
                 loss = step(state, iteration, view_at(iteration, scene.train, config.seed), photos, config, device)
                 if state.strategy.due(iteration):
-                    densify(state, device if config.optimizer == "device" else None)
+                    densify(state, scene.train, config, device)
             except DeviceError as error:
                 raise DeviceError(
                     f"iteration {iteration}: {error}; the last checkpoint in {out}, if there is one, is intact: "
@@ -155,6 +156,7 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
             extents, v_means2d = download(extents), download(v_means2d)
         state.strategy.observe(stage_functions(optimizer), extents, v_means2d, camera.width, camera.height)
     settings = adam_settings(iteration, config.iterations, state.extent, config.optim, sh_degree)
+    settings = settings._replace(penalties=state.strategy.penalties(len(gaussians)))
     moments, antialiased = (state.moments.first, state.moments.second), config.render.mode == "antialiased"
     if optimizer:
         update = stage_functions(device).project_bwd_adam
@@ -164,19 +166,32 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
             gaussians, camera, sh_degree, run.splats, v_splats, antialiased=antialiased
         )
         stage_functions(None).adam_step(state.gaussians, fetch(v_gaussians), *moments, settings)
+    state.strategy.perturb(stage_functions(optimizer), state.gaussians, iteration, settings.rates["means"])
     state.iteration = iteration
     return loss
 
 
-def densify(state: State, device: "Device | None") -> None:
-    """The edit that is due after an iteration; None: the parameters are on the host. Changes `state`.
+def densify(state: State, views: list[View], config: TrainConfig, device: "Device") -> None:
+    """The edit that is due after an iteration. Changes `state`.
 
     Not a part of `step`, whose arrays of the old size must be gone before those of the new one are allocated.
     """
-    move(state, None)
-    _apply(state.strategy.edit(state.iteration, state.gaussians), state)
-    if device:
+    _apply(_edit(state, views, config, device), state)
+    if config.optimizer == "device":
         move(state, device)
+
+
+def _edit(state: State, views: list[View], config: TrainConfig, device: "Device") -> Edit:
+    gaussians = state.gaussians
+    sh_degree = sh_degree_at(state.iteration, config.shortened(config.optim.sh_degree_every), gaussians.sh_degree)
+
+    def survey(count: int) -> tuple[Any, Any]:
+        order = stream(config.seed, "surveyed views", state.iteration).permutation(len(views))
+        chosen = [views[i] for i in order[:count]]
+        return contributions(device, gaussians, chosen, config.render, BACKGROUNDS[config.data.background], sh_degree)
+
+    move(state, None)
+    return state.strategy.edit(state.iteration, state.gaussians, survey)
 
 
 def _apply(edit: Edit, state: State) -> None:
@@ -198,6 +213,6 @@ def move(state: State, device: "Device | None") -> None:
 
 def initial_state(scene: Scene, config: TrainConfig) -> State:
     """The state before the first iteration."""
-    gaussians = initialize(scene, config.init, config.seed)
+    gaussians = initialize(scene, config.init, config.seed, config.max_gaussians)
     strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
     return State(0, 0.0, scene.extent, gaussians, Moments.zeros(gaussians), strategy)

@@ -133,6 +133,14 @@ def adam(device):
                 np.testing.assert_allclose(a.arrays()[name].get(), array, rtol=1e-12, atol=1e-14)
 
 
+def noise(device):
+    found = scene(70, -3, 1).astype(np.float64)
+    on_device = upload(device, found)
+    ops.add_noise(device, on_device, 2.0, 5, 9)
+    reference.add_noise(found, 2.0, 5, 9)
+    np.testing.assert_allclose(on_device.means.get(), found.means, rtol=1e-12, atol=1e-14)
+
+
 def scene(n, opacity_logit, scale):
     rng = np.random.default_rng(n)
     return Gaussians(
@@ -170,6 +178,7 @@ CASES = {
     "scan": scan,
     "loss": loss,
     "adam": adam,
+    "noise": noise,
     "gpu-8": lambda device: pipeline(device, "gpu", 8),
     "gpu-16": lambda device: pipeline(device, "gpu", 16),
     "cpu-16": lambda device: pipeline(device, "cpu", 16),

@@ -7,11 +7,11 @@ from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.config import OptimConfig
-from clsplat.gaussians import SHAPES, Gaussians
+from clsplat.gaussians import SHAPES, Gaussians, sigmoid
 from clsplat.optim import Moments, adam_settings
 from clsplat.reference.adam import BLOCK
 from clsplat.render import fetch, upload
-from clsplat.testing import assert_matches, synthetic_scene
+from clsplat.testing import assert_matches, gradcheck, synthetic_scene
 
 CONFIG = OptimConfig()
 STEPS = 100
@@ -142,6 +142,38 @@ def test_rates_act_where_they_should(any_device):
             for rate, part in parts.items():
                 # Single precision: parameters of up to 4, and steps of 1e-3.
                 np.testing.assert_allclose(part, rates[rate], rtol=5e-4, err_msg=rate)
+
+
+def test_penalties_are_gradients_of_sums(any_device):
+    """What the first moments take in, by finite differences of the penalty itself; opacities near 0 and 1 too."""
+    weights = 0.3, 0.7
+    gaussians, zeros, second = start_of(23)
+    gaussians.logit_opacities[:3] = -30, 30, 0
+
+    def penalty(log_scales, logit_opacities):
+        return weights[0] * sigmoid(logit_opacities).sum() + weights[1] * np.exp(log_scales).sum()
+
+    def moments(add):
+        step = settings(1)._replace(penalties=weights)
+        return {name: array / (1 - CONFIG.beta1) for name, array in add(step).arrays().items()}
+
+    def twin(step):
+        state = [part.astype(np.float64) for part in (gaussians, zeros, zeros, second)]
+        reference.adam_step(*state, step)
+        return state[2]
+
+    def kernel(step):
+        state = [upload(any_device, part) for part in (gaussians, zeros, zeros, second)]
+        ops.adam_step(any_device, *state, step)
+        return fetch(state[2])
+
+    expected, found = moments(twin), moments(kernel)
+    inputs = {name: getattr(gaussians, name) for name in ("log_scales", "logit_opacities")}
+    gradcheck(penalty, inputs, {name: expected[name] for name in inputs})
+    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    for name in SHAPES:
+        assert_matches("first moments", found[name], expected[name], tolerances)
+        assert name in inputs or not expected[name].any()
 
 
 def test_no_gradient_no_step(any_device):

@@ -27,7 +27,7 @@ LAYERS = """
     scene structs device reference metrics raytrace orbit
     ops io testing still_life memory
     render optim densify initialize report demo
-    checkpoint rasterization
+    checkpoint rasterization survey
     train
     evaluate
     bench viewer commands
@@ -136,6 +136,7 @@ def test_no_path_of_a_machine():
 # What each file's header documents, with values it allows.
 DEFINES = {
     "adam": {},
+    "noise": {"GATE_SLOPE": 100.0, "GATE_OPACITY": 0.005},
     "observe": {},
     "bin": {"TILE": 16, "GRADIENTS": 1},
     "composite_cpu": {"TILE": 8, "CHANNELS": 1},

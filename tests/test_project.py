@@ -101,16 +101,17 @@ def random_moments(gaussians, rng):
 
 
 @MODES
+@pytest.mark.parametrize("penalties", [(0.0, 0.0), (0.3, 0.2)])
 @pytest.mark.parametrize(("stored", "degree"), [(0, 0), (1, 0), (1, 1), (2, 1), (2, 2), (3, 0), (3, 2), (3, 3)])
-def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degree):
-    """The gradients in registers are those that project_bwd writes, and each meets its own moments and rate;
-    invisible Gaussians move on by their moments."""
+def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degree, penalties):
+    """The gradients in registers are those that project_bwd writes, and each meets its own moments, rate and penalty;
+    invisible Gaussians move on by their moments and penalties."""
     gaussians, camera = wide_scene(300)
     gaussians.sh = gaussians.sh[:, : (stored + 1) ** 2]
     parts = (gaussians, *random_moments(gaussians, np.random.default_rng(stored)))
     splats = reference.project_fwd(gaussians, camera, degree, antialiased=antialiased)
     v_splats = random_grads(splats)
-    step = adam_settings(20, 100, 2.0, OptimConfig(), degree)
+    step = adam_settings(20, 100, 2.0, OptimConfig(), degree)._replace(penalties=penalties)
     uploaded = [type(a)(*(any_device.upload("splats", x) for x in a)) for a in (splats, v_splats)]
     fused, separate = ([upload(any_device, part) for part in parts] for _ in range(2))
 

@@ -10,8 +10,8 @@ import pytest
 
 from clsplat.camera import Camera
 from clsplat.checkpoint import State, load_state, log_file, save_state
-from clsplat.config import AdcConfig, InitConfig, OptimConfig, TrainConfig
-from clsplat.densify import Edit
+from clsplat.config import AdcConfig, InitConfig, McmcConfig, OptimConfig, TrainConfig
+from clsplat.densify import STRATEGIES, Edit
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
@@ -23,6 +23,7 @@ from clsplat.testing import synthetic_scene
 from clsplat.train import _apply, initial_state, train, view_at
 
 SIZE = (40, 32)
+EACH_STRATEGY = pytest.mark.parametrize("strategy", STRATEGIES)
 CONFIG = TrainConfig(
     iterations=60,
     checkpoint_every=25,
@@ -30,7 +31,13 @@ CONFIG = TrainConfig(
     optim=OptimConfig(sh_degree_every=2333),
     # Small enough to see a clone, a split and a reset within 60 iterations.
     adc=AdcConfig(every=10, reset_every=30, stop_fraction=0.8, grad_threshold=1e-5),
+    mcmc=McmcConfig(every=10),
 )
+
+
+def with_strategy(strategy: str) -> TrainConfig:
+    """40 Gaussians at the start, and a cap that each strategy reaches."""
+    return replace(CONFIG, strategy=strategy, max_gaussians=61)
 
 
 def cameras(count: int) -> list[Camera]:
@@ -68,8 +75,8 @@ def test_it_learns_an_unseen_view(scene: Scene, device: Device, tmp_path: Path) 
     optim = replace(
         CONFIG.optim, means_lr=1.6e-3, means_lr_final=1e-4
     )  # points are 0.05 off, 600 times the default step
-    adc = replace(CONFIG.adc, max_gaussians=80, reset_every=1000, every=50)
-    config = replace(CONFIG, iterations=300, optim=optim, adc=adc)
+    adc = replace(CONFIG.adc, reset_every=1000, every=50)
+    config = replace(CONFIG, iterations=300, optim=optim, adc=adc, max_gaussians=80)
     before = held_out(train(scene, replace(config, iterations=1), device, tmp_path), scene, device)
     after = held_out(train(scene, config, device, tmp_path), scene, device)
     # Measured: 16.8 dB before, 25.2 dB after; 24.2 dB or less where means, scales, opacities or colours do not learn.
@@ -77,21 +84,27 @@ def test_it_learns_an_unseen_view(scene: Scene, device: Device, tmp_path: Path) 
     assert after > 24.7
 
 
-def test_two_runs_are_the_same_file(scene: Scene, device: Device, tmp_path: Path) -> None:
+@EACH_STRATEGY
+def test_two_runs_are_the_same_file(scene: Scene, device: Device, tmp_path: Path, strategy: str) -> None:
+    config = with_strategy(strategy)
     for name in ("a.ply", "b.ply"):
-        save_gaussians(tmp_path / name, train(scene, CONFIG, device, tmp_path))
+        save_gaussians(tmp_path / name, train(scene, config, device, tmp_path))
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-    other = train(scene, replace(CONFIG, seed=1), device, tmp_path)
+    other = train(scene, replace(config, seed=1), device, tmp_path)
     save_gaussians(tmp_path / "c.ply", other)
     assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "c.ply").read_bytes()
 
 
+@EACH_STRATEGY
 @pytest.mark.parametrize("killed_at", [26, 49, 51])
-def test_a_killed_run_resumes_to_the_same_bits(scene: Scene, device: Device, tmp_path: Path, killed_at: int) -> None:
+def test_a_killed_run_resumes_to_the_same_bits(
+    scene: Scene, device: Device, tmp_path: Path, killed_at: int, strategy: str
+) -> None:
+    config = with_strategy(strategy)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     whole.mkdir()
     broken.mkdir()
-    expected = train(scene, CONFIG, device, whole)
+    expected = train(scene, config, device, whole)
 
     class Killed(Exception):
         pass
@@ -101,9 +114,9 @@ def test_a_killed_run_resumes_to_the_same_bits(scene: Scene, device: Device, tmp
             raise Killed
 
     with pytest.raises(Killed):
-        train(scene, CONFIG, device, broken, progress=kill)
+        train(scene, config, device, broken, progress=kill)
     first: list[object] = []
-    resumed = train(scene, CONFIG, device, broken, resume=True, progress=lambda r: first.append(r["iteration"]))
+    resumed = train(scene, config, device, broken, resume=True, progress=lambda r: first.append(r["iteration"]))
     assert first[0] == 25 * (killed_at // 25) + 1
     assert same(resumed, expected)
 
@@ -139,8 +152,35 @@ def test_resume_refuses_what_would_not_continue(scene: Scene, device: Device, tm
         train(scene, CONFIG, device, tmp_path, resume=True)
 
 
-def test_both_optimisers_train_alike(scene: Scene, device: Device, tmp_path: Path) -> None:
-    config = replace(CONFIG, iterations=30, adc=AdcConfig(stop_fraction=0))
+@EACH_STRATEGY
+@pytest.mark.parametrize("cap", [7, 61])
+def test_the_cap_holds_in_every_iteration(
+    scene: Scene, device: Device, tmp_path: Path, strategy: str, cap: int
+) -> None:
+    """Below and above the 40 points; photos of noise, in which every Gaussian has a reason to be split."""
+    rng = np.random.default_rng(0)
+    noise = [replace(v, image=rng.integers(0, 256, v.image.shape, dtype=np.uint8)) for v in scene.train]
+    counts: list[int] = []
+    config = replace(with_strategy(strategy), max_gaussians=cap)
+    result = train(
+        replace(scene, train=noise), config, device, tmp_path, progress=lambda r: counts.append(r["num_gaussians"])
+    )
+    assert max(counts) == cap
+    assert 0 < len(result) <= cap
+    assert all(np.isfinite(a).all() for a in result.arrays().values())
+    assert 0 < len(initial_state(scene, config).gaussians) <= min(cap, 40)
+
+
+def test_a_cap_of_none_is_refused(scene: Scene, device: Device, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--max-gaussians: expected at least 1, found 0"):
+        train(scene, replace(CONFIG, max_gaussians=0), device, tmp_path)
+
+
+@EACH_STRATEGY
+def test_both_optimisers_train_alike(scene: Scene, device: Device, tmp_path: Path, strategy: str) -> None:
+    """Also what a strategy adds to the gradients and to the means; nothing is densified."""
+    config = replace(CONFIG, strategy=strategy, iterations=30, adc=AdcConfig(stop_fraction=0))
+    config = replace(config, mcmc=McmcConfig(stop_fraction=0))
     results = [train(scene, replace(config, optimizer=o), device, tmp_path) for o in ("device", "numpy")]
     # Adam turns a gradient that is zero to rounding into a whole step of either sign: parameters without effect may
     # differ, what is seen hardly does. Measured: 1.7e-3.

@@ -41,6 +41,7 @@ DOUBLE = {
     "weights": _REORDERED,
     "squares": _REORDERED,
     "pulls": _CANCELS,
+    "moved means": _REORDERED,
     "moved world": Tolerance(1e-9, 1e-11, "float64: translations of 10 units and scales of 40 cost three digits"),
 }
 
@@ -79,5 +80,6 @@ FLOAT = {
     "parameters": Tolerance(1e-6, 1e-5, "float32: a hundred updates, each rounded"),
     "first moments": Tolerance(1e-6, 2e-6, "float32: gradients of both signs cancel"),
     "second moments": Tolerance(2e-6, 0, "float32: a hundred updates, each rounded"),
+    "moved means": Tolerance(1e-6, 1e-6, "float32: a random step of the size of the coordinate"),
     "grad_sum": Tolerance(1e-6, 0, "float32: a root and a sum of positive numbers, each rounded"),
 }

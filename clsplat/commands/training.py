@@ -35,6 +35,7 @@ class Train:
 
     def run(self) -> None:
         """Run the command."""
+        from clsplat.initialize import start_size
         from clsplat.io import load_scene, save_gaussians, suffix_of
         from clsplat.memory import Footprint, parse_size
 
@@ -52,8 +53,8 @@ class Train:
         scene = load_scene(self.data, config.data)
         say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
         need = Footprint.of(scene, config, device)
-        start = len(scene.points) or config.init.random_points
-        say(need.describe(start, config.adc.max_gaussians, device.memory_limit))
+        start = start_size(scene, config.init, config.max_gaussians)
+        say(need.describe(start, config.max_gaussians, device.memory_limit))
         new_folder(out)
         write_json(out / "config.json", {"data_path": str(self.data.resolve()), **asdict(config)})
         gaussians = train_and_report(scene, config, device, out, self.resume)

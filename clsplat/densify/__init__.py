@@ -5,10 +5,12 @@ strategies only through this table.
 """
 
 from clsplat.densify.adc import Adc
-from clsplat.densify.strategy import Edit, Strategy
+from clsplat.densify.mcmc import Mcmc
+from clsplat.densify.strategy import Edit, Strategy, Survey
 
 STRATEGIES: dict[str, type[Strategy]] = {
     "adc": Adc,
+    "mcmc": Mcmc,
 }
 
-__all__ = ["STRATEGIES", "Edit", "Strategy"]
+__all__ = ["STRATEGIES", "Edit", "Strategy", "Survey"]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config import TrainConfig
-from clsplat.densify.strategy import Edit
+from clsplat.densify.strategy import Edit, Strategy, Survey
 from clsplat.gaussians import Gaussians, logit
 from clsplat.randomness import stream
 from clsplat.reference.project import rotations
@@ -18,7 +18,7 @@ CHILDREN = 2
 CHILD_SHRINK = 1.6
 
 
-class Adc:
+class Adc(Strategy):
     """The paper's strategy, with a hard cap on the number of Gaussians and a floor under pruning.
 
     Statistics: `grad_sum`, the sum over iterations of the norm of the positional gradient in normalised device
@@ -26,6 +26,7 @@ class Adc:
     """
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
+        super().__init__(config, extent, n)
         self.config, self.seed, self.extent = config.adc, config.seed, extent
         self.start = config.shortened(config.adc.start)
         # On white, Gaussians in empty space turn white instead of transparent: a reset at the first round of
@@ -33,8 +34,6 @@ class Adc:
         self.white = config.data.background == "white"
         self.first_edit = -(-self.start // config.adc.every) * config.adc.every
         self.stop = round(config.adc.stop_fraction * config.iterations)
-        self.statistics: dict[str, Any] = {}
-        self.max_gaussians = config.adc.max_gaussians
         self._clear(n)
 
     def _clear(self, n: int) -> None:
@@ -59,7 +58,7 @@ class Adc:
         """See `clsplat.densify.Strategy`."""
         return self._densifies(iteration) or self._resets(iteration)
 
-    def edit(self, iteration: int, gaussians: Gaussians) -> Edit:
+    def edit(self, iteration: int, gaussians: Gaussians, survey: Survey) -> Edit:
         """See `clsplat.densify.Strategy`."""
         edit = Edit(gaussians, np.arange(len(gaussians)), np.zeros(len(gaussians), bool))
         if self._densifies(iteration):

@@ -1,6 +1,7 @@
 """What a densification strategy is."""
 
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
@@ -8,6 +9,13 @@ from clsplat.config import TrainConfig
 from clsplat.gaussians import Gaussians
 
 Array = NDArray[Any]
+
+# Indices on the device are of 32 bits.
+MOST_GAUSSIANS = 2**32 - 1
+
+
+# Sums of weights and of weights times errors, (N,) each, over so many photos: `clsplat.survey.contributions`.
+Survey = Callable[[int], tuple[Array, Array]]
 
 
 class Edit(NamedTuple):
@@ -23,12 +31,12 @@ class Edit(NamedTuple):
     reset_opacities: bool = False
 
 
-class Strategy(Protocol):
-    """Decides when Gaussians are added and removed, from statistics of the gradients.
+class Strategy:
+    """Decides when Gaussians are added and removed, from statistics of the gradients; this one leaves them alone.
 
     A strategy keeps all it remembers between iterations in `statistics`, arrays of one row per Gaussian: checkpoints
-    save and restore them, so that a resumed run continues to the same bits. No edit leaves more than `max_gaussians`,
-    which training lowers to what fits the device.
+    save and restore them, so that a resumed run continues to the same bits. No edit leaves more than `max_gaussians`:
+    training sets it before each, to the user's cap or what fits the device.
     """
 
     statistics: dict[str, Any]
@@ -36,9 +44,12 @@ class Strategy(Protocol):
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         """Statistics of `n` Gaussians in a scene of the given extent, in world units."""
+        self.statistics = {}
+        self.max_gaussians = config.max_gaussians or MOST_GAUSSIANS
 
     def watches(self, iteration: int) -> bool:
         """Whether `observe` is to be told of an iteration, counted from 1."""
+        return False
 
     def observe(self, stage: Any, extents: Any, v_means2d: Any, width: int, height: int) -> None:
         """Take in one iteration.
@@ -53,10 +64,33 @@ class Strategy(Protocol):
             The image's size in pixels.
         """
 
+    def penalties(self, n: int) -> tuple[float, float]:
+        """Weights in the loss of the sum of all opacities and of that of all scales, where there are n Gaussians."""
+        return 0.0, 0.0
+
+    def perturb(self, stage: Any, gaussians: Gaussians, iteration: int, rate: float) -> None:
+        """Change the Gaussians in place after the step of the optimiser.
+
+        Parameters
+        ----------
+        stage : namespace
+            As given to `observe`.
+        gaussians : Gaussians
+            Arrays where the stages work.
+        iteration : int
+            Counted from 1.
+        rate : float
+            Learning rate of the means in this iteration, in world units.
+        """
+
     def due(self, iteration: int) -> bool:
         """Whether an edit is due after an iteration, counted from 1."""
+        return False
 
-    def edit(self, iteration: int, gaussians: Gaussians) -> Edit:
+    def edit(self, iteration: int, gaussians: Gaussians, survey: Survey) -> Edit:
         """The edit that is due.
 
-        Leaves `gaussians` as they are, and the statistics in step with the result."""
+        Leaves `gaussians` as they are, and the statistics in step with the result. `survey` renders as many photos
+        as it is asked for.
+        """
+        raise NotImplementedError

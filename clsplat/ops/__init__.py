@@ -4,6 +4,7 @@ from clsplat.ops.adam import adam_step
 from clsplat.ops.bin import bin_splats
 from clsplat.ops.composite import composite_bwd, composite_fwd
 from clsplat.ops.loss import l1_ssim
+from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
 from clsplat.ops.project import project_bwd, project_bwd_adam, project_fwd
 from clsplat.ops.removal import removal
@@ -12,6 +13,7 @@ from clsplat.ops.sort import argsort, argsort_segments
 
 __all__ = [
     "adam_step",
+    "add_noise",
     "argsort",
     "argsort_segments",
     "bin_splats",

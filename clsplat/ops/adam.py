@@ -37,5 +37,6 @@ def adam_step(
         else:
             stride, width, split = RUN, RUN, 0
             rates = [struct[name]] * 2
-        scalars: list[Any] = [total, stride, width, split, *rates, struct]
+        penalties = [float(step.penalties[k]) * (name == f) for k, f in enumerate(("logit_opacities", "log_scales"))]
+        scalars: list[Any] = [total, stride, width, split, *rates, *penalties, struct]
         device.launch("adam", "adam_step", (-(-total // stride),), [*scalars, *arrays])

@@ -36,7 +36,9 @@ def removal(
         If the lists were made without what gradients need.
     """
     if bins.slots is None:
-        raise InputError("bins: expected lists made with gradients=True, found lists without slots; bin the splats anew")
+        raise InputError(
+            "bins: expected lists made with gradients=True, found lists without slots; bin the splats anew"
+        )
     n, channels = splats.colors.shape
     m, (tiles, _) = bins.gauss_ids.shape[0], bins.tile_ranges.shape
     size = bins.height, bins.width

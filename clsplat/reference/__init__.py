@@ -4,6 +4,7 @@ from clsplat.reference.adam import adam_step
 from clsplat.reference.bin import bin_splats
 from clsplat.reference.composite import composite_bwd, composite_fwd
 from clsplat.reference.loss import l1_ssim
+from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
 from clsplat.reference.project import project_bwd, project_bwd_adam, project_fwd
 from clsplat.reference.removal import removal
@@ -12,6 +13,7 @@ from clsplat.reference.sort import argsort, argsort_segments
 
 __all__ = [
     "adam_step",
+    "add_noise",
     "argsort",
     "argsort_segments",
     "bin_splats",

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians import SHAPES, Gaussians
+from clsplat.gaussians import SHAPES, Gaussians, sigmoid
 from clsplat.stages import AdamStep
 
 Array = NDArray[Any]
@@ -29,10 +29,21 @@ def adam_step(
         else:
             rate = step.rates[name]
         p, g, m, v = (getattr(c, name).reshape(n, -1)[:, :width] for c in (gaussians, gradients, first, second))
+        g = _penalised(name, p, g, step)
         rows = max(1, BLOCK // width)
         for begin in range(0, n, rows):
             block = slice(begin, begin + rows)
             _update(p[block], g[block], m[block], v[block], rate / correction1, correction2, step)
+
+
+def _penalised(name: str, p: Array, g: Array, step: AdamStep) -> Array:
+    """Gradients with those of the penalties: d exp(p)/dp = exp(p), and o (1 - o) for o = sigmoid(p)."""
+    opacity, scale = step.penalties
+    if name == "log_scales" and scale:
+        return g + scale * np.exp(p)
+    if name == "logit_opacities" and opacity:
+        return g + opacity * sigmoid(p) * sigmoid(-p)
+    return g
 
 
 def _update(p: Array, g: Array, m: Array, v: Array, rate: Any, correction2: float, step: AdamStep) -> None:

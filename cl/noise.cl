@@ -1,0 +1,62 @@
+// Stage noise: a random walk of the means that explores along each Gaussian's own shape.
+//
+//   mean += size gate(opacity) Sigma eta,  Sigma = R S S^T R^T,  eta ~ N(0, I)          (Kheradmand et al. 2024,
+//   gate(o) = 1 / (1 + exp(GATE_SLOPE (o - GATE_OPACITY)))                               equation 8 and section 3.2)
+// eta comes from Philox4x32-10 (Salmon et al. 2011, section 3.3), whose counter is the Gaussian's index and the
+// iteration: the same integers on every device, without a state. docs/stages/noise.md; clsplat/reference/noise.py is
+// the twin.
+//
+// Mapping: one work-item per Gaussian.
+//
+// Buffers, N Gaussians: in log_scales[N,3] ln(world), quats[N,4], logit_opacities[N]; in and out means[N,3] world
+//
+// -DGATE_SLOPE    of the gate, against opacity
+// -DGATE_OPACITY  at which the gate is one half
+#include "common.h"
+#include "linalg.h"
+#include "power.h"
+
+#if !defined(GATE_SLOPE) || !defined(GATE_OPACITY)
+#error "-DGATE_SLOPE and -DGATE_OPACITY, slope and middle of the gate, must be given"
+#endif
+
+DEFINE_POWER(4)
+
+static inline uint4 philox(uint4 counter, uint2 key) {
+    for (int round = 0; round < 10; ++round) {
+        const ulong first = (ulong)0xD2511F53u * counter.x, second = (ulong)0xCD9E8D57u * counter.z;
+        counter = (uint4)((uint)(second >> 32) ^ counter.y ^ key.x, (uint)second,
+                          (uint)(first >> 32) ^ counter.w ^ key.y, (uint)first);
+        key += (uint2)(0x9E3779B9u, 0xBB67AE85u);
+    }
+    return counter;
+}
+
+// Three independent standard normal numbers (Box and Muller 1958).
+static inline real3 normals(uint4 bits) {
+    const real4 u = ((real4)((real)bits.x, (real)bits.y, (real)bits.z, (real)bits.w) + (real)0.5) *
+                    (real)2.3283064365386963e-10; // 2^-32: above 0, and 1 at most
+    const real2 radii = sqrt((real)(-2 / LOG2_E) * (real2)(logarithm(u.x), logarithm(u.z)));
+    return radii.xxy * cospi((real)2 * (real4)(u.y, u.y - (real)0.25, u.w, 0)).xyz;
+}
+
+__kernel void add_noise(const uint n, const uint2 key, const uint iteration, const real size,
+                        const __global real *log_scales, const __global real *quats,
+                        const __global real *logit_opacities, __global real *means) {
+    const size_t i = get_global_id(0);
+    if (i >= n)
+        return;
+    const real4 quat = load4(quats, i);
+    const real norm2 = dot4(quat, quat);
+    if (!(norm2 >= QUAT_NORM2_MIN))
+        return;
+    // Squares of the scales, and exp(-logit).
+    const real4 t = (real)LOG2_E * (real4)(2 * load3(log_scales, i), -logit_opacities[i]);
+    const real4 e = power4(CLAMP(t, (real4)POWER_MIN, (real4)POWER_MAX));
+    const real slope = (real)(GATE_SLOPE * LOG2_E) * (1 / (1 + e.w) - (real)GATE_OPACITY);
+    const real gate = 1 / (1 + power4((real4)LESSER(slope, (real)POWER_MAX)).x);
+    const mat3 rotation = rotation_from_quat(quat / sqrt(norm2));
+    const real3 eta = normals(philox((uint4)((uint)i, iteration, 0, 0), key));
+    const real3 step = mat3_mul(rotation, e.xyz * mat3_tmul(rotation, eta));
+    store3(means, i, load3(means, i) + size * gate * step);
+}
