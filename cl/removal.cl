@@ -18,7 +18,7 @@
 // Buffers: N, M, T, C and splats as in composite_cpu.cl, order[N], first_slots[N+1], slots[M] as in bin.cl
 //   in   splats[N], gauss_ids[M], tile_ranges[T,2], slots[M], background[C]; residuals[H,W,C], image - target;
 //        mask[H,W] uchar, 1 where pixels count
-//   out  records[M,3+C]; sums[N,3+C]: change of the squared error, sum of w, of w^2, of w r
+//   out  records[M,4+C]; sums[N,4+C]: change of the squared error, sums of |D|^2, of w, of w^2, of w r
 // -DTILE=8|16   edge of a tile, px
 // -DCHANNELS    colour channels, 1 or more
 #include "common.h"
@@ -27,7 +27,7 @@
 #define STOP ((real)(TRANSMITTANCE_MIN * (1 - ALPHA_MAX)))
 
 // Reals of a record.
-#define SUMS (3 + CHANNELS)
+#define SUMS (4 + CHANNELS)
 
 __kernel void removal(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
                       const __global uint *tile_ranges, const __global uint *slots, const __global real *background,
@@ -90,7 +90,7 @@ __kernel void removal(const int width, const int height, const __global Splat *s
         for (uint j = 0; j < count; ++j) {
             const Over *over = &batch[j];
             const REALV curved = curvature(&over->splat);
-            REALV change = 0, weights = 0, squares = 0, pulls[CHANNELS];
+            REALV difference = 0, agreement = 0, weights = 0, squares = 0, pulls[CHANNELS];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pulls[k] = 0;
             for (uint blocks = unfinished & over->blocks; blocks;) {
                 const int b = take_block(&blocks);
@@ -103,7 +103,8 @@ __kernel void removal(const int width, const int height, const __global Splat *s
                     const REALV part = weight * over->splat.color[k];
                     behind[b][k] -= part;
                     const REALV less = part - ratio * behind[b][k];
-                    change += less * (counts[b] * less - 2 * residual[b][k]);
+                    difference += counts[b] * less * less;
+                    agreement += less * residual[b][k];
                     pulls[k] += weight * residual[b][k];
                 }
                 const REALV counted = weight * counts[b];
@@ -111,10 +112,11 @@ __kernel void removal(const int width, const int height, const __global Splat *s
                 squares += weight * counted;
             }
             __global real *record = records + (size_t)SUMS * slots[first + j];
-            record[0] = sum_lanes(change);
-            record[1] = sum_lanes(weights);
-            record[2] = sum_lanes(squares);
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[3 + k] = sum_lanes(pulls[k]);
+            record[0] = sum_lanes(difference - 2 * agreement);
+            record[1] = sum_lanes(difference);
+            record[2] = sum_lanes(weights);
+            record[3] = sum_lanes(squares);
+            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[4 + k] = sum_lanes(pulls[k]);
         }
     }
     for (uint i = first; i < end; ++i) {

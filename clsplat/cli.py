@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from clsplat.bench.commands import Kernels
+from clsplat.commands.compact import Compact
 from clsplat.commands.console import say
 from clsplat.commands.files import Devices, Export, Sfm
 from clsplat.commands.pictures import Eval, Render
@@ -31,7 +32,7 @@ class Bench:
             self.what.run()
 
 
-COMMANDS = Devices | Sfm | Train | Eval | Render | Export | Demo | Bench
+COMMANDS = Devices | Sfm | Train | Eval | Render | Export | Compact | Demo | Bench
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -1,15 +1,29 @@
-"""Camera paths: an orbit around what the training cameras look at."""
+"""Camera paths: an orbit around what the training cameras look at; viewpoints for a scene without cameras."""
 
 import math
+from typing import Any
 
 import numpy as np
 
 from clsplat.camera import Camera, focus_point
 from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
 
 FULL_CIRCLE_GAP = math.pi / 2
 """Where the photos leave out more of the circle than this, in radians, the path swings over the rest instead of
 closing: Gaussians seen from where no photo was taken look arbitrary."""
+
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+"""Between neighbours of a Fibonacci lattice on the sphere, in radians (Gonzalez 2010,
+doi:10.1007/s11004-009-9257-x)."""
+
+STATIONS = ((3.0, -1), (2.0, -1), (1.25, -1), (0.5, 1))
+"""Where `surround` stands, in radii of the scene, and whether it looks to the centre (-1) or outward (1). At 3 radii
+the field of view below spans 1.7 radii to either side: the scene and some of what is around it."""
+
+FIELD_OF_VIEW = math.pi / 3
+"""Of `surround`, across the longer edge, in radians: that of a phone's or a compact camera's standard lens is 60 to
+70 degrees."""
 
 
 def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[Camera]:
@@ -70,3 +84,49 @@ def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[C
     fx = first.fx * min(width / first.width, height / first.height)
     rim = radii.mean() * (np.cos(path)[:, None] * east + np.sin(path)[:, None] * north)
     return [Camera.look_at(centre + arm + heights.mean() * up, centre, up, fx, width, height) for arm in rim]
+
+
+def surround(gaussians: Gaussians, count: int, width: int, height: int) -> list[list[Camera]]:
+    """Viewpoints around and within a scene of which no cameras are known.
+
+    At each of `STATIONS` the directions are spread evenly over the sphere (a Fibonacci lattice, turned from one
+    station to the next), since nothing says where up is: some will look at the scene from below, or stand inside of
+    something. The scene's centre is the median of the Gaussians' positions by opacity, its radius the median distance
+    from there: a background far away moves neither.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        At least one.
+    count : int
+        Number of cameras per station.
+    width, height : int
+        Size of the images in pixels.
+
+    Returns
+    -------
+    list of lists of Camera
+        Per station. The images' upper edge is towards -y, where most scenes of photogrammetry have their sky.
+    """
+    means, weights = gaussians.means.astype(np.float64), gaussians.opacities.astype(np.float64)
+    centre = np.array([_median(means[:, axis], weights) for axis in range(3)])
+    radius = _median(np.linalg.norm(means - centre, axis=1), weights)
+    radius = radius if radius > 0 else float(np.exp(gaussians.log_scales.max()))
+    fx = max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2)
+    y = 1 - (2 * np.arange(count) + 1) / count
+
+    def look(station: int) -> list[Camera]:
+        distance, gaze = STATIONS[station]
+        turns = GOLDEN_ANGLE * np.arange(count) + 2 * math.pi * station / len(STATIONS)
+        rim = np.sqrt(1 - y**2)
+        eyes = centre + distance * radius * np.stack([rim * np.cos(turns), y, rim * np.sin(turns)], axis=1)
+        return [Camera.look_at(eye, eye + gaze * (eye - centre), (0, -1, 0), fx, width, height) for eye in eyes]
+
+    return [look(station) for station in range(len(STATIONS))]
+
+
+def _median(values: Any, weights: Any) -> float:
+    """Weighted median: half of the weight lies at or below it."""
+    order = np.argsort(values, kind="stable")
+    sums = np.cumsum(weights[order])
+    return float(values[order[int(np.searchsorted(sums, sums[-1] / 2))]])

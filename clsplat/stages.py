@@ -65,12 +65,14 @@ class Image(NamedTuple):
 class Removal(NamedTuple):
     """What becomes of an image's squared error, summed over pixels and channels, if one splat alone changes.
 
-    errors (N,): by how much it grows if the splat is removed; weights (N,), squares (N,): sums over the pixels of
-    the weight w = alpha T and of w^2; pulls (N, C): sums of w r with r = image - target. Another colour c + d makes
-    the error grow by squares |d|^2 + 2 pulls . d. All are 0 for what is not seen.
+    errors (N,): by how much it grows if the splat is removed; differences (N,): the squared difference that this
+    makes to the image, the same if the image is its own target; weights (N,), squares (N,): sums of the weight
+    w = alpha T and of w^2; pulls (N, C): sums of w r with r = image - target. Another colour c + d makes the error
+    grow by squares |d|^2 + 2 pulls . d. All are 0 for what is not seen.
     """
 
     errors: Any
+    differences: Any
     weights: Any
     squares: Any
     pulls: Any

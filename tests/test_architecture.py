@@ -27,8 +27,8 @@ LAYERS = """
     scene structs device reference metrics raytrace orbit
     ops io testing still_life memory
     render optim densify initialize report demo
-    checkpoint rasterization survey
-    train
+    checkpoint rasterization survey prune
+    train compact
     evaluate
     bench viewer commands
     cli

@@ -15,7 +15,10 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/howto/python.md", "docs/howto/memory.md"])
+WITH_EXAMPLES = ["README.md", *(f"docs/howto/{name}.md" for name in ("python", "memory", "compact"))]
+
+
+@pytest.mark.parametrize("page", WITH_EXAMPLES)
 def test_python_examples_run(page, device, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYOPENCL_NO_CACHE", "1")

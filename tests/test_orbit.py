@@ -5,7 +5,8 @@ import pytest
 
 from clsplat.camera import Camera, focus_point
 from clsplat.errors import InputError
-from clsplat.orbit import orbit
+from clsplat.orbit import STATIONS, orbit, surround
+from clsplat.testing import synthetic_scene
 
 TARGET = np.array([1.0, -2.0, 3.0])
 UP = np.array([0.0, 0.6, 0.8])
@@ -147,3 +148,32 @@ def test_real_scenes_are_seen_from_the_orbit(shared, name):
     photos = np.mean([share_seen(camera) for camera in cameras])
     # Half of what a photo sees: a path that looks elsewhere sees a tenth.
     assert np.mean([share_seen(camera) for camera in path]) > 0.5 * photos
+
+
+def test_surround_stands_around_what_is_there():
+    """Evenly in all directions, whatever lies far away: the radius is the median distance."""
+    gaussians = synthetic_scene(4000, 1)[0]
+    rng = np.random.default_rng(0)
+    arms = rng.normal(size=(4000, 3))
+    gaussians.means[:] = TARGET + 2 * arms / np.linalg.norm(arms, axis=1, keepdims=True)
+    gaussians.means[:40] *= 50
+    gaussians.logit_opacities[:] = 1
+    stations = surround(gaussians, 50, 640, 480)
+    assert [len(cameras) for cameras in stations] == [50] * len(STATIONS)
+    for cameras, (distance, gaze) in zip(stations, STATIONS, strict=True):
+        arms = np.array([camera.position for camera in cameras]) - TARGET
+        lengths = np.linalg.norm(arms, axis=1)
+        np.testing.assert_allclose(lengths, 2 * distance, rtol=0.15)
+        directions = arms / lengths[:, None]
+        assert np.linalg.norm(directions.mean(axis=0)) < 0.15
+        nearest = np.sort(directions @ directions.T, axis=1)[:, -2]
+        assert nearest.max() < np.cos(np.radians(15)), "two cameras stand together"
+        gazes = np.array([camera.viewmat[2, :3] for camera in cameras])
+        assert (gaze * (gazes * directions).sum(axis=1) > 0.95).all()
+    fov = 2 * np.arctan(320 / stations[0][0].fx)
+    assert fov == pytest.approx(np.pi / 3)
+
+
+def test_surround_of_a_single_gaussian():
+    for cameras in surround(synthetic_scene(1)[0], 5, 64, 48):
+        assert all(np.isfinite(camera.viewmat).all() for camera in cameras)

@@ -56,15 +56,15 @@ def test_is_what_rendering_without_the_splat_shows(any_device):
     target, mask = target_and_mask(image.shape)
     args = splats, bins, BACKGROUND, image - target, mask
     before = squared_error(image, target, mask)
-    removed = [
-        squared_error(image_of(without(splats, g), width, height, BACKGROUND).image, target, mask) - before
-        for g in range(len(splats.depths))
-    ]
+    images = [image_of(without(splats, g), width, height, BACKGROUND).image for g in range(len(splats.depths))]
+    removed = [squared_error(other, target, mask) - before for other in images]
+    changed = [squared_error(other, image, mask) for other in images]
     assert min(removed) < 0 < max(removed), "removal makes it worse and better"
     exact = any_device.real == np.float64
     table, tolerance = (DOUBLE, 1e-10) if exact else (FLOAT, 1e-4)
     for found in (reference.removal(*args), by_kernel(any_device, *args)):
         assert_matches("errors", found.errors, np.array(removed), table)
+        assert_matches("differences", found.differences, np.array(changed), table)
 
         d = np.array([0.3, -0.2, 0.5, 1.0])
         for g in (0, 7, 31):
@@ -77,7 +77,7 @@ def test_is_what_rendering_without_the_splat_shows(any_device):
     everywhere = reference.removal(splats, bins, BACKGROUND)
     alpha = image_of(splats, width, height, BACKGROUND).alpha
     assert everywhere.weights.sum() == pytest.approx(alpha.sum(), rel=1e-12)
-    assert (everywhere.errors >= 0).all() and (everywhere.pulls == 0).all()
+    assert (everywhere.errors == everywhere.differences).all() and (everywhere.pulls == 0).all()
 
 
 @pytest.mark.parametrize("tile_size", [8, 16])
@@ -176,7 +176,7 @@ def test_splats_behind_a_finished_tile(any_device):
     splats = handmade(np.full((n, 2), 0.5), np.eye(2), np.full(n, 0.95), rng.uniform(size=(n, 3)))
     order = np.arange(n)
     bins = Bins(order, np.array([[0, n]]), order, np.arange(n + 1), order, 16, 1, 1)
-    any_device.upload("prices per intersection", np.full((n, 6), np.nan))  # what the next of this name will hold
+    any_device.upload("prices per intersection", np.full((n, 7), np.nan))  # what the next of this name will hold
     expected = reference.removal(splats, bins, (50.0, 20.0, 30.0))
     found = by_kernel(any_device, splats, bins, (50.0, 20.0, 30.0))
     assert (found.errors[4:] == 0).all() and (found.weights[4:] == 0).all() and found.weights[3] > 0

@@ -38,6 +38,7 @@ DOUBLE = {
     "second moments": _UPDATED,
     "grad_sum": _UPDATED,
     "errors": _CANCELS,
+    "differences": _CANCELS,
     "weights": _REORDERED,
     "squares": _REORDERED,
     "pulls": _CANCELS,
@@ -74,6 +75,7 @@ FLOAT = {
     "errors": Tolerance(
         1e-4, 1e-5, "float32: what lies behind is what earlier splats left of the whole, times up to 99"
     ),
+    "differences": Tolerance(1e-4, 1e-5, "float32: as for errors"),
     "weights": Tolerance(1e-5, 1e-6, _SUM),
     "squares": Tolerance(1e-5, 1e-6, _SUM),
     "pulls": Tolerance(1e-5, 2e-6, _SUM),

@@ -42,8 +42,8 @@ def removal(
     n, channels = splats.colors.shape
     m, (tiles, _) = bins.gauss_ids.shape[0], bins.tile_ranges.shape
     size = bins.height, bins.width
-    records = device.empty("prices per intersection", (max(m, 1), 3 + channels))
-    sums = device.empty("prices", (n, 3 + channels))
+    records = device.empty("prices per intersection", (max(m, 1), 4 + channels))
+    sums = device.empty("prices", (n, 4 + channels))
     pixels = [
         device.upload("residuals", np.zeros((*size, channels)) if residuals is None else residuals),
         device.upload("mask", np.ones(size) if mask is None else mask, np.uint8),
@@ -54,5 +54,5 @@ def removal(
     device.launch("removal", "removal", (tiles,), arguments, defines=defines, group=(1,))
     arguments = [n, bins.order, bins.first_slots, records, sums]
     device.launch("removal", "removal_sum", (n,), arguments, defines=defines)
-    errors, weights, squares, *pulls = sums.get().T
-    return Removal(errors, weights, squares, np.stack(pulls, axis=1))
+    errors, differences, weights, squares, *pulls = sums.get().T
+    return Removal(errors, differences, weights, squares, np.stack(pulls, axis=1))

@@ -25,14 +25,16 @@ def removal(splats: Splats, bins: Bins, background: Any, residuals: Any = None, 
         behind[hit.box] += weight[:, :, None] * splats.colors[hit.splat]
     behind += transmittance[:, :, None] * np.asarray(background, dtype=np.float64)
 
-    out = Removal(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, channels)))
+    out = Removal(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, channels)))
     for hit in hits(splats, bins, transmittance, STOP):
         g, alpha = hit.splat, np.minimum(hit.alpha, ALPHA_MAX)
         weight = alpha * hit.before
         part = weight[:, :, None] * splats.colors[g]
         behind[hit.box] -= part
         less = part - (alpha / (1 - alpha))[:, :, None] * behind[hit.box]
-        out.errors[g] += (counts[hit.box][:, :, None] * less**2 - 2 * r[hit.box] * less).sum()
+        difference = (counts[hit.box][:, :, None] * less**2).sum()
+        out.errors[g] += difference - 2 * (r[hit.box] * less).sum()
+        out.differences[g] += difference
         out.weights[g] += (weight * counts[hit.box]).sum()
         out.squares[g] += (weight**2 * counts[hit.box]).sum()
         out.pulls[g] += np.einsum("hw,hwc->c", weight, r[hit.box])

@@ -1,0 +1,153 @@
+"""The command `compact`."""
+
+import tempfile
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from clsplat.commands.console import Out, moved, open_device, say
+from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
+from clsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from clsplat.compact import Limits
+    from clsplat.device import Device
+    from clsplat.gaussians import Gaussians
+    from clsplat.scene import Scene, View
+
+HELD_OUT = 6
+"""Of views without a split of their own, every sixth judges and does not price."""
+
+SUSPICIOUS = 15.0
+"""Decibels: photos that a scene matches worse than this are hardly of this scene."""
+
+
+@dataclass(frozen=True)
+class Compact:
+    """Make a scene smaller: fewer Gaussians, fewer bands of spherical harmonics, a compact format."""
+
+    scene: tyro.conf.Positional[Path]
+    """File of Gaussians."""
+    out: Out
+    """File to write; its suffix names the format."""
+    max_gaussians: int | None = None
+    """At most so many Gaussians."""
+    max_bytes: str | None = None
+    """At most so large a file, such as 20MB."""
+    max_psnr_loss: float | None = None
+    """The smallest file that loses at most so many dB, judged by views that had no say in what is removed."""
+    cameras: Path | None = None
+    """Dataset, as given to `train`: views from which the scene is compared with its own renders."""
+    photos: Path | None = None
+    """Dataset with whose photos the scene is compared instead. Without either, viewpoints are chosen by
+    themselves."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
+    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.compact import ASSUMED_PSNR, Judge, compact
+        from clsplat.io import load_gaussians, load_scene, save_gaussians, suffix_of
+        from clsplat.memory import size_text
+
+        limits = self._limits()
+        suffix = suffix_of(self.out)
+        if not suffix or not self.out.absolute().parent.is_dir():  # said now, not after minutes
+            raise InputError(f"{self.out}: expected a file of Gaussians in a folder that exists; see docs/formats.md")
+        if self.cameras is not None and self.photos is not None:
+            raise InputError("--cameras, --photos: expected one of them, found both; --photos has cameras as well")
+        gaussians, mode, offset = load_gaussians(self.scene)
+        device = open_device(self.device)
+        config, background = replace(self.render, mode=mode), BACKGROUNDS[self.data_config.background]
+        scene = None
+        dataset = self.photos or self.cameras
+        if dataset is not None:
+            scene = load_scene(dataset, self.data_config)
+            gaussians, offset = moved(gaussians, offset - scene.offset), scene.offset
+        priced, judging = self._views(gaussians, scene, config, device)
+        say(f"views: {len(priced)} price the Gaussians, {len(judging)} judge the loss")
+        judge = Judge(gaussians, judging, self.photos is not None, config, device, background)
+
+        def stored(version: "Gaussians") -> "tuple[Gaussians, int]":
+            with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # said once, of the file that stays
+                path = Path(folder) / f"scene{suffix}"
+                save_gaussians(path, version, mode, offset)
+                return load_gaussians(path)[0], path.stat().st_size
+
+        found = compact(gaussians, priced, judge, limits, stored, config, device, background)
+        save_gaussians(self.out, found.gaussians, mode, offset)
+        size = self.scene.stat().st_size if self.scene.is_file() else stored(gaussians)[1]
+        say(
+            f"{self.scene}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, {size_text(size)}\n"
+            f"{self.out}: {len(found.gaussians)} Gaussians of degree {found.gaussians.sh_degree}, "
+            f"{size_text(self.out.stat().st_size)}"
+        )
+        if self.photos is not None:
+            say(f"loss: {found.loss:.3f} dB of PSNR against the photos that judge")
+        else:
+            say(f"loss: {found.loss:.3f} dB of PSNR, if the scene has {ASSUMED_PSNR:.0f} dB against photos unknown")
+
+    def _limits(self) -> "Limits":
+        from clsplat.compact import Limits
+        from clsplat.memory import parse_size
+
+        size = None if self.max_bytes is None else parse_size(self.max_bytes, "--max-bytes")
+        if self.max_gaussians is None and size is None and self.max_psnr_loss is None:
+            raise InputError(
+                "--max-gaussians, --max-bytes, --max-psnr-loss: expected how small or how good, found none"
+            )
+        if self.max_gaussians is not None and self.max_gaussians < 1:
+            raise InputError(f"--max-gaussians: expected 1 or more, found {self.max_gaussians}")
+        if self.max_psnr_loss is not None and not self.max_psnr_loss > 0:
+            raise InputError(f"--max-psnr-loss: expected more than 0 dB, found {self.max_psnr_loss}")
+        return Limits(self.max_gaussians, size, self.max_psnr_loss)
+
+    def _views(
+        self, gaussians: "Gaussians", scene: "Scene | None", config: RenderConfig, device: "Device"
+    ) -> "tuple[list[View], list[View]]":
+        """Views that price, and views that judge."""
+        from clsplat.compact import automatic_cameras, own_views
+
+        background = BACKGROUNDS[self.data_config.background]
+        if scene is None:
+            cameras = automatic_cameras(gaussians, config, device, background)
+            held_out: set[str] = set()
+        else:
+            cameras = {view.name: view.camera for view in scene.train + scene.test}
+            held_out = {view.name for view in scene.test}
+        views = own_views(gaussians, cameras, config, device, background)
+        if len(views) < len(cameras):
+            warnings.warn(f"{len(cameras) - len(views)} of {len(cameras)} views show nothing; left out", stacklevel=2)
+        if self.photos is not None and scene is not None:
+            showing = {view.name for view in views}
+            own, views = views, [view for view in scene.train + scene.test if view.name in showing]
+            self._check_photos(own, views)
+        held_out = held_out or {view.name for view in views[::HELD_OUT]}
+        priced = [view for view in views if view.name not in held_out]
+        judging = [view for view in views if view.name in held_out]
+        if not priced or not judging:
+            where = self.photos or self.cameras or "automatic viewpoints"
+            raise InputError(
+                f"{where}: expected a view that shows the scene to price with and one to judge by, found "
+                f"{len(priced)} and {len(judging)} of {len(cameras)}; do the cameras belong to {self.scene}?"
+            )
+        return priced, judging
+
+    def _check_photos(self, own: "list[View]", photos: "list[View]") -> None:
+        """Warn of photos that can hardly be of this scene."""
+        import numpy as np
+
+        from clsplat.metrics import psnr
+
+        found = [psnr(render.image, photo.image, photo.mask) for render, photo in zip(own, photos, strict=True)]
+        if found and np.mean(found) < SUSPICIOUS:
+            warnings.warn(
+                f"{self.photos}: the scene matches the photos with {np.mean(found):.1f} dB only; are they of it?",
+                stacklevel=2,
+            )
