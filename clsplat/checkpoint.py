@@ -18,6 +18,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
 from clsplat.optim import Moments
 from clsplat.render import download, fetch
+from clsplat.size import Kept, Point, Search
 
 
 @dataclass
@@ -25,7 +26,7 @@ class State:
     """All that training changes, which is what a checkpoint holds, and the scene's extent in world units.
 
     intersections: the most tiles that a Gaussian has met in a view, on the mean over all Gaussians; it bounds their
-    growth where memory does.
+    growth where memory does. search: for the scene's size; None where that is fixed.
     """
 
     iteration: int
@@ -35,6 +36,7 @@ class State:
     moments: Moments
     strategy: Strategy
     intersections: float = 0.0
+    search: Search | None = None
 
 
 def save_state(path: Path, state: State, config: TrainConfig) -> None:
@@ -46,6 +48,16 @@ def save_state(path: Path, state: State, config: TrainConfig) -> None:
     for part, gaussians in parts.items():
         arrays |= {f"{part}.{name}": array for name, array in fetch(gaussians).arrays().items()}
     arrays |= {f"statistics.{name}": download(array) for name, array in state.strategy.statistics.items()}
+    if search := state.search:
+        arrays["search"] = json.dumps({"points": search.points, "grown": search.grown, "settled": search.settled})
+        if best := search.best:
+            for part, kept in {
+                "": best.gaussians,
+                "first.": best.moments.first,
+                "second.": best.moments.second,
+            }.items():
+                arrays |= {f"best.{part}{name}": array for name, array in kept.arrays().items()}
+            arrays |= {f"best.statistics.{name}": array for name, array in best.statistics.items()}
     with replacing(path) as file:
         np.savez(file, **arrays)
 
@@ -75,7 +87,15 @@ def load_state(path: Path, extent: float, config: TrainConfig) -> State:
     strategy.statistics = {k: arrays[f"statistics.{k}"] for k in strategy.statistics}
     moments = Moments(part("first"), part("second"))
     numbers = int(arrays["iteration"]), float(arrays["seconds"]), extent
-    return State(*numbers, gaussians, moments, strategy, float(arrays["intersections"]))
+    search = None
+    if "search" in arrays:
+        saved = json.loads(str(arrays["search"]))
+        search = Search([Point(*p) for p in saved["points"]], saved["grown"], saved["settled"])
+        if "best.means" in arrays:
+            best = Moments(part("best.first"), part("best.second"))
+            rows = {k: arrays[f"best.statistics.{k}"] for k in strategy.statistics}
+            search.best = Kept(part("best"), best, rows)
+    return State(*numbers, gaussians, moments, strategy, float(arrays["intersections"]), search)
 
 
 def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:

@@ -171,6 +171,11 @@ class TrainConfig:
     """Where Adam runs: in a kernel, or in NumPy on the host (slower; the same to rounding)."""
     strategy: str = "adc"
     """Densification strategy: a name of clsplat.densify.STRATEGIES."""
+    size: Literal["auto", "fixed"] = "fixed"
+    """auto: the number of Gaussians and the degree of the spherical harmonics are chosen from the photos, some of
+    which validate in the meantime (size.json explains the choice). fixed: what the strategy makes, up to the cap."""
+    size_price: float = 0.1
+    """Decibels of PSNR that twice as many Gaussians, or bytes, must gain; with --size auto."""
     max_gaussians: int | None = None
     """Hard cap, under every strategy: in no iteration are there more Gaussians. A start of more is thinned to it."""
     checkpoint_every: int = 1000

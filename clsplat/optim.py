@@ -40,19 +40,20 @@ def sh_degree_at(iteration: int, every: int, stored: int) -> int:
     return min(stored, (iteration - 1) // every)
 
 
-def adam_settings(iteration: int, iterations: int, extent: float, config: OptimConfig, sh_degree: int) -> AdamStep:
+def adam_settings(iteration: int, progress: float, extent: float, config: OptimConfig, sh_degree: int) -> AdamStep:
     """Learning rates and constants of an iteration.
 
     Parameters
     ----------
-    iteration, iterations : int
-        The current one, counted from 1, and the last one, at which means_lr_final is reached.
+    iteration : int
+        Counted from 1.
+    progress : float
+        From 0 to 1, where means_lr_final is reached.
     extent : float
         Scale of the scene in world units: the means' rate is proportional to it.
     sh_degree : int
         Highest degree of the spherical harmonics that is trained.
     """
-    progress = (iteration - 1) / max(iterations - 1, 1)
     rates = {
         "means": extent * config.means_lr * (config.means_lr_final / config.means_lr) ** progress,
         "log_scales": config.log_scales_lr,

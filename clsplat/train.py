@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from clsplat import size
 from clsplat.checkpoint import State, load_state, log_file, save_state
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.densify import STRATEGIES, Edit
@@ -94,15 +95,20 @@ def train(
         for iteration in range(state.iteration + 1, config.iterations + 1):
             intersections = state.intersections or INTERSECTIONS
             photos.keep_within(device.memory_limit - need.total(len(state.gaussians), intersections))
+            views = size.training_views(scene.train, state.search)
             if state.strategy.due(iteration):
                 fitting = need.most_gaussians(device.memory_limit, intersections)
                 state.strategy.max_gaussians = min(config.max_gaussians or fitting, fitting)
-                if len(state.gaussians) >= fitting:
+                if state.search and state.search.grown:
+                    state.strategy.max_gaussians = min(state.strategy.max_gaussians, len(state.gaussians))
+                elif len(state.gaussians) >= fitting:
                     warnings.warn(f"no more than {fitting} Gaussians fit the memory: growth stops", stacklevel=2)
             try:
-                loss = step(state, iteration, view_at(iteration, scene.train, config.seed), photos, config, device)
+                loss = step(state, iteration, view_at(iteration, views, config.seed), photos, config, device)
+                if state.search and not state.search.settled:
+                    seek_size(state, scene.train, config, device)
                 if state.strategy.due(iteration):
-                    densify(state, scene.train, config, device)
+                    densify(state, views, config, device)
             except DeviceError as error:
                 raise DeviceError(
                     f"iteration {iteration}: {error}; the last checkpoint in {out}, if there is one, is intact: "
@@ -132,7 +138,10 @@ def train(
             except KeyboardInterrupt:
                 save_state(out / "checkpoint.npz", state, config)
                 raise
-    return fetch(state.gaussians)
+    if not state.search:
+        return fetch(state.gaussians)
+    size.write_report(out / "size.json", state.search, config)
+    return size.without_useless_bands(fetch(state.gaussians), scene.train, config, device)
 
 
 def step(state: State, iteration: int, view: View, photos: Photos, config: TrainConfig, device: "Device") -> float:
@@ -155,7 +164,8 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
         if not optimizer:
             extents, v_means2d = download(extents), download(v_means2d)
         state.strategy.observe(stage_functions(optimizer), extents, v_means2d, camera.width, camera.height)
-    settings = adam_settings(iteration, config.iterations, state.extent, config.optim, sh_degree)
+    progress = size.progress(iteration, config, state.search)
+    settings = adam_settings(iteration, progress, state.extent, config.optim, sh_degree)
     settings = settings._replace(penalties=state.strategy.penalties(len(gaussians)))
     moments, antialiased = (state.moments.first, state.moments.second), config.render.mode == "antialiased"
     if optimizer:
@@ -194,6 +204,34 @@ def _edit(state: State, views: list[View], config: TrainConfig, device: "Device"
     return state.strategy.edit(state.iteration, state.gaussians, survey)
 
 
+def seek_size(state: State, views: list[View], config: TrainConfig, device: "Device") -> None:
+    """What `clsplat.size` does after an iteration: validate, stop growth, prune, choose. Changes `state`."""
+    search, iteration = state.search, state.iteration
+    path = size.stops(config)
+    phase = "path" if iteration in path else "growth" if iteration < path[0] and state.strategy.due(iteration) else ""
+    if not search or not phase:
+        return
+    training, validation = size.split(views)
+    trained = sh_degree_at(iteration, config.shortened(config.optim.sh_degree_every), state.gaussians.sh_degree)
+    move(state, None)
+    scores = size.validate(state.gaussians, validation, config, device, trained)
+    search.points.append(size.point(iteration, phase, state.gaussians, scores, trained, config))
+    if phase == "growth":
+        search.grown = search.grown or not size.growth_pays(search.points, config.size_price)
+    else:
+        search.grown = True
+        if search.points[-1].worth == max(p.worth for p in search.points if p.phase == "path"):
+            search.best = size.keep(state.gaussians, state.moments, state.strategy.statistics)
+        if iteration == path[-1] or size.path_ends(search.points, config.size_price):
+            kept = size.settle(search, validation, config, device)
+        else:
+            rows = size.costliest_rows(state.gaussians, training, config, device)
+            kept = size.keep(state.gaussians, state.moments, state.strategy.statistics).take(rows)
+        state.gaussians, state.moments, state.strategy.statistics = kept
+    if config.optimizer == "device":
+        move(state, device)
+
+
 def _apply(edit: Edit, state: State) -> None:
     state.gaussians, state.moments = edit.gaussians, state.moments.take(edit.rows, edit.fresh)
     if edit.reset_opacities:
@@ -215,4 +253,5 @@ def initial_state(scene: Scene, config: TrainConfig) -> State:
     """The state before the first iteration."""
     gaussians = initialize(scene, config.init, config.seed, config.max_gaussians)
     strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
-    return State(0, 0.0, scene.extent, gaussians, Moments.zeros(gaussians), strategy)
+    search = size.Search() if config.size == "auto" and size.can_search(scene.train) else None
+    return State(0, 0.0, scene.extent, gaussians, Moments.zeros(gaussians), strategy, search=search)

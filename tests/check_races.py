@@ -125,7 +125,7 @@ def adam(device):
         found = [scene(22, seed, 1).astype(np.float64) for seed in range(3)]
         found.append(Gaussians(**{name: array**2 for name, array in found[2].arrays().items()}))
         on_device = [upload(device, part) for part in found]
-        step = adam_settings(3, 10, 1.0, OptimConfig(), 0)
+        step = adam_settings(3, 0.3, 1.0, OptimConfig(), 0)
         ops.adam_step(device, *on_device, step)
         reference.adam_step(*found, step)
         for a, b in zip(on_device, found, strict=True):

@@ -20,7 +20,7 @@ COUNTS = [1, 5, 21, 22, 64, 65, 1000]
 
 
 def settings(t, sh_degree=3):
-    return adam_settings(t, STEPS, 2.0, CONFIG, sh_degree)
+    return adam_settings(t, t / STEPS, 2.0, CONFIG, sh_degree)
 
 
 def start_of(n, *, sh_degree=3):

@@ -27,7 +27,9 @@ LAYERS = """
     scene structs device reference metrics raytrace orbit
     ops io testing still_life memory
     render optim densify initialize report demo
-    checkpoint rasterization survey prune
+    prune rasterization survey
+    size
+    checkpoint
     train compact
     evaluate
     bench viewer commands

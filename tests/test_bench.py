@@ -241,7 +241,7 @@ class TestResults:
         gradients = Gaussians(**{name: np.ones_like(array) for name, array in gaussians.arrays().items()})
         moments = Moments.zeros(gaussians)
         for _ in range(3):
-            settings = adam_settings(3001, 7000, 1.0, STILL, 3)
+            settings = adam_settings(3001, 0.4, 1.0, STILL, 3)
             reference.adam_step(gaussians, gradients, moments.first, moments.second, settings)
         for name, array in gaussians.arrays().items():
             np.testing.assert_array_equal(array, getattr(before, name))

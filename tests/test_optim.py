@@ -22,7 +22,7 @@ def test_moments_follow_their_rows() -> None:
 
 
 def test_schedules_at_their_ends() -> None:
-    first, last = adam_settings(1, 1000, 3.0, CONFIG, 3), adam_settings(1000, 1000, 3.0, CONFIG, 2)
+    first, last = adam_settings(1, 0.0, 3.0, CONFIG, 3), adam_settings(1000, 1.0, 3.0, CONFIG, 2)
     assert (first.iteration, last.iteration) == (1, 1000)
     assert first.rates["means"] == pytest.approx(3 * CONFIG.means_lr)
     assert last.rates["means"] == pytest.approx(3 * CONFIG.means_lr_final)

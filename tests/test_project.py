@@ -111,7 +111,7 @@ def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degr
     parts = (gaussians, *random_moments(gaussians, np.random.default_rng(stored)))
     splats = reference.project_fwd(gaussians, camera, degree, antialiased=antialiased)
     v_splats = random_grads(splats)
-    step = adam_settings(20, 100, 2.0, OptimConfig(), degree)._replace(penalties=penalties)
+    step = adam_settings(20, 0.2, 2.0, OptimConfig(), degree)._replace(penalties=penalties)
     uploaded = [type(a)(*(any_device.upload("splats", x) for x in a)) for a in (splats, v_splats)]
     fused, separate = ([upload(any_device, part) for part in parts] for _ in range(2))
 

@@ -70,6 +70,7 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
     from clsplat.evaluate import evaluate, mean_metrics
     from clsplat.io import save_gaussians
     from clsplat.report import training_curve
+    from clsplat.size import can_search, size_chart, split
     from clsplat.train import train
 
     background = BACKGROUNDS[config.data.background]
@@ -101,6 +102,11 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
     save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
     say(f"{out / 'scene.ply'}: {len(gaussians)} Gaussians")
     training_curve(out / "log.jsonl", out / "training_curve.png")
+    if config.size == "auto" and not can_search(scene.train):
+        say(f"size: {len(scene.train)} photos are too few to choose it from; it is what the strategy made")
+    elif config.size == "auto":
+        size_chart(out / "size.json", out / "size.png")
+        say(f"size: chosen from {len(split(scene.train)[1])} validation photos; {out / 'size.png'} shows why")
     if scene.test:
         report = evaluate(gaussians, scene.test, out / "eval", config.render, device, background=background)
         say_scores(report, out / "eval")
