@@ -29,7 +29,8 @@ Array = NDArray[np.float64]
 
 ROUND = 0.85
 """Fraction of the Gaussians that a round of `removal_order` leaves. With half of a scene removed in rounds of 0.7
-instead, the loss was 0.63 dB instead of 0.43 (fox_pinhole) and 0.24 instead of 0.21 (guitar), in 0.6 of the time."""
+instead, the loss was 0.63 dB instead of 0.43 (fox_pinhole) and 0.24 instead of 0.21 (guitar, views of others), in
+0.6 of the time."""
 
 
 class Prices(NamedTuple):

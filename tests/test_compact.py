@@ -71,8 +71,23 @@ def test_number_of_gaussians(bloated, tmp_path, capsys):
     assert len(found) == 40 and found.sh_degree == before.sh_degree
     assert (found.logit_opacities > 1).mean() > 0.9, "those that make the picture are kept"
     said = capsys.readouterr().err
+    assert "views: 10 price the Gaussians, 2 judge the loss" in said, "every view has one of the two offices"
     assert "200 Gaussians of degree 3" in said and "40 Gaussians of degree 3" in said and "loss: " in said
     assert len(compacted(bloated, tmp_path / "b.ply", "--max-gaussians", 999)) == 200
+
+
+def test_offset_of_the_world(bloated, tmp_path):
+    """A file whose coordinates count from elsewhere is compared where its scene is, and stays there."""
+    scene, offset = load_gaussians(bloated / "bloated.ply")[0], np.array([4.0, -2.0, 8.0])
+    expected = compacted(bloated, tmp_path / "a.ply", "--max-gaussians", 40)
+    scene.means -= offset.astype(np.float32)
+    save_gaussians(tmp_path / "moved.ply", scene, offset=offset)
+    run(
+        *("compact", tmp_path / "moved.ply", "-o", tmp_path / "b.ply", "--max-gaussians", 40),
+        *("--photos", bloated / "photos"),
+    )
+    found, _, kept = load_gaussians(tmp_path / "b.ply")
+    np.testing.assert_allclose(found.means + kept, expected.means, atol=1e-5)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
