@@ -77,8 +77,8 @@ class InitConfig:
     random_extent: float = 1 / 3
     """Half edge of the random start's box, as a fraction of the cameras' mean distance from the point they look
     at; for NeRF-synthetic scenes (distance 4) that is the original's box within 3 %."""
-    opacity: float = 0.1
-    """Opacity at the start (original)."""
+    opacity: float | None = None
+    """Opacity at the start; default: what suits the strategy, 0.1 for adc and 0.5 for the others."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """Highest degree of the spherical harmonics."""
 
@@ -159,6 +159,32 @@ class McmcConfig:
 
 
 @dataclass(frozen=True)
+class ErrorConfig:
+    """Growth to a cap where the photos' errors are (clsplat.densify.error has the sources; values by measurement,
+    docs/howto/strategies.md)."""
+
+    start: int = 500
+    """First iteration after which Gaussians are split or removed; sooner in short runs."""
+    stop_fraction: float = 0.8
+    """Fraction of the iterations after which they no longer are."""
+    every: int = 100
+    """Iterations between two rounds."""
+    growth: float = 0.05
+    """Gaussians added per round, as a fraction of all; more where the cap would be reached too late otherwise."""
+    full_fraction: float = 0.4
+    """Fraction of the iterations by which the cap is reached."""
+    views: int = 10
+    """Photos rendered per round to see where the errors are."""
+    opacity_min: float = 0.005
+    """Gaussians of this opacity or a lower one are removed."""
+    replaced: float = 0.02
+    """Fraction of the Gaussians that make room for others in each round at the cap: those whose removal changes the
+    squared error of the photos least."""
+    replaced_most: float = 0.2
+    """The largest such fraction: all make room, up to it, whose removal would even lower the error."""
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """A whole training run; saved as ``config.json``, from which it can be repeated."""
 
@@ -177,7 +203,8 @@ class TrainConfig:
     size_price: float = 0.1
     """Decibels of PSNR that twice as many Gaussians, or bytes, must gain; with --size auto."""
     max_gaussians: int | None = None
-    """Hard cap, under every strategy: in no iteration are there more Gaussians. A start of more is thinned to it."""
+    """Hard cap, under every strategy: in no iteration are there more Gaussians. A start of more is thinned to it.
+    mcmc and error grow to it, and need it."""
     checkpoint_every: int = 1000
     """Iterations between two checkpoints, from which an interrupted run resumes."""
     eval_every: int = 500
@@ -192,6 +219,7 @@ class TrainConfig:
     optim: OptimConfig = field(default_factory=OptimConfig)
     adc: AdcConfig = field(default_factory=AdcConfig)
     mcmc: McmcConfig = field(default_factory=McmcConfig)
+    error: ErrorConfig = field(default_factory=ErrorConfig)
     render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
 
     def shortened(self, interval: int) -> int:

@@ -16,6 +16,9 @@ from clsplat.scene import Scene
 NEIGHBOURS = 3
 """Neighbours whose mean squared distance is a Gaussian's first variance (original)."""
 
+OPACITY = 0.1
+"""A Gaussian's first opacity where the configuration says none (original)."""
+
 VARIANCE_MIN = 1e-7
 """Smallest such variance, in squared world units: duplicates would otherwise start with scale 0 (original)."""
 
@@ -144,8 +147,9 @@ def _gaussians(
     means: NDArray[np.float64], variances: NDArray[np.float64], rgb: NDArray[np.float64], config: InitConfig
 ) -> Gaussians:
     """Isotropic Gaussians; `rgb` (N, 3) in [0, 1]."""
-    if not 0 < config.opacity < 1:
-        raise InputError(f"opacity: expected a value between 0 and 1, found {config.opacity}")
+    opacity = OPACITY if config.opacity is None else config.opacity
+    if not 0 < opacity < 1:
+        raise InputError(f"opacity: expected a value between 0 and 1, found {opacity}")
     count = len(means)
     sh = np.zeros((count, (config.sh_degree + 1) ** 2, 3))
     sh[:, 0] = (rgb - 0.5) / SH_C0
@@ -153,6 +157,6 @@ def _gaussians(
         means=means,
         log_scales=np.repeat(0.5 * np.log(variances)[:, None], 3, axis=1),
         quats=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-        logit_opacities=np.full(count, logit(np.array(config.opacity))),
+        logit_opacities=np.full(count, logit(np.array(opacity))),
         sh=sh,
     ).astype(np.float32)

@@ -4,11 +4,11 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.config import RenderConfig
+from clsplat.densify import Contributions
 from clsplat.gaussians import Gaussians
-from clsplat.render import backward_to_splats, download, forward, upload
+from clsplat.render import backward_to_splats, download, forward, stage_functions, upload
 from clsplat.scene import View
 from clsplat.stages import Image
 
@@ -23,11 +23,12 @@ def contributions(
     config: RenderConfig,
     background: Any,
     sh_degree: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sums over views and pixels of the weights with which Gaussians are composited, alone and times the error.
+) -> Contributions:
+    """Add up over photos what each Gaussian has to do with their squared errors.
 
     The image is linear in a splat's colour, and its derivative is the splat's weight: the gradient of compositing
-    with respect to the colours, for an image of gradients of ones and of errors, is both sums.
+    with respect to the colours, for an image of gradients that are squared errors, shares these out by weight. What
+    the removal of a splat does is the stage removal's to say.
 
     Parameters
     ----------
@@ -39,17 +40,20 @@ def contributions(
 
     Returns
     -------
-    weights, errors : (N,)
-        The error of a pixel is the mean over RGB of its absolute difference from the photo.
+    Contributions
     """
-    total = np.zeros((len(gaussians), 3))
+    stage, n = stage_functions(device), len(gaussians)
+    result = Contributions(np.zeros(n), np.zeros(n), np.zeros(n))
     if isinstance(gaussians.means, np.ndarray):
         gaussians = upload(device, gaussians)
     for view in views:
         run = forward(device, gaussians, view.camera, config, background, sh_degree)
-        counted = np.ones(view.image.shape[:2]) if view.mask is None else view.mask.astype(float)
-        error = np.abs(download(run.image.image) - view.image / 255).mean(axis=2)
-        v_image = np.stack([counted, counted * error, np.zeros_like(error)], axis=2)
-        v = Image(device.upload("v_image", v_image), device.upload("v_alpha", np.zeros_like(error)))
-        total += download(backward_to_splats(device, run, v).colors)
-    return total[:, 0], total[:, 1]
+        residuals = download(run.image.image) - view.image / 255
+        squares = (residuals**2).sum(axis=2) * (1 if view.mask is None else view.mask)
+        v_image = np.stack([squares, np.zeros_like(squares), np.zeros_like(squares)], axis=2)
+        v = Image(device.upload("v_image", v_image), device.upload("v_alpha", np.zeros_like(squares)))
+        result.errors[:] += download(backward_to_splats(device, run, v).colors)[:, 0]
+        removal = stage.removal(run.splats, run.bins, background, residuals, view.mask)
+        result.weights[:] += removal.weights
+        result.prices[:] += removal.errors
+    return result

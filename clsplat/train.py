@@ -3,6 +3,7 @@
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ import numpy as np
 from clsplat import size
 from clsplat.checkpoint import State, load_state, log_file, save_state
 from clsplat.config import BACKGROUNDS, TrainConfig
-from clsplat.densify import STRATEGIES, Edit
+from clsplat.densify import STRATEGIES, Contributions, Edit
 from clsplat.errors import ClsplatError, DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.initialize import initialize
@@ -83,6 +84,8 @@ def train(
     UserWarning
         If the Gaussians stop growing because more would not fit the device's memory.
     """
+    if config.strategy not in STRATEGIES:
+        raise InputError(f"--strategy: expected one of {', '.join(STRATEGIES)}, found {config.strategy!r}")
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
     state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
@@ -195,7 +198,7 @@ def _edit(state: State, views: list[View], config: TrainConfig, device: "Device"
     gaussians = state.gaussians
     sh_degree = sh_degree_at(state.iteration, config.shortened(config.optim.sh_degree_every), gaussians.sh_degree)
 
-    def survey(count: int) -> tuple[Any, Any]:
+    def survey(count: int) -> Contributions:
         order = stream(config.seed, "surveyed views", state.iteration).permutation(len(views))
         chosen = [views[i] for i in order[:count]]
         return contributions(device, gaussians, chosen, config.render, BACKGROUNDS[config.data.background], sh_degree)
@@ -251,7 +254,10 @@ def move(state: State, device: "Device | None") -> None:
 
 def initial_state(scene: Scene, config: TrainConfig) -> State:
     """The state before the first iteration."""
-    gaussians = initialize(scene, config.init, config.seed, config.max_gaussians)
+    init = config.init
+    if init.opacity is None:
+        init = replace(init, opacity=STRATEGIES[config.strategy].start_opacity)
+    gaussians = initialize(scene, init, config.seed, config.max_gaussians)
     strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
     search = size.Search() if config.size == "auto" and size.can_search(scene.train) else None
     return State(0, 0.0, scene.extent, gaussians, Moments.zeros(gaussians), strategy, search=search)

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from clsplat import reference
-from clsplat.config import AdcConfig, TrainConfig
-from clsplat.densify import STRATEGIES, Strategy
+from clsplat.config import AdcConfig, ErrorConfig, McmcConfig, TrainConfig
+from clsplat.densify import STRATEGIES, Contributions, Strategy
 from clsplat.densify.adc import CHILD_SHRINK, Adc
+from clsplat.densify.schedule import Schedule
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
 from clsplat.testing import synthetic_scene
 
@@ -25,10 +27,10 @@ def scene() -> Gaussians:
     return gaussians
 
 
-def survey(views: int) -> tuple[np.ndarray, np.ndarray]:
-    """Weights and errors as of photos that see each Gaussian the better the later it stands."""
+def survey(views: int) -> Contributions:
+    """As of photos that see each Gaussian the better the later it stands."""
     assert views > 0
-    return np.arange(N) / 2.0, np.arange(N) ** 2 / 100.0
+    return Contributions(np.arange(N) / 2.0, np.arange(N) ** 2 / 100.0, np.arange(N) - 9.0)
 
 
 def observed(
@@ -160,3 +162,30 @@ def test_gradients_count_in_normalised_device_coordinates() -> None:
     strategy.observe(reference, np.array([[1.0, 2], [1, 1]]), np.array([[3.0, 0.0], [0.0, 4.0]]), 20, 10)
     assert strategy.statistics["grad_sum"].tolist() == [30, 20]
     assert strategy.statistics["seen"].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("settings", [McmcConfig(), ErrorConfig()])
+@pytest.mark.parametrize("iterations", [300, 700, 2000, 7000, 30_000])
+@pytest.mark.parametrize("cap", [50, 1001, 4000, 1_000_000])
+def test_growth_reaches_the_cap_in_time(settings: McmcConfig | ErrorConfig, iterations: int, cap: int) -> None:
+    n, sizes = min(1000, cap), []
+    schedule = Schedule(replace(CONFIG, iterations=iterations, max_gaussians=cap), settings)
+    for iteration in filter(schedule.due, range(1, iterations + 1)):
+        before, n = n, schedule.size_after(iteration, n, cap)
+        assert n == cap or n >= round(before * (1 + settings.growth))
+        sizes.append((iteration, n))
+    assert max(size for _, size in sizes) == cap
+    first = next(iteration for iteration, size in sizes if size == cap)
+    assert first <= max(settings.full_fraction * iterations, sizes[0][0])
+
+
+def test_growth_takes_nothing_away() -> None:
+    """Where less than there is fits the device."""
+    schedule = Schedule(replace(CONFIG, max_gaussians=5000), McmcConfig())
+    assert [schedule.size_after(200, 1000, cap) for cap in (900, 1010)] == [1000, 1010]
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "error"])
+def test_growth_needs_a_cap(strategy: str) -> None:
+    with pytest.raises(InputError, match=f"--max-gaussians: expected with --strategy {strategy}"):
+        STRATEGIES[strategy](replace(CONFIG, strategy=strategy), 1.0, N)

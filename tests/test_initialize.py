@@ -130,3 +130,27 @@ def test_initialize_takes_points_where_there_are_any():
     assert len(initialize(scene, config, 0)) == 2
     bare = dataclasses.replace(scene, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8))
     assert len(initialize(bare, config, 0)) == 10
+
+
+def test_a_cap_thins_the_start():
+    """Points are drawn, in proportion wherever they lie, and sized by their neighbours among those drawn."""
+    points, colors = RNG.normal(size=(400, 3)), RNG.integers(0, 256, (400, 3)).astype(np.uint8)
+    scene = Scene([View("a.png", orbit(1)[0], np.zeros((48, 64, 3), np.uint8))], [], points, colors)
+    found = initialize(scene, InitConfig(), 3, 100)
+    rows = [int(np.flatnonzero((points.astype(np.float32) == mean).all(axis=1))[0]) for mean in found.means]
+    assert len(set(rows)) == 100 and rows == sorted(rows)
+    # Of the first half of the rows 50 on average, by 4.3 in the standard deviation.
+    assert abs(np.sum(np.array(rows) < 200) - 50) < 20
+    np.testing.assert_allclose(found.scales[:, 0], brute_force_scales(points[rows]), rtol=1e-5)
+    np.testing.assert_allclose(found.sh[:, 0] * SH_C0 + 0.5, colors[rows] / 255, atol=1e-6)
+    assert (initialize(scene, InitConfig(), 3, 100).means == found.means).all()
+    assert not (initialize(scene, InitConfig(), 4, 100).means == found.means).all()
+    assert len(initialize(scene, InitConfig(), 3, 400)) == 400
+    bare = dataclasses.replace(scene, points=points[:0], colors=colors[:0])
+    assert len(initialize(bare, InitConfig(random_points=50), 0, 20)) == 20
+
+
+def test_a_cap_below_one_is_refused():
+    scene = Scene([], [], np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+    with pytest.raises(InputError, match="--max-gaussians"):
+        initialize(scene, InitConfig(), 0, 0)

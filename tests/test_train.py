@@ -1,16 +1,17 @@
 """Training on a tiny scene: it learns, repeats to the bit, and resumes to the same bits."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
 from clsplat.camera import Camera
 from clsplat.checkpoint import State, load_state, log_file, save_state
-from clsplat.config import AdcConfig, InitConfig, McmcConfig, OptimConfig, TrainConfig
+from clsplat.config import AdcConfig, ErrorConfig, InitConfig, McmcConfig, OptimConfig, TrainConfig
 from clsplat.densify import STRATEGIES, Edit
 from clsplat.device import Device
 from clsplat.errors import InputError
@@ -19,6 +20,7 @@ from clsplat.io import save_gaussians
 from clsplat.metrics import psnr, to_uint8
 from clsplat.render import render
 from clsplat.scene import Scene, View
+from clsplat.survey import contributions
 from clsplat.testing import synthetic_scene
 from clsplat.train import _apply, initial_state, train, view_at
 
@@ -32,6 +34,7 @@ CONFIG = TrainConfig(
     # Small enough to see a clone, a split and a reset within 60 iterations.
     adc=AdcConfig(every=10, reset_every=30, stop_fraction=0.8, grad_threshold=1e-5),
     mcmc=McmcConfig(every=10),
+    error=ErrorConfig(every=10),
 )
 
 
@@ -176,11 +179,62 @@ def test_a_cap_of_none_is_refused(scene: Scene, device: Device, tmp_path: Path) 
         train(scene, replace(CONFIG, max_gaussians=0), device, tmp_path)
 
 
+@pytest.mark.parametrize("optimizer", ["device", "numpy"])
+def test_noise_and_penalties_are_part_of_a_step(
+    scene: Scene, device: Device, tmp_path: Path, optimizer: Literal["device", "numpy"]
+) -> None:
+    still = McmcConfig(stop_fraction=0, noise_lr=0, opacity_penalty=0, scale_penalty=0)
+    # Dim enough for the gate to let noise pass.
+    init = replace(CONFIG.init, opacity=0.02)
+    config = replace(CONFIG, strategy="mcmc", optimizer=optimizer, iterations=1, max_gaussians=40, init=init)
+    before = train(scene, replace(config, mcmc=still), device, tmp_path)
+    for change, moved in (
+        ("noise_lr", "means"),
+        ("opacity_penalty", "logit_opacities"),
+        ("scale_penalty", "log_scales"),
+    ):
+        # A weight that no gradient of the image outdoes.
+        after = train(scene, replace(config, mcmc=replace(still, **{change: 1e5})), device, tmp_path)
+        for name, array in after.arrays().items():
+            assert (array != getattr(before, name)).any() == (name == moved), (change, name)
+
+
+def test_each_round_surveys_photos_of_its_own(
+    scene: Scene, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rounds: list[list[str]] = []
+
+    def recorded(device: Device, gaussians: Gaussians, views: list[View], *rest: Any) -> Any:
+        rounds.append([view.name for view in views])
+        return contributions(device, gaussians, views, *rest)
+
+    # clsplat.train is the function, too.
+    monkeypatch.setattr(sys.modules["clsplat.train"], "contributions", recorded)
+    config = replace(with_strategy("error"), error=ErrorConfig(every=10, views=5))
+    train(scene, config, device, tmp_path)
+    assert len(rounds) == 5 - 1  # after iterations 10 to 40, before 0.8 of 60
+    assert all(len(set(names)) == 5 for names in rounds)
+    assert len({tuple(sorted(names)) for names in rounds}) > 1
+    assert set().union(*rounds) <= {view.name for view in scene.train}
+
+
+def test_an_unknown_strategy_is_refused(scene: Scene, device: Device, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--strategy: expected one of adc, mcmc, error, found 'best'"):
+        train(scene, replace(CONFIG, strategy="best"), device, tmp_path)
+
+
+def test_the_strategy_says_how_opaque_the_start_is(scene: Scene) -> None:
+    for given, expected in ((None, 0.5), (0.2, 0.2)):
+        config = replace(with_strategy("mcmc"), init=replace(CONFIG.init, opacity=given))
+        np.testing.assert_allclose(initial_state(scene, config).gaussians.opacities, expected, rtol=1e-5)
+    np.testing.assert_allclose(initial_state(scene, CONFIG).gaussians.opacities, 0.1, rtol=1e-5)
+
+
 @EACH_STRATEGY
 def test_both_optimisers_train_alike(scene: Scene, device: Device, tmp_path: Path, strategy: str) -> None:
     """Also what a strategy adds to the gradients and to the means; nothing is densified."""
     config = replace(CONFIG, strategy=strategy, iterations=30, adc=AdcConfig(stop_fraction=0))
-    config = replace(config, mcmc=McmcConfig(stop_fraction=0))
+    config = replace(config, mcmc=McmcConfig(stop_fraction=0), error=ErrorConfig(stop_fraction=0), max_gaussians=40)
     results = [train(scene, replace(config, optimizer=o), device, tmp_path) for o in ("device", "numpy")]
     # Adam turns a gradient that is zero to rounding into a whole step of either sign: parameters without effect may
     # differ, what is seen hardly does. Measured: 1.7e-3.

@@ -5,12 +5,14 @@ strategies only through this table.
 """
 
 from clsplat.densify.adc import Adc
+from clsplat.densify.error import ErrorGuided
 from clsplat.densify.mcmc import Mcmc
-from clsplat.densify.strategy import Edit, Strategy, Survey
+from clsplat.densify.strategy import Contributions, Edit, Strategy, Survey
 
 STRATEGIES: dict[str, type[Strategy]] = {
     "adc": Adc,
     "mcmc": Mcmc,
+    "error": ErrorGuided,
 }
 
-__all__ = ["STRATEGIES", "Edit", "Strategy", "Survey"]
+__all__ = ["STRATEGIES", "Contributions", "Edit", "Strategy", "Survey"]

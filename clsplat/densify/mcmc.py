@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config import TrainConfig
+from clsplat.densify.schedule import Schedule
 from clsplat.densify.strategy import Edit, Strategy, Survey
 from clsplat.gaussians import Gaussians, logit
 from clsplat.randomness import stream
@@ -22,13 +23,12 @@ class Mcmc(Strategy):
     It remembers nothing between iterations.
     """
 
+    start_opacity = 0.5  # the original's; measured 0.6 dB better than 0.1 on fox_pinhole
+
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         super().__init__(config, extent, n)
         self.config, self.seed, self.extent = config.mcmc, config.seed, extent
-        self.capped = config.max_gaussians is not None
-        self.start = config.shortened(config.mcmc.start)
-        self.full = round(config.mcmc.full_fraction * config.iterations)
-        self.stop = round(config.mcmc.stop_fraction * config.iterations)
+        self.schedule = Schedule(config, config.mcmc)
 
     def penalties(self, n: int) -> tuple[float, float]:
         """See `clsplat.densify.Strategy`: of the means over all Gaussians, and all axes."""
@@ -41,7 +41,7 @@ class Mcmc(Strategy):
 
     def due(self, iteration: int) -> bool:
         """See `clsplat.densify.Strategy`."""
-        return self.start <= iteration < self.stop and iteration % self.config.every == 0
+        return self.schedule.due(iteration)
 
     def edit(self, iteration: int, gaussians: Gaussians, survey: Survey) -> Edit:
         """See `clsplat.densify.Strategy`."""
@@ -60,21 +60,12 @@ class Mcmc(Strategy):
         share(moved, np.bincount(rows, minlength=n)[rows], self.config.opacity_min)
 
         draw = stream(self.seed, "sources of new Gaussians", iteration)
-        added = sample(moved.opacities, self.size_after(iteration, n) - n, draw)
+        added = sample(moved.opacities, self.schedule.size_after(iteration, n, self.max_gaussians) - n, draw)
         fresh[added] = True
         all_rows = np.concatenate([np.arange(n), added])
         grown = moved.take(all_rows)
         share(grown, np.bincount(all_rows, minlength=n)[all_rows], self.config.opacity_min)
         return Edit(grown, rows[all_rows], np.concatenate([fresh, np.ones(len(added), bool)]))
-
-    def size_after(self, iteration: int, n: int) -> int:
-        """Gaussians after a round that began with n: a fixed fraction more; where there is a cap, no less than takes
-        it there by equal factors in the rounds until it is to be full."""
-        rounds = self.full // self.config.every - iteration // self.config.every + 1
-        factor = 1 + self.config.growth
-        if self.capped and n < self.max_gaussians:
-            factor = max(factor, (self.max_gaussians / n) ** (1 / max(1, rounds)))
-        return max(n, min(self.max_gaussians, round(n * factor)))
 
 
 def sample(weights: Array, count: int, generator: np.random.Generator) -> Array:

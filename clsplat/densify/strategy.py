@@ -14,8 +14,21 @@ Array = NDArray[Any]
 MOST_GAUSSIANS = 2**32 - 1
 
 
-# Sums of weights and of weights times errors, (N,) each, over so many photos: `clsplat.survey.contributions`.
-Survey = Callable[[int], tuple[Array, Array]]
+class Contributions(NamedTuple):
+    """What N Gaussians have to do with some photos, added up over them.
+
+    weights (N,): with which they are composited; errors (N,): the same, times the pixels' squared errors; prices
+    (N,): by how much the squared error would rise without the Gaussian alone, negative where it does harm. Squared
+    errors are summed over RGB.
+    """
+
+    weights: Array
+    errors: Array
+    prices: Array
+
+
+# Contributions to so many training photos.
+Survey = Callable[[int], Contributions]
 
 
 class Edit(NamedTuple):
@@ -41,6 +54,8 @@ class Strategy:
 
     statistics: dict[str, Any]
     max_gaussians: int
+    start_opacity = 0.1
+    """Opacity of the Gaussians at the start, where the user gives none (original)."""
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         """Statistics of `n` Gaussians in a scene of the given extent, in world units."""
