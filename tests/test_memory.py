@@ -11,7 +11,8 @@ import pytest
 
 from clsplat.camera import Camera
 from clsplat.checkpoint import load_state
-from clsplat.config import AdcConfig, OptimConfig, RenderConfig, TrainConfig
+from clsplat.config import AdcConfig, ErrorConfig, McmcConfig, OptimConfig, RenderConfig, TrainConfig
+from clsplat.densify import STRATEGIES
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
@@ -120,10 +121,18 @@ def test_a_start_that_does_not_fit_says_what_would() -> None:
     assert "downscale" not in str(error.value)
 
 
-def test_growth_stops_where_memory_ends(tmp_path: Path) -> None:
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_growth_stops_where_memory_ends(tmp_path: Path, strategy: str) -> None:
     scene = make_scene(1500, 96, 64)
     adc = AdcConfig(start=1, every=5, grad_threshold=1e-7, stop_fraction=1)
-    config = TrainConfig(iterations=30, adc=adc)
+    config = TrainConfig(
+        iterations=30,
+        strategy=strategy,
+        max_gaussians=12_000,
+        adc=adc,
+        mcmc=McmcConfig(start=1, every=5),
+        error=ErrorConfig(start=1, every=5, stop_fraction=1),
+    )
     free = Device()
     grown = len(train(scene, config, free, tmp_path))
     limit = round(free.memory_peak / 2)
