@@ -180,7 +180,7 @@ class ErrorConfig:
     replaced: float = 0.02
     """Fraction of the Gaussians that make room for others in each round at the cap: those whose removal changes the
     squared error of the photos least."""
-    replaced_most: float = 0.2
+    replaced_most: float = 0.05
     """The largest such fraction: all make room, up to it, whose removal would even lower the error."""
 
 
