@@ -20,7 +20,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
 from clsplat.metrics import psnr
 from clsplat.optim import Moments
-from clsplat.prune import price, with_degree, without_bands
+from clsplat.prune import price, removal_order, with_degree, without_bands
 from clsplat.render import fetch, render_views
 from clsplat.scene import View
 
@@ -171,11 +171,20 @@ def path_ends(points: list[Point], price_db: float) -> bool:
     return path[-1] < max(path) - price_db
 
 
-def costliest_rows(gaussians: Gaussians, views: list[View], config: TrainConfig, device: "Device") -> NDArray[Any]:
+def costliest_rows(
+    gaussians: Gaussians, views: list[View], config: TrainConfig, device: "Device"
+) -> NDArray[np.intp]:
     """The rows that a step of the path leaves, in their order: those whose removal costs most."""
-    errors = price(gaussians, views, config.render, device, BACKGROUNDS[config.data.background]).errors
     left = max(1, int(STEP * len(gaussians)))
-    return np.sort(np.argsort(-errors, kind="stable")[:left])
+    order = removal_order(
+        gaussians,
+        views,
+        lambda rest: len(rest) < left,
+        config.render,
+        device,
+        BACKGROUNDS[config.data.background],
+    )
+    return np.sort(order[:left])
 
 
 def settle(search: Search, views: list[View], config: TrainConfig, device: "Device") -> Kept:
