@@ -22,6 +22,7 @@ from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.optim import adam_settings
 from clsplat.render import render, upload
+from clsplat.stages import SplatGrads
 
 RACES = """
 __kernel void race(__global int *x) {
@@ -133,6 +134,46 @@ def adam(device):
                 np.testing.assert_allclose(a.arrays()[name].get(), array, rtol=1e-12, atol=1e-14)
 
 
+def fused(device):
+    """The end of a training step: statistics, and gradients with Adam; each degree stored and trained."""
+    camera = Camera(np.eye(4), 20, 20, 34, 18, 37, 21)
+    for sh_degree in (0, 1):
+        found = [scene(70, seed, 1).astype(np.float64) for seed in (-2, 1, 2)]
+        found[2] = Gaussians(**{name: array**2 for name, array in found[2].arrays().items()})
+        splats = reference.project_fwd(found[0], camera, sh_degree)
+        rng = np.random.default_rng(0)
+        v = SplatGrads(*(rng.normal(size=getattr(splats, name).shape) for name in SplatGrads._fields))
+        statistics = [np.zeros(70), np.zeros(70, np.int32)]
+        on_device = [upload(device, part) for part in found]
+        arrays, v_arrays = (type(part)(*(device.upload("splats", a) for a in part)) for part in (splats, v))
+        sums = [device.upload("sums", a, a.dtype) for a in statistics]
+        ops.observe(device, arrays.extents, v_arrays.means2d, 37, 21, *sums)
+        reference.observe(splats.extents, v.means2d, 37, 21, *statistics)
+        step = adam_settings(3, 0.3, 1.0, OptimConfig(), sh_degree)
+        ops.project_bwd_adam(device, on_device[0], tuple(on_device[1:]), camera, arrays, v_arrays, step)
+        reference.project_bwd_adam(found[0], tuple(found[1:]), camera, splats, v, step)
+        for a, b in zip(sums, statistics, strict=True):
+            np.testing.assert_allclose(a.get(), b, rtol=1e-12)
+        for part, expected in zip(on_device, found, strict=True):
+            for name, array in expected.arrays().items():
+                np.testing.assert_allclose(part.arrays()[name].get(), array, rtol=1e-9, atol=1e-12)
+
+
+def removal(device):
+    """Translucent splats and opaque ones, in an image that cuts tiles off."""
+    camera = Camera(np.eye(4), 20, 20, 34, 18, 37, 21)
+    residuals = np.random.default_rng(0).normal(size=(21, 37, 3))
+    for opacity_logit in (-2, 5):
+        splats = reference.project_fwd(scene(90, opacity_logit, 2).astype(np.float64), camera, 1)
+        bins = reference.bin_splats(splats, 37, 21, 16)
+        arrays = type(splats)(*(device.upload("splats", a) for a in splats))
+        lists = ops.bin_splats(device, arrays, 37, 21, 16)
+        found = ops.removal(device, arrays, lists, (0.1, 0.5, 0.9), residuals)
+        expected = reference.removal(splats, bins, (0.1, 0.5, 0.9), residuals)
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10 * np.abs(b).max())
+
+
 def noise(device):
     found = scene(70, -3, 1).astype(np.float64)
     on_device = upload(device, found)
@@ -179,6 +220,8 @@ CASES = {
     "loss": loss,
     "adam": adam,
     "noise": noise,
+    "fused": fused,
+    "removal": removal,
     "gpu-8": lambda device: pipeline(device, "gpu", 8),
     "gpu-16": lambda device: pipeline(device, "gpu", 16),
     "cpu-16": lambda device: pipeline(device, "cpu", 16),
