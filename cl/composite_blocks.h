@@ -159,4 +159,28 @@ static inline REALV transmittance_at_first(int b, int rows, int columns) {
     return ((x < (REALV)columns) & (y < (REALV)rows)) ? (REALV)1 : (REALV)-1;
 }
 
+// Composites the entries [begin, end) of a tile's list over its blocks, whose pixels are finished where the transmittance
+// would fall to `stop` or below; adds the colours to sums.
+static inline void composite_tile(const __global Splat *splats, const __global uint *gauss_ids, uint begin, uint end,
+                                  int x0, int y0, real stop, REALV *transmittance, REALV (*sums)[CHANNELS]) {
+    Over batch[BATCH];
+    for (uint first = begin; first < end; first += BATCH) {
+        const uint unfinished = unfinished_blocks(transmittance);
+        if (!unfinished)
+            break;
+        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
+        for (uint j = 0; j < count; ++j) {
+            const Over *over = &batch[j];
+            const REALV curved = curvature(&over->splat);
+            for (uint blocks = unfinished & over->blocks; blocks;) {
+                const int b = take_block(&blocks);
+                const REALV t = block_exponent(over, b, curved), alpha = power16(t);
+                MASKV drawn = splat_seen(&over->splat, t);
+                const REALV weight = splat_over(alpha, stop, &drawn, &transmittance[b]);
+                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) sums[b][k] += weight * over->splat.color[k];
+            }
+        }
+    }
+}
+
 #endif

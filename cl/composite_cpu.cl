@@ -40,25 +40,8 @@ __kernel void composite_fwd(const int width, const int height, const __global Sp
         _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) sums[b][k] = 0;
     }
 
-    const uint begin = tile_ranges[2 * t], end = tile_ranges[2 * t + 1];
-    Over batch[BATCH];
-    for (uint first = begin; first < end; first += BATCH) {
-        const uint unfinished = unfinished_blocks(transmittance);
-        if (!unfinished)
-            break;
-        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
-        for (uint j = 0; j < count; ++j) {
-            const Over *over = &batch[j];
-            const REALV curved = curvature(&over->splat);
-            for (uint blocks = unfinished & over->blocks; blocks;) {
-                const int b = take_block(&blocks);
-                const REALV t = block_exponent(over, b, curved), alpha = power16(t);
-                MASKV drawn = splat_seen(&over->splat, t);
-                const REALV weight = splat_over(alpha, TRANSMITTANCE_MIN, &drawn, &transmittance[b]);
-                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) sums[b][k] += weight * over->splat.color[k];
-            }
-        }
-    }
+    composite_tile(splats, gauss_ids, tile_ranges[2 * t], tile_ranges[2 * t + 1], x0, y0, TRANSMITTANCE_MIN,
+                   transmittance, sums);
 
     for (int r = 0; r < rows; ++r) {
         const size_t first = (size_t)(y0 + r) * width + x0;

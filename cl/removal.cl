@@ -57,30 +57,14 @@ __kernel void removal(const int width, const int height, const __global Splat *s
     }
 
     const uint begin = tile_ranges[2 * t], end = tile_ranges[2 * t + 1];
-    Over batch[BATCH];
-    for (uint first = begin; first < end; first += BATCH) {
-        const uint unfinished = unfinished_blocks(transmittance);
-        if (!unfinished)
-            break;
-        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
-        for (uint j = 0; j < count; ++j) {
-            const Over *over = &batch[j];
-            const REALV curved = curvature(&over->splat);
-            for (uint blocks = unfinished & over->blocks; blocks;) {
-                const int b = take_block(&blocks);
-                const REALV exponent = block_exponent(over, b, curved), alpha = power16(exponent);
-                MASKV drawn = splat_seen(&over->splat, exponent);
-                const REALV weight = splat_over(alpha, STOP, &drawn, &transmittance[b]);
-                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) behind[b][k] += weight * over->splat.color[k];
-            }
-        }
-    }
+    composite_tile(splats, gauss_ids, begin, end, x0, y0, STOP, transmittance, behind);
     for (int b = 0; b < BLOCKS; ++b) {
         _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) behind[b][k] +=
             ABSOLUTE(transmittance[b]) * background[k];
         transmittance[b] = transmittance_at_first(b, rows, columns);
     }
 
+    Over batch[BATCH];
     uint first = begin;
     for (; first < end; first += BATCH) {
         const uint unfinished = unfinished_blocks(transmittance);
