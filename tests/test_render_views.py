@@ -7,6 +7,7 @@ from clsplat import reference
 from clsplat.config import RenderConfig
 from clsplat.device import Device
 from clsplat.errors import InputError
+from clsplat.gaussians import SHAPES
 from clsplat.render import render, render_views
 from clsplat.testing import synthetic_scene
 
@@ -43,7 +44,7 @@ class TestForwardOnly:
         upload = Device.upload
         monkeypatch.setattr(Device, "upload", lambda self, what, *a: uploads.append(what) or upload(self, what, *a))
         list(render_views(scene[0], cameras, RenderConfig(), device))
-        assert [uploads.count(name) for name in FIELDS] == [1] * len(FIELDS)
+        assert [uploads.count(name) for name in SHAPES] == [1] * len(SHAPES)
 
     def test_lists_are_made_without_what_gradients_need(self, scene, cameras, monkeypatch):
         asked = []
