@@ -47,6 +47,11 @@ class Prices(NamedTuple):
     weights: Array
     bands: Array
 
+    @property
+    def costs(self) -> Array:
+        """(N,) What pruning goes by: the error, but of what makes a place too bright, each promises the same gain."""
+        return np.maximum(self.errors, self.differences)
+
 
 def price(
     gaussians: Gaussians,
@@ -140,8 +145,7 @@ def removal_order(
     gone: list[NDArray[np.intp]] = []
     while True:
         prices = price(gaussians.take(kept), views, config, device, background)
-        cost = np.maximum(prices.errors, prices.differences)
-        kept = kept[np.argsort(-cost, kind="stable")]
+        kept = kept[np.argsort(-prices.costs, kind="stable")]
         left = int(ROUND * len(kept))
         if left == 0 or until(gaussians.take(np.sort(kept[:left]))):
             return np.concatenate([kept, *reversed(gone)])

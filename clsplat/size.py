@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
-from clsplat.metrics import psnr
+from clsplat.metrics import psnr, to_uint8
 from clsplat.optim import Moments
 from clsplat.prune import price, with_degree, without_bands
-from clsplat.render import fetch, render_views
+from clsplat.render import render_views
 from clsplat.scene import View
 
 if TYPE_CHECKING:
@@ -139,8 +139,7 @@ def validate(
         background=background,
         sh_degree=min(sh_degree, gaussians.sh_degree),
     )
-    images = (np.rint(np.clip(r.rgb, 0, 1) * 255).astype(np.uint8) for r in renderings)
-    return [psnr(image, view.image, view.mask) for image, view in zip(images, views, strict=True)]
+    return [psnr(to_uint8(r.rgb), view.image, view.mask) for r, view in zip(renderings, views, strict=True)]
 
 
 def point(
@@ -180,7 +179,7 @@ def costliest_rows(
     """
     prices = price(gaussians, views, config.render, device, BACKGROUNDS[config.data.background])
     left = max(1, int(STEP * len(gaussians)))
-    return np.sort(np.argsort(-np.maximum(prices.errors, prices.differences), kind="stable")[:left])
+    return np.sort(np.argsort(-prices.costs, kind="stable")[:left])
 
 
 def settle(search: Search, views: list[View], config: TrainConfig, device: "Device") -> Kept:
@@ -208,12 +207,6 @@ def without_useless_bands(
     """Zero, per Gaussian, the bands of the spherical harmonics without which the error is no larger."""
     prices = price(gaussians, views, config.render, device, BACKGROUNDS[config.data.background])
     return without_bands(gaussians, prices.bands, 0.0)
-
-
-def keep(gaussians: Gaussians, moments: Moments, statistics: dict[str, NDArray[Any]]) -> Kept:
-    """Copies on the host."""
-    first, second = fetch(moments.first), fetch(moments.second)
-    return Kept(fetch(gaussians), Moments(first, second), {k: np.array(v) for k, v in statistics.items()})
 
 
 def lower_degree(kept: Kept, degree: int) -> Kept:

@@ -223,13 +223,14 @@ def seek_size(state: State, views: list[View], config: TrainConfig, device: "Dev
         search.grown = search.grown or not size.growth_pays(search.points, config.size_price)
     else:
         search.grown = True
+        here = size.Kept(state.gaussians, state.moments, dict(state.strategy.statistics))
         if search.points[-1].worth == max(p.worth for p in search.points if p.phase == "path"):
-            search.best = size.keep(state.gaussians, state.moments, state.strategy.statistics)
+            search.best = here
         if iteration == path[-1] or size.path_ends(search.points, config.size_price):
             kept = size.settle(search, validation, config, device)
         else:
             rows = size.costliest_rows(state.gaussians, training, config, device)
-            kept = size.keep(state.gaussians, state.moments, state.strategy.statistics).take(rows)
+            kept = here.take(rows)
         state.gaussians, state.moments, state.strategy.statistics = kept
     if config.optimizer == "device":
         move(state, device)
