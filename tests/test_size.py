@@ -19,6 +19,7 @@ from clsplat.size import (
     Point,
     Search,
     can_search,
+    costliest_rows,
     growth_pays,
     path_ends,
     point,
@@ -129,14 +130,15 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     scene = known_scene(20, device, copies=4, views=24)
     for name in ("whole", "parts"):
         (tmp_path / name).mkdir()
-    config = replace(CONFIG, iterations=200, checkpoint_every=1000)
+    # A price at which the start is not the best.
+    config = replace(CONFIG, iterations=200, checkpoint_every=1000, size_price=8.0)
     sizes: list[int] = []
     whole = train(scene, config, device, tmp_path / "whole", progress=lambda r: sizes.append(r["num_gaussians"]))
     report = json.loads((tmp_path / "whole" / "size.json").read_text())
     path = [p for p in report["points"] if p["phase"] == "path"]
     assert [p["n"] for p in path][:2] == [80, 56] and max(sizes) == 80
     best = max(path, key=lambda p: p["worth"])
-    assert report["chosen"]["n"] == best["n"] == len(whole) == sizes[-1]
+    assert report["chosen"]["n"] == best["n"] == len(whole) == sizes[-1] < 80
     degrees = [p for p in report["points"] if p["phase"] == "degree"]
     assert report["chosen"]["sh_degree"] == max(degrees, key=lambda p: p["worth"])["sh_degree"] == whole.sh_degree
     assert all(len(p["views"]) == len(split(scene.train)[1]) for p in path)
@@ -154,6 +156,17 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     for name, array in whole.arrays().items():
         assert resumed.arrays()[name].tobytes() == array.tobytes(), name
     assert (tmp_path / "parts" / "size.json").read_text() == (tmp_path / "whole" / "size.json").read_text()
+
+
+def test_a_step_leaves_what_the_photos_would_miss(device: Device) -> None:
+    """Of twenty visible Gaussians and eight that are all but transparent, the transparent ones go."""
+    scene = known_scene(20, device, copies=1, views=8)
+    gaussians = synthetic_scene(28, 4)[0].astype(np.float32)
+    gaussians.means[:20] = scene.points
+    gaussians.logit_opacities[:] = 2
+    gaussians.logit_opacities[20:] = -5
+    rows = costliest_rows(gaussians, scene.train, CONFIG, device)
+    assert len(rows) == 19 and set(rows) <= set(range(20))
 
 
 def test_too_few_photos_to_validate(device: Device, tmp_path: Path) -> None:
