@@ -1,6 +1,6 @@
 PYTHON = python
 
-.PHONY: test test-slow lint docs check-races bench formats
+.PHONY: test test-slow stability lint docs check-races bench bench-stability formats
 
 # The default tests: a few minutes on two cores.
 test:
@@ -9,6 +9,10 @@ test:
 # Trainings, which take minutes each.
 test-slow:
 	$(PYTHON) -m pytest -m slow
+
+# Of these, the trainings that show that a known failure of the method is held off.
+stability:
+	$(PYTHON) -m pytest -m slow tests/stability tests/test_faults.py
 
 # Style, types, and the kernels' format.
 lint:
@@ -29,6 +33,10 @@ check-races:
 # The figures of docs/benchmarks.md, measured anew: some minutes, on a machine that does nothing else.
 bench:
 	$(PYTHON) -m clsplat bench kernels -o docs/results/kernels.json --scaling docs/results/kernels.svg
+
+# The figures of docs/stability.md, measured anew: make bench-stability DATA=folder of real scenes.
+bench-stability:
+	$(PYTHON) -m clsplat bench stability $(NAMES) -o docs/results --data $(DATA)
 
 # The figures of docs/formats.md: make formats SCENE=scene.ply DATA=dataset OPTIONS="--downscale 2".
 formats:

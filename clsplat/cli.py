@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from clsplat.bench.commands import Kernels
+from clsplat.bench.commands import Kernels, Stability
 from clsplat.commands.compact import Compact
 from clsplat.commands.console import say
 from clsplat.commands.files import Devices, Export, Sfm
@@ -15,8 +15,9 @@ from clsplat.commands.pictures import Eval, Render
 from clsplat.commands.training import Demo, Train
 from clsplat.errors import ClsplatError
 
-# tyro makes sub-commands of a union; the hidden member makes one of a single class.
-BENCHMARKS = Annotated[Kernels, tyro.conf.subcommand("kernels")] | Annotated[None, tyro.conf.Suppress]
+BENCHMARKS = (
+    Annotated[Kernels, tyro.conf.subcommand("kernels")] | Annotated[Stability, tyro.conf.subcommand("stability")]
+)
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,7 @@ class Bench:
 
     def run(self) -> None:
         """Run the command."""
-        if self.what is not None:
-            self.what.run()
+        self.what.run()
 
 
 COMMANDS = Devices | Sfm | Train | Eval | Render | Export | Compact | Demo | Bench

@@ -4,13 +4,13 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from clsplat.bench.workloads import DEFAULT, Workload, from_files, scaling_names, synthetic
 from clsplat.config import DataConfig, RenderConfig
-from clsplat.errors import InputError
+from clsplat.errors import ClsplatError, InputError
 
 CHART_SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -82,3 +82,55 @@ class Kernels:
             return from_files(self.scene, self.cameras, self.views, DataConfig(downscale=self.downscale))
         names = [*self.workloads, *(scaling_names() if self.scaling is not None else ())]
         return [synthetic(name) for name in dict.fromkeys(names)]
+
+
+@dataclass(frozen=True)
+class Stability:
+    """Measure how the method's known failures show without their remedies and with them."""
+
+    names: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Experiments; default: all."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Folder for stability.json, in which rows that are not measured now stay as they are, and charts."""
+    data: Path | None = None
+    """Folder with the real scenes that some experiments train on; they do not run without it."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.bench.stability.report import chart_file, charts, save_chart, table
+        from clsplat.bench.stability.run import run_experiments
+        from clsplat.device import Device, select_device
+        from clsplat.io.atomic import replacing
+
+        for folder in filter(None, (self.out, self.data)):
+            if not folder.is_dir():
+                raise InputError(f"{folder}: expected a folder that exists, found none")
+        results = _read_results(self.out / "stability.json") if self.out is not None else {}
+        device = Device(select_device(self.device))
+        _say(f"device: {device.label}")
+        rows = run_experiments(self.names, device, self.data, lambda name: _say(f"measuring: {name}"))
+        # A row that could not run says less than the same row measured earlier.
+        results |= {name: row for name, row in rows.items() if "not_run" not in row or name not in results}
+        if self.out is not None:
+            with replacing(self.out / "stability.json") as file:
+                file.write((json.dumps(results, indent=1, allow_nan=False) + "\n").encode())
+            for name in charts(rows):
+                save_chart(name, rows[name], self.out / chart_file(name))
+            _say(f"results: {self.out / 'stability.json'}")
+        print(table(results))
+        if failed := [name for name, row in rows.items() if "error" in row]:
+            raise ClsplatError(f"experiments failed, see above: {', '.join(failed)}")
+
+
+def _read_results(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        return {}
+    try:
+        results = json.loads(path.read_bytes())
+        if not isinstance(results, dict):
+            raise ValueError(f"a {type(results).__name__}")
+        return results
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected results of an earlier run, found: {error}") from error

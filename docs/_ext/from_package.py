@@ -2,7 +2,8 @@
 
 ``{constants}`` lists clsplat/constants.py; ``{config} NAME`` a dataclass of clsplat/config.py; ``{command} NAME``
 is what ``clsplat NAME --help`` prints; ``{bench_kernels} FILE [WORKLOAD]`` shows the results that
-``clsplat bench kernels -o FILE`` measured, or the stages of one workload of them.
+``clsplat bench kernels -o FILE`` measured, or the stages of one workload of them; ``{bench_stability} FILE`` the
+rows and charts that ``clsplat bench stability`` left in the folder of FILE.
 """
 
 import ast
@@ -24,6 +25,8 @@ from sphinx.util.docutils import SphinxDirective
 
 from clsplat import cli, config, constants
 from clsplat.bench import report
+from clsplat.bench.stability import EXPERIMENTS
+from clsplat.bench.stability import report as stability
 
 HEADER_RULE = "|---"
 
@@ -172,9 +175,27 @@ class BenchKernels(SphinxDirective):
         return self.parse_text_to_nodes(report.details(workload))
 
 
+class BenchStability(SphinxDirective):
+    """``{bench_stability} FILE``; the file and its charts lie in a folder beside the page."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        relative, path = self.env.relfn2path(self.arguments[0])
+        self.env.note_dependency(relative)
+        results = json.loads(Path(path).read_text())
+        parts = [stability.table(results), "Measured on", stability.origin(results)]
+        folder = self.arguments[0].rpartition("/")[0]
+        for name in stability.charts(results):
+            failure = EXPERIMENTS[name].failure
+            parts.append(f"![{failure}: measured without and with the remedy]({folder}/{stability.chart_file(name)})")
+        return self.parse_text_to_nodes("\n\n".join(parts))
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("constants", Constants)
     app.add_directive("config", Config)
     app.add_directive("command", Command)
     app.add_directive("bench_kernels", BenchKernels)
+    app.add_directive("bench_stability", BenchStability)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

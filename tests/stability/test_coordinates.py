@@ -1,0 +1,24 @@
+"""Scenes whose coordinates are geo-referenced: float32 has steps of 0.06 at 1e6, and of 0.5 at 5e6."""
+
+import numpy as np
+from test_io_dataset import write_colmap
+
+from clsplat.config import DataConfig, InitConfig
+from clsplat.initialize import initialize
+from clsplat.io import load_scene
+from clsplat.render import render
+
+
+def test_the_same_image_in_coordinates_of_the_world(device, tmp_path):
+    """A dataset in coordinates of the world (UTM: up to 1e7) is rendered as the same one at the origin."""
+    images = []
+    for name, centre in (("far", (5e6, -4e5, 3e5)), ("near", (0.0, 0.0, 0.0))):
+        write_colmap(tmp_path / name, centre=centre)
+        scene = load_scene(tmp_path / name, DataConfig())
+        gaussians = initialize(scene, InitConfig(), seed=0)
+        gaussians.log_scales[:] = -1
+        gaussians.logit_opacities[:] = 2
+        gaussians.sh[:, 0] = [[0, 1, 0], [1, 0, 1]]  # the points are dark
+        images.append(render(gaussians, scene.test[0].camera, device=device, gradients=False).rgb)
+    assert images[0].std(axis=(0, 1)).min() > 0.1, "both Gaussians must be seen"
+    np.testing.assert_allclose(images[0], images[1], atol=1e-5)
