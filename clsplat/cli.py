@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import tyro
@@ -38,10 +38,15 @@ COMMANDS = Devices | Sfm | Train | Eval | Render | Export | Compact | Demo | Ben
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``clsplat``: errors that are the user's to mend print one sentence and exit with 2."""
     warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
+    arguments = sys.argv[1:] if arguments is None else arguments
     command = tyro.cli(
         COMMANDS, prog="clsplat", args=arguments, description="3D Gaussian Splatting on any OpenCL device."
     )
     try:
+        if isinstance(command, Train) and (base := command.base()):
+            # Read again: flags are told from defaults by what they are put into.
+            start = replace(command, settings=base)
+            command = tyro.cli(Train, prog="clsplat train", args=arguments[1:], default=start)
         command.run()
     except ClsplatError as error:
         say(f"clsplat: {error}")

@@ -22,6 +22,7 @@ STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__i
 LAYERS = """
     constants errors stages randomness
     config photos
+    presets
     camera gaussians lenses
     sfm
     scene structs device reference metrics raytrace orbit

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,11 @@ from PIL import Image
 
 from clsplat.camera import Camera
 from clsplat.cli import main
+from clsplat.config import AdcConfig, TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.io import FORMATS, load_gaussians, save_gaussians
 from clsplat.metrics import to_uint8
+from clsplat.presets import load_preset
 from clsplat.render import render
 from clsplat.testing import synthetic_scene
 
@@ -148,6 +151,27 @@ def test_resume_of_a_finished_run_changes_nothing(dataset: Path, tmp_path: Path)
     before = (tmp_path / "scene.ply").read_bytes()
     run("train", dataset, "-o", tmp_path, *TRAIN, "--resume")
     assert (tmp_path / "scene.ply").read_bytes() == before
+
+
+def test_the_config_of_a_run_repeats_it(trained: Path, dataset: Path, tmp_path: Path) -> None:
+    run("train", dataset, "-o", tmp_path / "again", "--config", trained / "config.json")
+    assert (tmp_path / "again" / "scene.ply").read_bytes() == (trained / "scene.ply").read_bytes()
+    assert (tmp_path / "again" / "config.json").read_text() == (trained / "config.json").read_text()
+
+
+def test_flags_count_more_than_a_preset(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # 7000 is TrainConfig's own value: flags are not told by differing from it.
+    seen: list[TrainConfig] = []
+    monkeypatch.setattr("clsplat.commands.training.train_and_report", lambda scene, config, *_: seen.append(config))
+    run("train", dataset, "-o", tmp_path / "a", "--preset", "fast", "--iterations", 7000, "--adc.every", 7)
+    assert seen == [replace(load_preset("fast"), iterations=7000, adc=AdcConfig(every=7))]
+    assert load_preset("fast").iterations != 7000
+    assert "expected one of auto" in fails(capsys, "train", dataset, "-o", tmp_path / "b", "--preset", "nothing")
+    both = ("--preset", "fast", "--config", "x.json")
+    assert "expected one of them, found both" in fails(capsys, "train", dataset, "-o", tmp_path / "b", *both)
+    assert not (tmp_path / "b").exists()
 
 
 def test_control_c_saves_and_says_how_to_go_on(dataset: Path, tmp_path: Path) -> None:

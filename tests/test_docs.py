@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat import cli, config, constants, densify, io, ops
+from clsplat import cli, config, constants, densify, io, ops, presets
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -40,6 +40,12 @@ def test_every_configuration_has_a_table():
     for name, cls in vars(config).items():
         if dataclasses.is_dataclass(cls):
             assert f"```{{config}} {name}\n" in page, name
+
+
+def test_every_preset_is_described():
+    page = (DOCS / "configuration.md").read_text()
+    for name in presets.PRESETS:
+        assert re.search(rf"^\* .*`{name}`.*:", page, flags=re.M), name
 
 
 def test_every_command_has_its_help():

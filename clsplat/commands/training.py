@@ -13,6 +13,7 @@ import tyro
 from clsplat.commands.console import STARTED, Out, new_folder, open_device, say, say_scores, write_json
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
+from clsplat.presets import DATA_PATH, PRESETS, load_config, load_preset
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -31,7 +32,19 @@ class Train:
     whose name without the suffix becomes the folder."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+    preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
+    """A named set of settings to start from, in the place of the defaults; flags given beside it count."""
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """The config.json of an earlier run, or a part of one, to start from; flags given beside it count."""
+    settings: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+
+    def base(self) -> TrainConfig | None:
+        """The settings that preset or file bring, in which flags are yet to be put; None where neither is given."""
+        if self.preset is not None and self.config is not None:
+            raise InputError("--preset and --config: expected one of them, found both")
+        if self.preset is not None:
+            return load_preset(self.preset)
+        return None if self.config is None else load_config(self.config)
 
     def run(self) -> None:
         """Run the command."""
@@ -45,7 +58,7 @@ class Train:
             raise InputError(
                 f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
             )
-        config = self.config
+        config = self.settings
         if config.data.masks is not None:
             config = replace(config, data=replace(config.data, masks=str(Path(config.data.masks).resolve())))
         limit = None if config.memory_limit is None else parse_size(config.memory_limit, "--memory-limit")
@@ -56,7 +69,7 @@ class Train:
         start = start_size(scene, config.init, config.max_gaussians)
         say(need.describe(start, config.max_gaussians, device.memory_limit))
         new_folder(out)
-        write_json(out / "config.json", {"data_path": str(self.data.resolve()), **asdict(config)})
+        write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
         gaussians = train_and_report(scene, config, device, out, self.resume)
         if suffix:
             save_gaussians(self.out, gaussians, config.render.mode, scene.offset)

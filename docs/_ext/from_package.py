@@ -1,9 +1,9 @@
 """Parts of pages made from the package while they are built, so that they cannot disagree with it.
 
 ``{constants}`` lists clsplat/constants.py; ``{config} NAME`` a dataclass of clsplat/config.py; ``{command} NAME``
-is what ``clsplat NAME --help`` prints; ``{bench_kernels} FILE [WORKLOAD]`` shows the results that
-``clsplat bench kernels -o FILE`` measured, or the stages of one workload of them; ``{bench_stability} FILE`` the
-rows and charts that ``clsplat bench stability`` left in the folder of FILE.
+is what ``clsplat NAME --help`` prints; ``{presets}`` lists what each preset sets; ``{bench_kernels} FILE [WORKLOAD]``
+shows the results that ``clsplat bench kernels -o FILE`` measured, or the stages of one workload of them;
+``{bench_stability} FILE`` the rows and charts that ``clsplat bench stability`` left in the folder of FILE.
 """
 
 import ast
@@ -23,7 +23,7 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from clsplat import cli, config, constants
+from clsplat import cli, config, constants, presets
 from clsplat.bench import report
 from clsplat.bench.stability import EXPERIMENTS
 from clsplat.bench.stability import report as stability
@@ -109,6 +109,26 @@ def config_table(name: str) -> str:
     return f"{_prose(cls.__doc__ or '')}\n\n" + "\n".join(rows)
 
 
+def _flags(settings: dict[str, Any], within: str = "") -> list[str]:
+    """Settings as they are written on the command line."""
+    texts = []
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            texts += _flags(value, f"{within}{name}.")
+        else:
+            texts.append(f"--{within}{name} {value}".replace("_", "-"))
+    return texts
+
+
+def presets_table() -> str:
+    """Markdown table of the presets, with the flags that would do the same."""
+    rows = [_row("preset", "the same as"), HEADER_RULE * 2 + "|"]
+    for name in presets.PRESETS:
+        settings = presets.read_settings(presets.FOLDER / f"{name}.json")
+        rows.append(_row(_code(name), " ".join(map(_code, _flags(settings)))))
+    return "\n".join(rows)
+
+
 def help_text(command: str) -> str:
     """What ``clsplat COMMAND --help`` prints on a terminal of 100 columns without colours."""
     text = io.StringIO()
@@ -144,6 +164,15 @@ class Config(Table):
 
     def run(self) -> list[nodes.Node]:
         return self.parse(config_table(self.arguments[0]), config)
+
+
+class Presets(Table):
+    """``{presets}``"""
+
+    def run(self) -> list[nodes.Node]:
+        for name in presets.PRESETS:
+            self.env.note_dependency(str(presets.FOLDER / f"{name}.json"))
+        return self.parse(presets_table(), presets)
 
 
 class Command(SphinxDirective):
@@ -195,6 +224,7 @@ class BenchStability(SphinxDirective):
 def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("constants", Constants)
     app.add_directive("config", Config)
+    app.add_directive("presets", Presets)
     app.add_directive("command", Command)
     app.add_directive("bench_kernels", BenchKernels)
     app.add_directive("bench_stability", BenchStability)

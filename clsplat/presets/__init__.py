@@ -1,0 +1,134 @@
+"""Whole training configurations as data: the presets, JSON files beside this one, and the config.json of a run."""
+
+import json
+import sys
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from clsplat.config import TrainConfig
+from clsplat.errors import InputError
+
+FOLDER = Path(__file__).parent
+
+PRESETS = tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
+"""Names that `load_preset` knows."""
+
+DATA_PATH = "data_path"
+"""What config.json says besides the configuration: where the dataset was."""
+
+Settings = TypeVar("Settings")
+
+EXPECTED = {int: "an integer", float: "a finite number", str: "text", bool: "true or false", NoneType: "null"}
+
+
+def load_preset(name: str) -> TrainConfig:
+    """The configuration that ``--preset`` names.
+
+    Raises
+    ------
+    InputError
+        If there is no such preset.
+    """
+    if name not in PRESETS:
+        raise InputError(f"--preset: expected one of {', '.join(PRESETS)}, found {name!r}")
+    return load_config(FOLDER / f"{name}.json")
+
+
+def load_config(path: Path) -> TrainConfig:
+    """Read a configuration from a JSON file: the config.json of a run, or a part of one.
+
+    Parameters
+    ----------
+    path : Path
+        Nested as config.json is; what it leaves out has its default.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is no JSON object, if `TrainConfig` has no such setting, or if a value is not of
+        its type or none of its choices; the message names file and setting.
+    """
+    settings = read_settings(path)
+    settings.pop(DATA_PATH, None)
+    return with_settings(TrainConfig(), settings, str(path))
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """The JSON object in a file, each key of which stands there once."""
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        names = [name for name, _ in pairs]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"{path}: {name}: expected it once, found it {names.count(name)} times")
+        return dict(pairs)
+
+    try:
+        settings = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=once)
+    except OSError as error:
+        raise InputError(f"{path}: expected a configuration that can be read, found: {error.strerror}") from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: expected JSON, found: {error}") from error
+    if not isinstance(settings, dict):
+        raise InputError(f"{path}: expected a JSON object of settings, found {settings!r:.60}")
+    return settings
+
+
+def with_settings(base: Settings, settings: dict[str, Any], source: str, within: str = "") -> Settings:
+    """A configuration with some settings changed.
+
+    Parameters
+    ----------
+    base : a dataclass of clsplat.config
+    settings : dict
+        Names to values, nested as the dataclasses are; what is left out stays as in `base`.
+    source : str
+        Where the settings come from, for messages: a file, say.
+    within : str
+        The name of `base` within the whole, with its dot.
+
+    Raises
+    ------
+    InputError
+        If there is no such setting, or a value is not of its type or none of its choices.
+    """
+    hints = get_type_hints(type(base))
+    known = {field.name for field in fields(base)}  # type: ignore[arg-type]
+    for name in settings:
+        if name not in known:
+            raise InputError(
+                f"{source}: {within}{name}: expected one of {', '.join(sorted(known))}, found no such setting"
+            )
+    values: dict[str, Any] = {}
+    for name, value in settings.items():
+        where = f"{source}: {within}{name}"
+        if is_dataclass(hints[name]):
+            if not isinstance(value, dict):
+                raise InputError(f"{where}: expected an object of settings, found {value!r:.60}")
+            values[name] = with_settings(getattr(base, name), value, source, f"{within}{name}.")
+        else:
+            values[name] = _checked(value, hints[name], where)
+    return replace(base, **values)  # type: ignore[type-var]
+
+
+def _checked(value: Any, hint: Any, where: str) -> Any:
+    """A value of JSON as a setting of the type that `hint` says."""
+    choices = get_args(hint) if get_origin(hint) is not Literal else ()
+    for kind in choices or (hint,):
+        if get_origin(kind) is Literal:
+            # 1 == True == 1.0, but only one of them is the choice.
+            if any(value == choice and type(value) is type(choice) for choice in get_args(kind)):
+                return value
+        elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+            if abs(value) <= sys.float_info.max:  # neither NaN nor infinite, nor an integer that no float64 holds
+                return float(value)
+        elif type(value) is kind:
+            return value
+    expected = " or ".join(_words(kind) for kind in choices or (hint,))
+    raise InputError(f"{where}: expected {expected}, found {value!r:.60}")
+
+
+def _words(kind: Any) -> str:
+    return EXPECTED[kind] if kind in EXPECTED else ", ".join(map(repr, get_args(kind)))
