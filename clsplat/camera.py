@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat import display
 from clsplat.errors import InputError
 
 
@@ -67,6 +68,17 @@ class Camera:
     def position(self) -> NDArray[np.float64]:
         """Camera centre in world units, (3,)."""
         return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), dtype=np.float64)
+
+    def _repr_html_(self) -> str:
+        angles = np.degrees(2 * np.arctan2([self.width, self.height], [2 * self.fx, 2 * self.fy]))
+        rows = {
+            "focal lengths": f"{display.numbers([self.fx, self.fy])} px",
+            "principal point": f"{display.numbers([self.cx, self.cy])} px",
+            "field of view": f"{angles[0]:.0f}° x {angles[1]:.0f}°",
+            "stands at": display.numbers(self.position),
+            "looks along": display.numbers(self.viewmat[2, :3]),
+        }
+        return display.facts(f"Camera, {self.width} x {self.height} px", rows)
 
     @classmethod
     def look_at(cls, position: object, target: object, up: object, fx: float, width: int, height: int) -> "Camera":

@@ -125,6 +125,12 @@ def log_file(path: Path, iteration: int) -> Iterator[Callable[[dict[str, Any]], 
                     kept.append(line)
             except (json.JSONDecodeError, KeyError):  # the line that was being written when the run was killed
                 continue
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{path.parent}: expected a folder that can be written to, found: {error.strerror}"
+        ) from error
     with replacing(path) as file:
         file.writelines(f"{line}\n".encode() for line in kept)
     with path.open("a") as log:

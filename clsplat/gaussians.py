@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat import display
 from clsplat.constants import SH_DEGREE_MAX
 from clsplat.errors import InputError
 
@@ -82,6 +83,29 @@ class Gaussians:
     def arrays(self) -> dict[str, Array]:
         """The fields by name, in their order."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def _repr_html_(self) -> str:
+        title = f"{len(self):,} Gaussians"
+        if not isinstance(self.means, np.ndarray):
+            return display.facts(title, {"arrays": "on the device"})
+        rows = {"spherical harmonics": f"degree {self.sh_degree}"}
+        finite = np.logical_and.reduce([np.isfinite(a).all(tuple(range(1, a.ndim))) for a in self.arrays().values()])
+        rows["memory"] = f"{sum(a.nbytes for a in self.arrays().values()) / 1e6:.3g} MB of {self.means.dtype}"
+        if not finite.all():
+            rows["not finite"] = f"{(~finite).sum():,} of them hold NaN or infinity"
+        if not finite.any():
+            return display.facts(title, rows)
+        shown = self.take(finite)
+        first, middle, last = np.percentile(shown.means, [1, 50, 99], axis=0)
+        rows |= {"middle": display.numbers(middle), "98 % from": display.numbers(first), "to": display.numbers(last)}
+        sizes = np.log10(np.e) * shown.log_scales.mean(axis=1)
+        low, high = np.percentile(sizes, [0.5, 99.5])
+        return display.facts(
+            title,
+            rows,
+            display.histogram(shown.opacities, 0, 1, "opacity"),
+            display.histogram(sizes, low - 0.1, high + 0.1, "size: log10 of the mean standard deviation"),
+        )
 
     def validate(self) -> "Gaussians":
         """Check shapes and dtypes; return self.

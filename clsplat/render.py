@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat import reference
+from clsplat import display, reference
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
@@ -151,6 +151,9 @@ class Rendering:
         self.depth: Array | None = None
         if image.shape[2] == 4:
             self.depth = np.divide(image[:, :, 3], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+
+    def _repr_png_(self) -> bytes:
+        return display.png(self.rgb)
 
     def backward(
         self,

@@ -5,7 +5,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat import display
 from clsplat.camera import Camera
+
+THUMBNAILS = 8
+"""Photos of a scene that a notebook shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,3 +63,31 @@ class Scene:
         centres = np.array([view.camera.position for view in self.train])
         radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
         return 1.1 * radius if radius > 0 else 1.0
+
+    def _repr_html_(self) -> str:
+        views = [*self.train, *self.test]
+        rows = {
+            "photos": f"{len(self.train)} to train on, {len(self.test)} held out",
+            "sizes": ", ".join(sorted({f"{v.camera.width} x {v.camera.height}" for v in views})),
+            "masks": str(sum(v.mask is not None for v in views)),
+            "points": f"{len(self.points):,}",
+        }
+        if self.offset.any():
+            rows["offset"] = display.numbers(self.offset)
+        if not views:
+            return display.facts("Scene", rows)
+        rows["extent"] = f"{self.extent:.3g}" if self.train else ""
+        eyes = np.array([v.camera.position for v in views])
+        looks = np.array([v.camera.viewmat[2, :3] for v in views])
+        up = -np.mean([v.camera.viewmat[1, :3] for v in views], axis=0)
+        # Of the axes at right angles to up any will do; that of the first camera's right edge is the familiar one.
+        east = views[0].camera.viewmat[0, :3] - up * (views[0].camera.viewmat[0, :3] @ up) / max(up @ up, 1e-12)
+        ground = np.stack([east, np.cross(up, east)])
+        ground /= np.maximum(np.linalg.norm(ground, axis=1, keepdims=True), 1e-12)
+        held_out = np.arange(len(views)) >= len(self.train)
+        plan = display.plan(eyes @ ground.T, looks @ ground.T, held_out, self.points @ ground.T, self.colors)
+        chosen = self.train[:: -(-len(self.train) // THUMBNAILS) or 1] or self.test[:THUMBNAILS]
+        photos = "".join(display.thumbnail(view.image, view.name) for view in chosen)
+        return display.facts(
+            "Scene", rows, display.figure(plan, "cameras from above; hollow: held out"), f"<div>{photos}</div>"
+        )

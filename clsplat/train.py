@@ -56,7 +56,8 @@ def train(
     config : TrainConfig
     device : Device
     out : Path
-        Folder for checkpoint.npz, from which an interrupted run resumes, and log.jsonl, one JSON object per line.
+        Folder, made where it is missing, for checkpoint.npz, from which an interrupted run resumes, and log.jsonl,
+        one JSON object per line.
     resume : bool
         Continue from the checkpoint in `out`, to the same bits as a run that was never interrupted.
     evaluate : callable, optional

@@ -20,7 +20,7 @@ STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__i
 
 # A module imports from rows above its own only; a package is one unit.
 LAYERS = """
-    constants errors stages randomness
+    constants errors stages randomness display
     config photos
     presets
     camera gaussians lenses

@@ -105,8 +105,6 @@ def test_a_killed_run_resumes_to_the_same_bits(
 ) -> None:
     config = with_strategy(strategy)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    whole.mkdir()
-    broken.mkdir()
     expected = train(scene, config, device, whole)
 
     class Killed(Exception):
@@ -321,6 +319,13 @@ def test_a_failed_write_leaves_the_last_checkpoint(
     assert loaded.iteration == 0
     assert same(loaded.gaussians, state.gaussians)
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.npz"]
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file/out: expected a folder that can be written to, found: Not a"):
+        with log_file(tmp_path / "file" / "out" / "log.jsonl", 0):
+            pass
 
 
 def test_the_log_drops_what_a_resumed_run_repeats(tmp_path: Path) -> None:
