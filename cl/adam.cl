@@ -32,8 +32,8 @@ __kernel void adam_step(const uint total, const uint stride, const uint width, c
             for (int k = 0; k < count; ++k)
                 ((real *)&p)[k] = parameters[i + k];
             // o (1 - o) for the logit p of o, even in p
-            const real16 e = exp(-ABSOLUTE(p));
-            g += opacity_penalty * e / ((1 + e) * (1 + e)) + (scale_penalty != 0 ? scale_penalty * exp(p) : 0);
+            const real16 below = -ABSOLUTE(p), e = OF16(exp, below);
+            g += opacity_penalty * e / ((1 + e) * (1 + e)) + (scale_penalty != 0 ? scale_penalty * OF16(exp, p) : 0);
         }
         adam_update_some(&adam, rates, count, g, parameters + i, first + i, second + i);
     }

@@ -10,7 +10,8 @@
 static inline real16 adam_update(const Adam *adam, real16 rates, real16 p, real16 g, real16 *m, real16 *v) {
     *m = adam->keep1 * *m + adam->take1 * g;
     *v = adam->keep2 * *v + adam->take2 * (g * g);
-    return p - rates * (*m / (sqrt(*v * adam->inv_correction2) + adam->eps));
+    const real16 mean = *v * adam->inv_correction2;
+    return p - rates * (*m / (OF16(sqrt, mean) + adam->eps));
 }
 
 // The same for `count` < 16 parameters that lie side by side; beyond them nothing is read or written.

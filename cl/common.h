@@ -51,6 +51,19 @@ typedef int16 mask16;
 #define CLAMP(x, lo, hi) ((x) < (lo) ? (lo) : (x) > (hi) ? (hi) : (x))
 #define ABSOLUTE(x)      ((x) < 0 ? -(x) : (x))
 
+// A function of the driver on 4, 8 or 16 values, called with at most 256 bits at once: PoCL 3.0 takes Zen 4, which has
+// AVX-512, for a CPU without, but calls what was built for AVX-512, and over wider arguments its compiler crashes, hangs
+// or yields wrong code. vload16 and conversions are such functions too.
+#define IN_HALVES(type, f, x) ((type)(f((x).lo), f((x).hi)))
+#define OF4(f, x)             f(x)
+#ifdef USE_DOUBLE
+#define OF8(f, x)  IN_HALVES(real8, f, x)
+#define OF16(f, x) ((real16)(f((x).lo.lo), f((x).lo.hi), f((x).hi.lo), f((x).hi.hi)))
+#else
+#define OF8(f, x)  f(x)
+#define OF16(f, x) IN_HALVES(real16, f, x)
+#endif
+
 static inline real2 load2(const __global real *x, size_t i) {
     return (real2)(x[2 * i], x[2 * i + 1]);
 }

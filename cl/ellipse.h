@@ -6,9 +6,13 @@
 #include "power.h"
 
 #ifdef USE_DOUBLE
-#define CONVERT_REAL8 convert_double8
+#define REAL8_OF(x)   IN_HALVES(real8, convert_double4, x)
+#define INT8_OF(x)    IN_HALVES(int8, convert_int4, x)
+#define FMA8(a, b, c) ((real8)(fma((a).lo, (b).lo, (c).lo), fma((a).hi, (b).hi, (c).hi)))
 #else
-#define CONVERT_REAL8 convert_float8
+#define REAL8_OF convert_float8
+#define INT8_OF  convert_int8
+#define FMA8     fma
 #endif
 
 // r2 in the unit of 2 sigma, the slack of clsplat/constants.py included; not positive: the splat is
@@ -20,7 +24,7 @@ static inline real ellipse_r2(real opacity) {
 
 // r2 of eight splats. On CPUs a vector logarithm costs less than one scalar one.
 static inline real8 ellipse_r2_8(real8 opacity) {
-    return opacity > (real8)ALPHA_MIN ? 2 * (log(opacity / ALPHA_MIN) + EXTENT_SLACK) : (real8)0;
+    return opacity > (real8)ALPHA_MIN ? 2 * (OF8(log, opacity / ALPHA_MIN) + EXTENT_SLACK) : (real8)0;
 }
 
 // A splat's ellipse as its ranges need it; all that is expensive is done once.
@@ -60,9 +64,11 @@ static inline mask8 ellipse_ranges8(const Ellipse *e, real8 lo, real8 hi, real8 
     right = GREATER(right, lo);
     right = LESSER(right, hi);
     const real8 t_left = left * e->inv_half_height, t_right = right * e->inv_half_height;
-    const real8 rest_left = fma(-t_left, t_left, (real8)1), rest_right = fma(-t_right, t_right, (real8)1);
-    *x_min = fma((real8)e->slope, left, -sqrt(e->half_sq * GREATER(rest_left, zero)));
-    *x_max = fma((real8)e->slope, right, sqrt(e->half_sq * GREATER(rest_right, zero)));
+    const real8 one = 1, slope = e->slope;
+    const real8 rest_left = FMA8(-t_left, t_left, one), rest_right = FMA8(-t_right, t_right, one);
+    const real8 sq_left = e->half_sq * GREATER(rest_left, zero), sq_right = e->half_sq * GREATER(rest_right, zero);
+    *x_min = FMA8(slope, left, -OF8(sqrt, sq_left));
+    *x_max = FMA8(slope, right, OF8(sqrt, sq_right));
     return lo <= hi;
 }
 
@@ -82,10 +88,12 @@ static inline void pixels_between8(real8 lo, real8 hi, int size, int8 *first, in
     lo = CLAMP(lo, zero, end);
     hi = CLAMP(hi, zero - 1, end - 1);
     // Truncated, then put right: a vector's comparison is -1 where it is true.
-    *first = convert_int8(lo);
-    *first -= convert_int8(CONVERT_REAL8(*first) < lo);
-    *last = convert_int8(hi);
-    *last += convert_int8(CONVERT_REAL8(*last) > hi);
+    *first = INT8_OF(lo);
+    const mask8 above = REAL8_OF(*first) < lo;
+    *first -= INT8_OF(above);
+    *last = INT8_OF(hi);
+    const mask8 below = REAL8_OF(*last) > hi;
+    *last += INT8_OF(below);
 }
 
 #endif

@@ -75,9 +75,9 @@ typedef struct __attribute__((packed)) {
 static inline reals load_photo(const __global uchar *photo) {
     const uchar16 bytes = ((const __global Bytes *)photo)->v;
 #ifdef USE_DOUBLE
-    return convert_double16(bytes) * (1 / (real)255);
+    return OF16(convert_double4, bytes) * (1 / (real)255);
 #else
-    return convert_float16(bytes) * (1 / (real)255);
+    return OF16(convert_float8, bytes) * (1 / (real)255);
 #endif
 }
 #endif

@@ -13,7 +13,7 @@
 #define POWER_MAX 1024
 #define DEFINE_POWER(N)                                                                                              \
     static inline real##N power##N(real##N t) {                                                                      \
-        return exp2(t);                                                                                              \
+        return OF##N(exp2, t);                                                                                       \
     }
 #else
 #define POWER_MIN -126

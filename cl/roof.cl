@@ -11,19 +11,23 @@
 // Without the order to unroll PoCL keeps the values in memory, at a quarter of the speed.
 //
 // Buffers: out[items,WIDTH]; a, b, y[items count,WIDTH]
-// -DWIDTH=1|4|16   width of the vectors
+// -DWIDTH=1|4|8|16   width of the vectors
 #include "common.h"
 
 #if WIDTH == 1
 #define REALV          real
 #define LOAD(i, p)     ((p)[i])
 #define STORE(v, i, p) ((p)[i] = (v))
-#elif WIDTH == 4 || WIDTH == 16
+#elif WIDTH == 4 || WIDTH == 8
 #define REALV CONCATENATE(real, WIDTH)
 #define LOAD  CONCATENATE(vload, WIDTH)
 #define STORE CONCATENATE(vstore, WIDTH)
+#elif WIDTH == 16
+#define REALV          real16
+#define LOAD(i, p)     load16((p) + 16 * (i))
+#define STORE(v, i, p) store16((p) + 16 * (i), v)
 #else
-#error "-DWIDTH must be 1, 4 or 16"
+#error "-DWIDTH must be 1, 4, 8 or 16"
 #endif
 
 // Two multiply-adds a cycle that take four cycles each need eight at least; PoCL's exp gains up to 12.

@@ -167,6 +167,16 @@ class Device:
         """Whether work-items run on CPU cores: few of them then own large contiguous pieces of work."""
         return bool(self.cl_device.type & cl.device_type.CPU)
 
+    @cached_property
+    def function_width(self) -> int:
+        """Widest vector of floats that the driver's own functions can be called with: 16, or 8 where that crashes it.
+
+        PoCL 3.0 (LLVM 14) takes AMD's Zen 4, which has AVX-512, for a Zen 3 without, but calls functions built for
+        AVX-512 (cl/common.h, OF16). No Zen that LLVM knows under an earlier name has vectors of 16.
+        """
+        mismatched = "znver" in self.cl_device.version and self.cl_device.native_vector_width_float == 16
+        return 8 if mismatched else 16
+
     def _check_size(self, what: str, nbytes: int) -> None:
         limit = self.cl_device.max_mem_alloc_size
         if nbytes > limit:

@@ -36,10 +36,10 @@ def _best(device: Device, run: Callable[[], None], runs: int) -> float:
     return min(seconds[1:])
 
 
-def _arithmetic(device: Device, kernel: str, *scalars: float) -> float:
-    """Results per second."""
+def _arithmetic(device: Device, kernel: str, *scalars: float, width: int = 16) -> float:
+    """Results per second, on a CPU by vectors of `width`."""
     # A CPU's core wants wide vectors, a GPU scalar work-items in great number.
-    width, group = (16, 1) if device.is_cpu else (1, 256)
+    width, group = (width, 1) if device.is_cpu else (1, 256)
     items = (4 if device.is_cpu else 2048) * device.cl_device.max_compute_units
     out = device.empty("roof", items * width)
 
@@ -98,8 +98,8 @@ def measure_roof(device: Device) -> dict[str, float]:
     return {
         # x -> 0.999 x + 0.001 converges to 1.
         "fma_gflops": 2e-9 * _arithmetic(device, "roof_fma", 0.999, 0.001),
-        "exp_gops": 1e-9 * _arithmetic(device, "roof_exp"),
-        "exp2_gops": 1e-9 * _arithmetic(device, "roof_exp2"),
+        "exp_gops": 1e-9 * _arithmetic(device, "roof_exp", width=device.function_width),
+        "exp2_gops": 1e-9 * _arithmetic(device, "roof_exp2", width=device.function_width),
         "copy_gbs": 1e-9 * copy,
         "triad_gbs": 1e-9 * triad,
         "buffer_mib": size / 2**20,
