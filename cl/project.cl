@@ -20,7 +20,7 @@
 //
 // -DCHANNELS=3|4      4: the depth is composited beside RGB
 // -DANTIALIASED=0|1   opacity compensation
-// -DVIEWMAT_GRAD=0|1  the backward kernel also writes v_viewmat; needs -DGROUP, the work-group size
+// -DVIEWMAT_GRAD=0|1  the backward kernels also write v_viewmat; needs -DGROUP, the work-group size
 #include "common.h"
 #include "adam.h"
 #include "ellipse.h"
@@ -36,7 +36,7 @@
 #error "-DANTIALIASED and -DVIEWMAT_GRAD must be 0 or 1"
 #endif
 #if VIEWMAT_GRAD && (!defined(GROUP) || GROUP < 1)
-#error "-DVIEWMAT_GRAD=1 needs -DGROUP, the work-group size of project_bwd"
+#error "-DVIEWMAT_GRAD=1 needs -DGROUP, the work-group size of the backward kernels"
 #endif
 
 static inline mat3 camera_rotation(const Camera *camera) {
@@ -286,6 +286,24 @@ static inline GaussianGrad gaussian_vjp(size_t i, const Camera *camera, int sh_s
     return v;
 }
 
+#if VIEWMAT_GRAD
+// Adds up the gradient of the viewmat over the work-group, in the order of its work-items.
+static inline void sum_viewmat(const FootprintGrad *v, __local real *partial, __global real *v_viewmat) {
+    const uint lane = get_local_id(0);
+    vstore3(v->view.row0, 4 * lane, partial);
+    vstore3(v->view.row1, 4 * lane + 1, partial);
+    vstore3(v->view.row2, 4 * lane + 2, partial);
+    vstore3(v->p, 4 * lane + 3, partial);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint k = lane; k < 12; k += GROUP) {
+        real sum = 0;
+        for (uint j = 0; j < GROUP; ++j)
+            sum += partial[12 * j + k];
+        v_viewmat[12 * get_group_id(0) + k] = sum;
+    }
+}
+#endif
+
 __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
                           const __global real *means, const __global real *log_scales, const __global real *quats,
                           const __global real *logit_opacities, const __global real *extents,
@@ -319,18 +337,7 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
 
 #if VIEWMAT_GRAD
     __local real partial[12 * GROUP];
-    const uint lane = get_local_id(0);
-    vstore3(v.geometry.view.row0, 4 * lane, partial);
-    vstore3(v.geometry.view.row1, 4 * lane + 1, partial);
-    vstore3(v.geometry.view.row2, 4 * lane + 2, partial);
-    vstore3(v.geometry.p, 4 * lane + 3, partial);
-    barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint k = lane; k < 12; k += GROUP) {
-        real sum = 0;
-        for (uint j = 0; j < GROUP; ++j)
-            sum += partial[12 * j + k];
-        v_viewmat[12 * get_group_id(0) + k] = sum;
-    }
+    sum_viewmat(&v.geometry, partial, v_viewmat);
 #endif
 }
 
@@ -344,16 +351,25 @@ __kernel void project_bwd_adam(const uint n, const Camera camera, const int sh_s
                                __global real *means_1, __global real *log_scales_1, __global real *quats_1,
                                __global real *logit_opacities_1, __global real *sh_1, __global real *means_2,
                                __global real *log_scales_2, __global real *quats_2, __global real *logit_opacities_2,
-                               __global real *sh_2) {
+                               __global real *sh_2
+#if VIEWMAT_GRAD
+                               ,
+                               __global real *v_viewmat
+#endif
+) {
     const size_t i = get_global_id(0);
-    if (i >= n)
-        return;
     GaussianGrad v = {0};
-    if (extents[2 * i] > 0) {
+    if (i < n && extents[2 * i] > 0) {
         const GaussianArrays gaussians = {means, log_scales, quats, logit_opacities, sh};
         const SplatArrays splats = {conics, colors, v_means2d, v_conics, v_opacities, v_colors};
         v = gaussian_vjp(i, &camera, sh_stride, sh_degree, gaussians, splats);
     }
+#if VIEWMAT_GRAD
+    __local real partial[12 * GROUP];
+    sum_viewmat(&v.geometry, partial, v_viewmat);
+#endif
+    if (i >= n)
+        return;
     if (adam.opacity_penalty != 0 || adam.scale_penalty != 0) {
         const real4 activated = activate(load3(log_scales, i), logit_opacities[i]);
         v.logit_opacity += adam.opacity_penalty * activated.w * (1 - activated.w);

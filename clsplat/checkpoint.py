@@ -17,7 +17,10 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
 from clsplat.optim import Moments
+from clsplat.perphoto import PerPhoto
+from clsplat.poses import refined
 from clsplat.render import download, fetch
+from clsplat.scene import Scene
 from clsplat.size import Kept, Point, Search
 
 
@@ -26,7 +29,8 @@ class State:
     """All that training changes, which is what a checkpoint holds, and the scene's extent in world units.
 
     intersections: the most tiles that a Gaussian has met in a view, on the mean over all Gaussians; it bounds their
-    growth where memory does. search: for the scene's size; None where that is fixed.
+    growth where memory does. search: for the scene's size; None where that is fixed. exposures, poses: what is
+    learned about each photo, if it is.
     """
 
     iteration: int
@@ -37,6 +41,8 @@ class State:
     strategy: Strategy
     intersections: float = 0.0
     search: Search | None = None
+    exposures: PerPhoto | None = None
+    poses: PerPhoto | None = None
 
 
 def save_state(path: Path, state: State, config: TrainConfig) -> None:
@@ -48,6 +54,9 @@ def save_state(path: Path, state: State, config: TrainConfig) -> None:
     for part, gaussians in parts.items():
         arrays |= {f"{part}.{name}": array for name, array in fetch(gaussians).arrays().items()}
     arrays |= {f"statistics.{name}": download(array) for name, array in state.strategy.statistics.items()}
+    for part, learned in (("exposures", state.exposures), ("poses", state.poses)):
+        if learned:
+            arrays |= {f"{part}.{name}": array for name, array in learned.arrays().items()}
     if search := state.search:
         arrays["search"] = json.dumps({"points": search.points, "grown": search.grown, "settled": search.settled})
         if best := search.best:
@@ -60,6 +69,23 @@ def save_state(path: Path, state: State, config: TrainConfig) -> None:
             arrays |= {f"best.statistics.{name}": array for name, array in best.statistics.items()}
     with replacing(path) as file:
         np.savez(file, **arrays)
+
+
+def write_photos(path: Path, state: State, scene: Scene) -> None:
+    """photos.json: what was learned about each training photo, by name.
+
+    colours: the rows of the (3, 4) map from the scene's RGB, in [0, 1], to the photo's; viewmat: the refined one,
+    world to camera, in the dataset's coordinates.
+    """
+    content: dict[str, dict[str, Any]] = {view.name: {} for view in scene.train}
+    for view in scene.train:
+        if state.exposures:
+            content[view.name]["colours"] = state.exposures.of(view.name).tolist()
+        if state.poses:
+            camera = refined(view.camera, state.poses.of(view.name)).translated(-scene.offset)
+            content[view.name]["viewmat"] = camera.viewmat.tolist()
+    with replacing(path) as file:
+        file.write((json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
 
 
 def load_state(path: Path, extent: float, config: TrainConfig) -> State:
@@ -95,7 +121,12 @@ def load_state(path: Path, extent: float, config: TrainConfig) -> State:
             best = Moments(part("best.first"), part("best.second"))
             rows = {k: arrays[f"best.statistics.{k}"] for k in strategy.statistics}
             search.best = Kept(part("best"), best, rows)
-    return State(*numbers, gaussians, moments, strategy, float(arrays["intersections"]), search)
+    state = State(*numbers, gaussians, moments, strategy, float(arrays["intersections"]), search)
+    for name in ("exposures", "poses"):
+        learned = {k.removeprefix(f"{name}."): a for k, a in arrays.items() if k.startswith(f"{name}.")}
+        if learned:
+            setattr(state, name, PerPhoto.restored(learned))
+    return state
 
 
 def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:

@@ -104,6 +104,14 @@ class OptimConfig:
     """lambda of the loss (1 - lambda) L1 + lambda (1 - SSIM) (paper, equation 7)."""
     sh_degree_every: int = 1000
     """Iterations after which one more band of spherical harmonics is trained; fewer in short runs."""
+    exposure_lr: float = 1e-2
+    """Of the photos' exposures, at the start (that of the original's code)."""
+    exposure_lr_final: float = 1e-3
+    """At the last iteration; exponential in between."""
+    poses_lr: float = 1e-3
+    """Of the photos' poses, at the start: radians, and extents of the scene."""
+    poses_lr_final: float = 1e-5
+    """At the last iteration; exponential in between."""
 
 
 @dataclass(frozen=True)
@@ -205,6 +213,11 @@ class TrainConfig:
     max_gaussians: int | None = None
     """Hard cap, under every strategy: in no iteration are there more Gaussians. A start of more is thinned to it.
     mcmc and error grow to it, and need it."""
+    exposure: bool = False
+    """Learn an affine map of colours for each training photo, for photos of changing exposure or white balance."""
+    poses: bool = False
+    """Refine the training photos' poses: where they were not made by structure from motion, or badly. Held-out photos
+    are then evaluated twice: as posed, and with each camera aligned with the scene."""
     checkpoint_every: int = 1000
     """Iterations between two checkpoints, from which an interrupted run resumes."""
     eval_every: int = 500

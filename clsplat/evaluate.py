@@ -16,7 +16,7 @@ from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
-from clsplat.metrics import flip, psnr, ssim, to_uint8
+from clsplat.metrics import flip, psnr, psnr_fitted, ssim, to_uint8
 from clsplat.render import Color, render_views
 from clsplat.report import save_difference, save_png, write_page
 from clsplat.scene import View
@@ -77,7 +77,8 @@ def evaluate(
     Returns
     -------
     dict
-        The content of metrics.json. ``mean`` holds psnr (dB), ssim and flip: the means of the views' figures;
+        The content of metrics.json. ``mean`` holds psnr (dB), psnr_fitted (after an affine fit of the colours), ssim
+        and flip: the means of the views' figures;
         ``views`` has those of each view, its size and the paths of its pictures. None (null) stands for a PSNR
         that is infinite, as between equal images, and for FLIP where flip-evaluator is not installed.
 
@@ -101,9 +102,10 @@ def evaluate(
         save_png(out / files["truth"], view.image)
         save_png(out / files["render"], image)
         save_difference(out / files["difference"], image, view.image, view.mask)
-        metrics = {metric.__name__: metric(image, view.image, view.mask) for metric in (psnr, ssim, flip)}
-        if metrics["psnr"] == math.inf:
-            metrics["psnr"] = None
+        metrics = {
+            metric.__name__: metric(image, view.image, view.mask) for metric in (psnr, psnr_fitted, ssim, flip)
+        }
+        metrics = {name: None if value == math.inf else value for name, value in metrics.items()}
         size = {"width": view.camera.width, "height": view.camera.height}
         return {"name": view.name, **metrics, **size, **files}
 
@@ -114,7 +116,7 @@ def evaluate(
         return None if None in values else float(np.mean(values))
 
     result = {
-        "mean": {metric: mean(metric) for metric in ("psnr", "ssim", "flip")},
+        "mean": {metric: mean(metric) for metric in ("psnr", "psnr_fitted", "ssim", "flip")},
         "num_gaussians": len(gaussians),
         "sh_degree": gaussians.sh_degree,
         "mode": config.mode,

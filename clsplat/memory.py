@@ -42,6 +42,7 @@ PER_PIXEL = {
     "loss": 3 + 9 + 1,  # v_image, derivatives of SSIM, v_alpha
     "photo": 1,  # 3 bytes, and one of a mask
 }
+PER_PIXEL_EXPOSURE = 3  # the image with the colours of its photo
 PER_ROW = 3 * 416  # derivatives of SSIM: rows have margins, and end with a work-item
 
 COPIES = 4
@@ -84,6 +85,8 @@ class Footprint:
         The device is no CPU: intersections are sorted in another way.
     per_tile : bool
         ``--sort per_tile``.
+    exposure : bool
+        ``--exposure``.
     """
 
     width: int
@@ -91,13 +94,15 @@ class Footprint:
     sh_degree: int
     gpu: bool
     per_tile: bool = False
+    exposure: bool = False
 
     @classmethod
     def of(cls, scene: Scene, config: TrainConfig, device: "Device") -> "Footprint":
         """That of training on the scene's photos."""
         cameras = [view.camera for view in scene.train + scene.test]
         width, height = max(c.width for c in cameras), max(c.height for c in cameras)
-        return cls(width, height, config.init.sh_degree, not device.is_cpu, config.render.sort == "per_tile")
+        per_tile = config.render.sort == "per_tile"
+        return cls(width, height, config.init.sh_degree, not device.is_cpu, per_tile, config.exposure)
 
     def per_gaussian(self, intersections: float = INTERSECTIONS) -> float:
         """Bytes per Gaussian that meets so many tiles."""
@@ -110,7 +115,8 @@ class Footprint:
     @property
     def fixed(self) -> int:
         """Bytes that do not depend on the Gaussians."""
-        return round(REAL * ROUNDING * self.height * (self.width * sum(PER_PIXEL.values()) + PER_ROW))
+        per_pixel = sum(PER_PIXEL.values()) + self.exposure * PER_PIXEL_EXPOSURE
+        return round(REAL * ROUNDING * self.height * (self.width * per_pixel + PER_ROW))
 
     def total(self, n: int, intersections: float = INTERSECTIONS) -> int:
         """Bytes for n Gaussians, each of which meets so many tiles; one photo is on the device."""

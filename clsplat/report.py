@@ -23,7 +23,12 @@ five times as large as they are."""
 COLOR_MAP = "magma"
 """Perceptually uniform: equal steps of the difference look equally large."""
 
-METRICS = {"psnr": ("PSNR", "dB", 2, "higher"), "ssim": ("SSIM", "", 3, "higher"), "flip": ("FLIP", "", 3, "lower")}
+METRICS = {
+    "psnr": ("PSNR", "dB", 2, "higher"),
+    "psnr_fitted": ("PSNR, colours fitted", "dB", 2, "higher"),
+    "ssim": ("SSIM", "", 3, "higher"),
+    "flip": ("FLIP", "", 3, "lower"),
+}
 """Metric -> its name, unit, decimals on the page, and which direction is better."""
 
 
@@ -305,7 +310,7 @@ def _card(view: dict[str, Any], index: int) -> str:
     figures = "".join(
         f"<dt>{METRICS[metric][0]}</dt><dd>{_figure(metric, view[metric])}</dd>"
         for metric in METRICS
-        if metric == "psnr" or view[metric] is not None
+        if metric.startswith("psnr") or view[metric] is not None
     )
     size = f"width={view['width']} height={view['height']} loading=lazy"
     files = {kind: quote(view[kind]) for kind in ("truth", "render", "difference")}

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clsplat import size
-from clsplat.checkpoint import State, load_state, log_file, save_state
+from clsplat import exposure, poses, size
+from clsplat.checkpoint import State, load_state, log_file, save_state, write_photos
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.densify import STRATEGIES, Contributions, Edit
 from clsplat.errors import ClsplatError, DeviceError, InputError
@@ -142,15 +142,17 @@ def train(
             except KeyboardInterrupt:
                 save_state(out / "checkpoint.npz", state, config)
                 raise
+    if state.exposures or state.poses:
+        write_photos(out / "photos.json", state, scene)
     if not state.search:
         return fetch(state.gaussians)
     size.write_report(out / "size.json", state.search, config)
-    return size.without_useless_bands(fetch(state.gaussians), scene.train, config, device)
+    return size.without_useless_bands(fetch(state.gaussians), as_seen(scene.train, state), config, device)
 
 
 def step(state: State, iteration: int, view: View, photos: Photos, config: TrainConfig, device: "Device") -> float:
     """One iteration: render, compare, differentiate, update. Changes `state`, returns the loss."""
-    camera = view.camera
+    camera = poses.refined(view.camera, state.poses.of(view.name)) if state.poses else view.camera
     sh_degree = sh_degree_at(iteration, config.shortened(config.optim.sh_degree_every), state.gaussians.sh_degree)
     photo, mask = photos(view)
     optimizer = device if config.optimizer == "device" else None
@@ -158,7 +160,15 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
 
     run = forward(device, gaussians, camera, config.render, BACKGROUNDS[config.data.background], sh_degree)
     state.intersections = max(state.intersections, run.bins.gauss_ids.shape[0] / len(gaussians))
-    loss, v_image = stage_functions(device).l1_ssim(run.image.image, photo, config.optim.ssim_weight, mask)
+    stage, image = stage_functions(device), run.image.image
+    if state.exposures:
+        affine = state.exposures.of(view.name)
+        image = stage.exposure_fwd(image, affine)
+    loss, v_image = stage.l1_ssim(image, photo, config.optim.ssim_weight, mask)
+    progress = size.progress(iteration, config, state.search)
+    if state.exposures:
+        v_affine = stage.exposure_bwd(run.image.image, affine, v_image)
+        exposure.update(state.exposures, view.name, v_affine, progress, config.optim)
     # No kernel writes this buffer: the loss does not depend on alpha.
     v_alpha = device.scratch("v_alpha", camera.height * camera.width)
     v_splats = backward_to_splats(device, run, Image(v_image, v_alpha))
@@ -168,21 +178,30 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
         if not optimizer:
             extents, v_means2d = download(extents), download(v_means2d)
         state.strategy.observe(stage_functions(optimizer), extents, v_means2d, camera.width, camera.height)
-    progress = size.progress(iteration, config, state.search)
     settings = adam_settings(iteration, progress, state.extent, config.optim, sh_degree)
     settings = settings._replace(penalties=state.strategy.penalties(len(gaussians)))
-    moments, antialiased = (state.moments.first, state.moments.second), config.render.mode == "antialiased"
+    moments = state.moments.first, state.moments.second
+    options = {"antialiased": config.render.mode == "antialiased", "viewmat_grad": state.poses is not None}
     if optimizer:
-        update = stage_functions(device).project_bwd_adam
-        update(gaussians, moments, camera, run.splats, v_splats, settings, antialiased=antialiased)
+        v_viewmat = stage.project_bwd_adam(gaussians, moments, camera, run.splats, v_splats, settings, **options)
     else:
-        v_gaussians, _ = stage_functions(device).project_bwd(
-            gaussians, camera, sh_degree, run.splats, v_splats, antialiased=antialiased
-        )
+        v_gaussians, v_viewmat = stage.project_bwd(gaussians, camera, sh_degree, run.splats, v_splats, **options)
         stage_functions(None).adam_step(state.gaussians, fetch(v_gaussians), *moments, settings)
+    if state.poses:
+        rate = poses.rate_at(progress, config.optim)
+        poses.update(state.poses, view.name, camera, v_viewmat, rate, state.extent, config.optim)
     state.strategy.perturb(stage_functions(optimizer), state.gaussians, iteration, settings.rates["means"])
     state.iteration = iteration
     return loss
+
+
+def as_seen(views: list[View], state: State) -> list[View]:
+    """Photos as the scene itself would show them: without what was learned about each."""
+    if state.exposures:
+        views = [replace(v, image=exposure.neutral(v.image, state.exposures.of(v.name))) for v in views]
+    if state.poses:
+        views = [replace(v, camera=poses.refined(v.camera, state.poses.of(v.name))) for v in views]
+    return views
 
 
 def densify(state: State, views: list[View], config: TrainConfig, device: "Device") -> None:
@@ -201,7 +220,7 @@ def _edit(state: State, views: list[View], config: TrainConfig, device: "Device"
 
     def survey(count: int) -> Contributions:
         order = stream(config.seed, "surveyed views", state.iteration).permutation(len(views))
-        chosen = [views[i] for i in order[:count]]
+        chosen = as_seen([views[i] for i in order[:count]], state)
         return contributions(device, gaussians, chosen, config.render, BACKGROUNDS[config.data.background], sh_degree)
 
     move(state, None)
@@ -215,7 +234,7 @@ def seek_size(state: State, views: list[View], config: TrainConfig, device: "Dev
     phase = "path" if iteration in path else "growth" if iteration < path[0] and state.strategy.due(iteration) else ""
     if not search or not phase:
         return
-    training, validation = size.split(views)
+    training, validation = (as_seen(part, state) for part in size.split(views))
     trained = sh_degree_at(iteration, config.shortened(config.optim.sh_degree_every), state.gaussians.sh_degree)
     move(state, None)
     scores = size.validate(state.gaussians, validation, config, device, trained)
@@ -262,4 +281,8 @@ def initial_state(scene: Scene, config: TrainConfig) -> State:
     gaussians = initialize(scene, init, config.seed, config.max_gaussians)
     strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
     search = size.Search() if config.size == "auto" and size.can_search(scene.train) else None
-    return State(0, 0.0, scene.extent, gaussians, Moments.zeros(gaussians), strategy, search=search)
+    state = State(0, 0.0, scene.extent, gaussians, Moments.zeros(gaussians), strategy, search=search)
+    names = [view.name for view in scene.train]
+    state.exposures = exposure.start(names) if config.exposure else None
+    state.poses = poses.start(names) if config.poses else None
+    return state

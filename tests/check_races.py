@@ -119,6 +119,22 @@ def loss(device):
     np.testing.assert_allclose(v_image.get(), expected_v_image, atol=1e-12 * np.abs(expected_v_image).max())
 
 
+def exposure(device):
+    """More pixels than a work-item has, and fewer than there are work-items."""
+    rng = np.random.default_rng(0)
+    affine = rng.normal(size=(3, 4))
+    for is_cpu in (True, False):
+        device.is_cpu = is_cpu
+        for height, width in ((5, 7), (65, 64)):
+            image, v = rng.uniform(0, 1, (height, width, 3)), rng.normal(size=(height, width, 3))
+            on_device = device.upload("image", image), device.upload("v", v)
+            adjusted = ops.exposure_fwd(device, on_device[0], affine)
+            v_affine = ops.exposure_bwd(device, on_device[0], affine, on_device[1])
+            np.testing.assert_allclose(adjusted.get(), reference.exposure_fwd(image, affine), atol=1e-12)
+            np.testing.assert_allclose(v_affine, reference.exposure_bwd(image, affine, v), rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(on_device[1].get(), v, atol=1e-12)
+
+
 def adam(device):
     """Runs of both widths that end inside an array, and rows of which the last bands are not trained."""
     for is_cpu in (True, False):
@@ -150,8 +166,11 @@ def fused(device):
         ops.observe(device, arrays.extents, v_arrays.means2d, 37, 21, *sums)
         reference.observe(splats.extents, v.means2d, 37, 21, *statistics)
         step = adam_settings(3, 0.3, 1.0, OptimConfig(), sh_degree)
-        ops.project_bwd_adam(device, on_device[0], tuple(on_device[1:]), camera, arrays, v_arrays, step)
-        reference.project_bwd_adam(found[0], tuple(found[1:]), camera, splats, v, step)
+        parts, poses = (on_device[0], tuple(on_device[1:])), {"viewmat_grad": sh_degree > 0}
+        v_viewmat = ops.project_bwd_adam(device, *parts, camera, arrays, v_arrays, step, **poses)
+        v_expected = reference.project_bwd_adam(found[0], tuple(found[1:]), camera, splats, v, step, **poses)
+        if sh_degree > 0:
+            np.testing.assert_allclose(v_viewmat, v_expected, rtol=1e-7)
         for a, b in zip(sums, statistics, strict=True):
             np.testing.assert_allclose(a.get(), b, rtol=1e-12)
         for part, expected in zip(on_device, found, strict=True):
@@ -218,6 +237,7 @@ CASES = {
     "schemes": schemes,
     "scan": scan,
     "loss": loss,
+    "exposure": exposure,
     "adam": adam,
     "noise": noise,
     "fused": fused,

@@ -25,10 +25,10 @@ LAYERS = """
     presets
     camera gaussians lenses
     sfm
-    scene structs device reference metrics raytrace orbit
+    scene structs device reference perphoto metrics raytrace orbit
     ops io testing still_life memory
-    render optim densify initialize report demo
-    prune rasterization survey
+    render optim densify initialize exposure report demo
+    prune rasterization survey poses
     size
     checkpoint
     train compact
@@ -139,6 +139,7 @@ def test_no_path_of_a_machine():
 # What each file's header documents, with values it allows.
 DEFINES = {
     "adam": {},
+    "exposure": {},
     "noise": {"GATE_SLOPE": 100.0, "GATE_OPACITY": 0.005},
     "observe": {},
     "bin": {"TILE": 16, "GRADIENTS": 1},

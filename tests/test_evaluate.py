@@ -62,7 +62,7 @@ def test_figures_are_those_of_the_files(gaussians, tmp_path):
         truth, image = read(out / record["truth"]), read(out / record["render"])
         np.testing.assert_array_equal(truth, view.image)
         assert (record["name"], record["width"], record["height"]) == (view.name, view.camera.width, 24)
-        for metric in (metrics.psnr, metrics.ssim, metrics.flip):
+        for metric in (metrics.psnr, metrics.psnr_fitted, metrics.ssim, metrics.flip):
             assert record[metric.__name__] == metric(image, truth)
         # The photo was the render plus noise: nothing but the noise is left.
         assert np.abs(image.astype(int) - truth).mean() < 20

@@ -62,7 +62,7 @@ def test_what_is_predicted_is_allocated(
     if gpu:
         device.is_cpu = False  # type: ignore[misc]  # shadows the cached property
     scene = make_scene(n, width, height)
-    config = TrainConfig(iterations=6, eval_every=3, adc=FIXED_N, render=RenderConfig(sort=sort))
+    config = TrainConfig(iterations=6, eval_every=3, adc=FIXED_N, render=RenderConfig(sort=sort), exposure=gpu)
 
     def evaluate(gaussians: Gaussians) -> dict[str, float]:
         return {"mean": float(np.mean([r.rgb.mean() for r in render_views(gaussians, cameras, device=device)]))}

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from clsplat.errors import InputError
-from clsplat.metrics import flip, psnr, ssim, to_uint8
+from clsplat.metrics import flip, psnr, psnr_fitted, ssim, to_uint8
 
-METRICS = [psnr, ssim, flip]
+METRICS = [psnr, psnr_fitted, ssim, flip]
 
 
 @pytest.fixture
@@ -53,6 +53,23 @@ def test_psnr_against_scikit_image(pair):
     # A difference of one step everywhere: 20 log10(255).
     assert psnr(np.full((4, 5, 3), 8, np.uint8), np.full((4, 5, 3), 9, np.uint8)) == pytest.approx(48.1308, abs=1e-4)
     assert psnr(truth, truth) == math.inf
+
+
+def test_fitted_psnr_forgives_an_affine_map_of_the_colours_and_nothing_else(pair):
+    image, truth = pair
+    mask = np.zeros(truth.shape[:2], bool)
+    mask[:30] = True
+    calm = 60 + truth // 3  # no channel is clamped by the map
+    mapped = calm / 255 @ np.array([[0.9, 0.05, 0], [0.05, 1.1, 0], [0, 0.1, 0.8]]) + [0.05, -0.02, 0]
+    outside = np.where(mask[..., None], mapped, 0.5)
+    for other in (mapped, outside):
+        assert psnr(other, calm, mask) < 30
+        # Two roundings to 8 bits, whose errors have a variance of 1/12 each: 48.1 dB + 10 log10(12 / 2) = 55.9 dB.
+        assert psnr_fitted(other, calm, mask) > 54
+    assert psnr_fitted(outside, calm) < 30
+    # Noise is nothing that a map explains.
+    assert psnr(image, truth) <= psnr_fitted(image, truth) < psnr(image, truth) + 0.5
+    assert math.isfinite(psnr_fitted(np.zeros_like(truth), truth))
 
 
 def test_ssim_against_its_definition(pair):

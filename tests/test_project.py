@@ -115,8 +115,13 @@ def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degr
     uploaded = [type(a)(*(any_device.upload("splats", x) for x in a)) for a in (splats, v_splats)]
     fused, separate = ([upload(any_device, part) for part in parts] for _ in range(2))
 
-    ops.project_bwd_adam(any_device, fused[0], tuple(fused[1:]), camera, *uploaded, step, antialiased=antialiased)
-    v, _ = ops.project_bwd(any_device, separate[0], camera, degree, *uploaded, antialiased=antialiased)
+    # The gradient of the viewmat comes along on request; without it, the kernel is another.
+    options = {"antialiased": antialiased, "viewmat_grad": degree == stored}
+    v_fused = ops.project_bwd_adam(any_device, fused[0], tuple(fused[1:]), camera, *uploaded, step, **options)
+    v, v_separate = ops.project_bwd(any_device, separate[0], camera, degree, *uploaded, **options)
+    assert (v_fused is not None) == options["viewmat_grad"]
+    if v_fused is not None:
+        assert_matches("v_viewmat", v_fused, v_separate, DOUBLE if any_device.real == np.float64 else FLOAT)
     ops.adam_step(any_device, separate[0], v, *separate[1:], step)
     twin = [part.astype(np.float64) for part in parts]
     reference.project_bwd_adam(twin[0], tuple(twin[1:]), camera, splats, v_splats, step, antialiased=antialiased)

@@ -59,11 +59,15 @@ def test_side_by_side_holds_both_pictures(tmp_path):
 
 def test_page_escapes_what_it_is_given_and_puts_equal_images_last(tmp_path):
     views = [
-        {"name": f"<{k}>", "psnr": psnr, "ssim": 0.5, "flip": None, "width": 4, "height": 3}
+        {"name": f"<{k}>", "psnr": psnr, "psnr_fitted": psnr, "ssim": 0.5, "flip": None, "width": 4, "height": 3}
         | {kind: f'{kind}/"{k}" #<.png' for kind in ("truth", "render", "difference")}
         for k, psnr in enumerate([None, 31.25, 20.0, -1.5])
     ]
-    result = {"mean": {"psnr": None, "ssim": 0.5, "flip": None}, "num_gaussians": 1234567, "sh_degree": 2}
+    result = {
+        "mean": {"psnr": None, "psnr_fitted": None, "ssim": 0.5, "flip": None},
+        "num_gaussians": 1234567,
+        "sh_degree": 2,
+    }
     result |= {"mode": "classic", "resolution": "4x3", "device": "<PoCL> & CPU", "views": views}
     write_page(tmp_path / "index.html", result)
     text = (tmp_path / "index.html").read_text(encoding="utf-8")

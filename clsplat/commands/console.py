@@ -57,5 +57,7 @@ def moved(gaussians: "Gaussians", by: Any) -> "Gaussians":
 
 def say_scores(report: dict[str, Any], out: Path) -> None:
     """Tell the mean figures and where the page is."""
-    mean = ", ".join(f"{name.upper()} {value:.4g}" for name, value in report["mean"].items() if value is not None)
+    from clsplat.report import METRICS
+
+    mean = ", ".join(f"{METRICS[name][0]} {value:.4g}" for name, value in report["mean"].items() if value is not None)
     say(f"held-out photos: {mean}; page: {out / 'index.html'}")

@@ -82,6 +82,7 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
 
     from clsplat.evaluate import evaluate, mean_metrics
     from clsplat.io import save_gaussians
+    from clsplat.poses import aligned
     from clsplat.report import training_curve
     from clsplat.size import can_search, size_chart, split
     from clsplat.train import train
@@ -123,6 +124,14 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
     if scene.test:
         report = evaluate(gaussians, scene.test, out / "eval", config.render, device, background=background)
         say_scores(report, out / "eval")
+    if scene.test and config.poses:
+        say("aligning the held-out photos' cameras with the scene")
+        posed = [
+            aligned(gaussians, view, scene.extent, config.optim, config.render, device, background)
+            for view in scene.test
+        ]
+        report = evaluate(gaussians, posed, out / "eval_aligned", config.render, device, background=background)
+        say_scores(report, out / "eval_aligned")
     return gaussians
 
 

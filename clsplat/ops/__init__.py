@@ -3,6 +3,7 @@
 from clsplat.ops.adam import adam_step
 from clsplat.ops.bin import bin_splats
 from clsplat.ops.composite import composite_bwd, composite_fwd
+from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
@@ -20,6 +21,8 @@ __all__ = [
     "composite_bwd",
     "composite_fwd",
     "exclusive_scan",
+    "exposure_bwd",
+    "exposure_fwd",
     "l1_ssim",
     "observe",
     "project_bwd",

@@ -109,14 +109,21 @@ def project_bwd(
         "ANTIALIASED": int(antialiased),
         "VIEWMAT_GRAD": int(viewmat_grad),
     }
-    if not viewmat_grad:
-        device.launch("project", "project_bwd", (n,), arguments, defines=defines)
-        return v, None
+    return v, _backward(device, "project_bwd", n, arguments, defines)
+
+
+def _backward(
+    device: Device, kernel: str, n: int, arguments: list[Any], defines: dict[str, int]
+) -> np.ndarray[Any, Any] | None:
+    """Launch a backward kernel; the gradient with respect to the viewmat, if it is defined to write that."""
+    if not defines["VIEWMAT_GRAD"]:
+        device.launch("project", kernel, (n,), arguments, defines=defines)
+        return None
     groups = -(-n // VIEWMAT_GROUP)
     partial = device.empty("v_viewmat", (groups, 12))
     device.launch(
         "project",
-        "project_bwd",
+        kernel,
         (groups * VIEWMAT_GROUP,),
         [*arguments, partial],
         defines=defines | {"GROUP": VIEWMAT_GROUP},
@@ -126,7 +133,7 @@ def project_bwd(
     v_viewmat = np.zeros((4, 4))
     v_viewmat[:3, :3] = total[:9].reshape(3, 3)
     v_viewmat[:3, 3] = total[9:]
-    return v, v_viewmat
+    return v_viewmat
 
 
 def project_bwd_adam(
@@ -139,7 +146,8 @@ def project_bwd_adam(
     step: AdamStep,
     *,
     antialiased: bool = False,
-) -> None:
+    viewmat_grad: bool = False,
+) -> np.ndarray[Any, Any] | None:
     """`project_bwd` and `adam_step` in one pass over the Gaussians, in place; arguments as theirs.
 
     Parameters
@@ -147,21 +155,26 @@ def project_bwd_adam(
     moments : (first, second)
     step : AdamStep
         Its degree of the spherical harmonics is that of `project_fwd`.
+
+    Returns
+    -------
+    v_viewmat : (4, 4) or None
+        As `project_bwd`.
     """
     fields = [splats.extents, splats.conics, splats.colors, *v_splats]
     arrays = [array for part in (gaussians, *moments) for array in part.arrays().values()]
-    device.launch(
-        "project",
-        "project_bwd_adam",
-        (len(gaussians),),
-        [
-            len(gaussians),
-            camera_struct(camera, device.real),
-            gaussians.sh.shape[1],
-            step.sh_degree,
-            adam_struct(step, device.real),
-            *fields,
-            *arrays,
-        ],
-        defines={"CHANNELS": splats.colors.shape[1], "ANTIALIASED": int(antialiased), "VIEWMAT_GRAD": 0},
-    )
+    arguments = [
+        len(gaussians),
+        camera_struct(camera, device.real),
+        gaussians.sh.shape[1],
+        step.sh_degree,
+        adam_struct(step, device.real),
+        *fields,
+        *arrays,
+    ]
+    defines = {
+        "CHANNELS": splats.colors.shape[1],
+        "ANTIALIASED": int(antialiased),
+        "VIEWMAT_GRAD": int(viewmat_grad),
+    }
+    return _backward(device, "project_bwd_adam", len(gaussians), arguments, defines)

@@ -3,6 +3,7 @@
 from clsplat.reference.adam import adam_step
 from clsplat.reference.bin import bin_splats
 from clsplat.reference.composite import composite_bwd, composite_fwd
+from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
@@ -20,6 +21,8 @@ __all__ = [
     "composite_bwd",
     "composite_fwd",
     "exclusive_scan",
+    "exposure_bwd",
+    "exposure_fwd",
     "l1_ssim",
     "observe",
     "project_bwd",

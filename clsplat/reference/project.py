@@ -207,7 +207,11 @@ def project_bwd_adam(
     step: AdamStep,
     *,
     antialiased: bool = False,
-) -> None:
+    viewmat_grad: bool = False,
+) -> Array | None:
     """`project_bwd`, then `adam_step`; arguments as of `clsplat.ops.project_bwd_adam`."""
-    v, _ = project_bwd(gaussians, camera, step.sh_degree, splats, v_splats, antialiased=antialiased)
+    v, v_viewmat = project_bwd(
+        gaussians, camera, step.sh_degree, splats, v_splats, antialiased=antialiased, viewmat_grad=viewmat_grad
+    )
     adam_step(gaussians, v, *moments, step)
+    return v_viewmat

@@ -1,0 +1,59 @@
+"""A few numbers per training photo beside the scene, with an Adam of their own on the host."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config import OptimConfig
+
+Array = NDArray[Any]
+
+
+@dataclass
+class PerPhoto:
+    """Parameters of V photos.
+
+    names: of the photos; values (V, ...): the parameters; first, second (V, ...): Adam's moments of the gradients;
+    steps (V,): how often each photo's were updated, by which its moments are corrected.
+    """
+
+    names: list[str]
+    values: Array
+    first: Array
+    second: Array
+    steps: Array
+
+    @classmethod
+    def start(cls, names: list[str], value: Array, shape: tuple[int, ...]) -> "PerPhoto":
+        """The same value for all photos; `shape` is that of a photo's gradient."""
+        v = len(names)
+        values = np.repeat(np.asarray(value, np.float64)[None], v, axis=0)
+        return cls(names, values, np.zeros((v, *shape)), np.zeros((v, *shape)), np.zeros(v, np.int64))
+
+    def of(self, name: str) -> Array:
+        """A photo's parameters, a view of them."""
+        values: Array = self.values[self.names.index(name)]
+        return values
+
+    def step(self, name: str, gradient: Array, rate: Any, config: OptimConfig) -> Array:
+        """A photo's step of Adam (Kingma and Ba 2015, algorithm 1), which the caller adds; changes the moments."""
+        i = self.names.index(name)
+        self.steps[i] += 1
+        self.first[i] += (1 - config.beta1) * (gradient - self.first[i])
+        self.second[i] += (1 - config.beta2) * (gradient**2 - self.second[i])
+        mean = self.first[i] / (1 - config.beta1 ** self.steps[i])
+        square = self.second[i] / (1 - config.beta2 ** self.steps[i])
+        step: Array = -rate * mean / (np.sqrt(square) + config.eps)
+        return step
+
+    def arrays(self) -> dict[str, Array]:
+        """The fields as arrays, for a checkpoint."""
+        return {**vars(self), "names": np.array(self.names)}
+
+    @classmethod
+    def restored(cls, arrays: dict[str, Array]) -> "PerPhoto":
+        """What `arrays` gave."""
+        numbers = (arrays[name] for name in ("values", "first", "second", "steps"))
+        return cls([str(name) for name in arrays["names"]], *numbers)

@@ -1,0 +1,101 @@
+"""Stage exposure: in numbers, against the twin, and against central differences; then its parameters per photo."""
+
+import numpy as np
+import pytest
+from tolerances import DOUBLE, FLOAT
+
+from clsplat import exposure, ops, reference
+from clsplat.config import OptimConfig
+from clsplat.testing import assert_matches, gradcheck
+
+# One pixel; less than, and more than what a work-item has, on a CPU and on a GPU.
+SIZES = [(1, 1), (5, 7), (64, 64), (65, 64), (97, 131)]
+
+
+def inputs(height, width):
+    """Image, map and gradient, exact in single precision."""
+    rng = np.random.default_rng(height)
+    arrays = rng.uniform(0, 1, (height, width, 3)), rng.normal(size=(3, 4)), rng.normal(size=(height, width, 3))
+    return [a.astype(np.float32).astype(np.float64) for a in arrays]
+
+
+def by_kernel(device, image, affine, v_image):
+    x, v = device.upload("image", image), device.upload("v", v_image)
+    adjusted = ops.exposure_fwd(device, x, affine)
+    v_affine = ops.exposure_bwd(device, x, affine, v)
+    np.testing.assert_array_equal(x.get(), image.astype(device.real))
+    return adjusted.get(), v.get(), v_affine
+
+
+def by_twin(image, affine, v_image):
+    v = v_image.copy()
+    adjusted = reference.exposure_fwd(image, affine)
+    v_affine = reference.exposure_bwd(image, affine, v)
+    return adjusted, v, v_affine
+
+
+def test_in_numbers(any_device):
+    """Channels are mixed by rows, then shifted."""
+    image = np.array([[[1.0, 2.0, 3.0]]])
+    affine = np.array([[1.0, 10.0, 100.0, 0.5], [0, 0, 2, 0], [0, 0, 0, -1]])
+    v = np.array([[[1.0, 2.0, 4.0]]])
+    for adjusted, v_image, v_affine in (by_twin(image, affine, v), by_kernel(any_device, image, affine, v)):
+        np.testing.assert_array_equal(adjusted, [[[321.5, 6, -1]]])
+        np.testing.assert_array_equal(v_image, [[[1, 10, 104]]])
+        np.testing.assert_array_equal(v_affine, [[1, 2, 3, 1], [2, 4, 6, 2], [4, 8, 12, 4]])
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_matches_twin(any_device, height, width):
+    check(any_device, height, width)
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_matches_twin_as_cpu_and_gpu(configured_device, height, width):
+    check(configured_device, height, width)
+
+
+def check(device, height, width):
+    given = inputs(height, width)
+    tolerances = DOUBLE if device.real == np.float64 else FLOAT
+    for name, found, expected in zip(
+        ("image", "v_image", "v_affine"), by_kernel(device, *given), by_twin(*given), strict=True
+    ):
+        assert_matches(name, found, expected, tolerances)
+
+
+def test_gradients_by_central_differences(device64):
+    image, affine, v = inputs(9, 11)
+    _, v_image, v_affine = by_kernel(device64, image, affine, v)
+    gradcheck(
+        lambda image, affine: float((by_kernel(device64, image, affine, v)[0] * v).sum()),
+        {"image": image, "affine": affine},
+        {"image": v_image, "affine": v_affine},
+    )
+
+
+def test_photos_find_their_exposures_and_the_mean_stays():
+    """Descent on |A x + b - y|^2 for photos of three gains: their ratios are found, and the mean map is none."""
+    rng = np.random.default_rng(0)
+    image = rng.uniform(0, 1, (8, 8, 3))
+    gains = {"a.png": 0.8, "b.png": 1.0, "c.png": 1.2}
+    exposures = exposure.start(list(gains))
+    config = OptimConfig()
+    for k in range(1500):
+        name = list(gains)[k % 3]
+        affine = exposures.of(name)
+        v = 2 * (reference.exposure_fwd(image, affine) - gains[name] * image) / image.size
+        exposure.update(exposures, name, reference.exposure_bwd(image, affine, v), k / 1500, config)
+        np.testing.assert_allclose(exposures.values.mean(axis=0), exposure.IDENTITY, atol=1e-12)
+    for name, gain in gains.items():
+        expected = np.hstack([gain * np.eye(3), np.zeros((3, 1))])
+        # Half a step of the last rate, and what is left of the way there.
+        np.testing.assert_allclose(exposures.of(name), expected, atol=0.01)
+
+
+def test_a_photo_is_seen_as_the_scene_would_show_it():
+    photo = np.random.default_rng(0).integers(20, 200, (4, 5, 3), dtype=np.uint8)
+    affine = np.array([[1.1, 0.02, 0, 0.01], [0, 0.9, 0.01, 0], [0, 0, 1.05, -0.02]])
+    neutral = exposure.neutral(photo, affine)
+    back = 255 * reference.exposure_fwd(neutral / 255, affine)
+    np.testing.assert_allclose(back, photo, atol=0.6)  # of 255: half a step of rounding, times the gains
