@@ -1,4 +1,4 @@
-// How many pairs of a splat and a pixel there are: for `clsplat bench kernels`, no stage of the pipeline.
+// How many pairs of a splat and a pixel there are: what an image costs, for the viewer and for `clsplat bench kernels`.
 //
 // A pair is evaluated if the pixel, not finished yet, lies in the box of the splat's extents and in a tile whose list
 // holds the splat; it is accepted if it is drawn: alpha >= ALPHA_MIN, and the transmittance behind it stays above

@@ -27,25 +27,25 @@ LAYERS = """
     sfm
     scene structs device reference perphoto metrics raytrace orbit
     ops io testing still_life memory
-    render optim densify initialize exposure report demo
+    page render optim densify initialize exposure report demo
     prune rasterization survey poses
     size
     checkpoint
     train compact
     evaluate
-    bench viewer commands
+    bench viewer
+    commands
     cli
     __main__
 """.strip().splitlines()
 LAYER = {unit: depth for depth, row in enumerate(LAYERS) for unit in row.split()}
 
 # Kernels of `clsplat bench kernels`, no stages: nothing is rendered or trained by them, and tests/test_bench.py is
-# where they are checked. roof measures the device's limits, which no equation describes; count finds how many pairs a
-# view has.
-BENCH_KERNELS = {"count", "roof"}
+# where they are checked. roof measures the device's limits, which no equation describes.
+BENCH_KERNELS = {"roof"}
 
 # Where a foreign package may be imported at all, whose absence or weight the rest must not feel.
-ONLY_IN = {"pyopencl": {"device", "ops"}, "pycolmap": {"sfm", "lenses"}}
+ONLY_IN = {"pyopencl": {"device", "ops"}, "pycolmap": {"sfm", "lenses"}, "viser": {"viewer"}}
 
 
 def imports_of(path):

@@ -1,4 +1,4 @@
-"""`clsplat bench`: counts by brute force, what the micro-benchmarks compute, and that every figure shown is the one
+"""`clsplat bench`: what the micro-benchmarks compute, and that every figure shown is the one
 measured. Nothing here depends on how fast anything is."""
 
 import json
@@ -18,16 +18,14 @@ from clsplat.bench import roof
 from clsplat.bench.environment import commit
 from clsplat.bench.kernels import STILL, _watched, bench_kernels, stage_bytes
 from clsplat.bench.report import chart_title, details, scaling_chart, summary
-from clsplat.bench.workloads import DEFAULT, count_pairs, from_files, scaling_names, synthetic
+from clsplat.bench.workloads import DEFAULT, from_files, scaling_names, synthetic
 from clsplat.cli import main
 from clsplat.config import DataConfig, RenderConfig
-from clsplat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.io import save_gaussians
 from clsplat.optim import Moments, adam_settings
 from clsplat.render import forward, upload
-from clsplat.stages import Splats
 from clsplat.testing import synthetic_scene
 
 STAGES = ("project_fwd", "bin_splats", "composite_fwd", "l1_ssim", "composite_bwd", "observe", "project_bwd_adam")
@@ -49,54 +47,10 @@ def results(device):
         return bench_kernels([synthetic("300-40x32"), synthetic("200-56x24")], RenderConfig(), device, 3)
 
 
-def brute_force_pairs(splats, bins):
-    """Evaluated and accepted pairs per pixel: every splat against every pixel, in NumPy."""
-    height, width, size = bins.height, bins.width, bins.tile_size
-    y, x = np.mgrid[:height, :width]
-    tile = y // size * -(-width // size) + x // size
-    listed = np.zeros((len(bins.tile_ranges), len(splats.depths)), dtype=bool)
-    for t, (begin, end) in enumerate(bins.tile_ranges):
-        listed[t, bins.gauss_ids[begin:end]] = True
-    evaluated, accepted = np.zeros((2, height, width), dtype=int)
-    transmittance, live = np.ones((height, width)), np.ones((height, width), dtype=bool)
-    shown = splats.extents[:, 0] > 0
-    for g in np.flatnonzero(shown)[np.argsort(splats.depths[shown], kind="stable")]:
-        dx, dy = x + 0.5 - splats.means2d[g, 0], y + 0.5 - splats.means2d[g, 1]
-        a, b, c = splats.conics[g]
-        sigma = (a * dx**2 + c * dy**2) / 2 + b * dx * dy
-        alpha = np.minimum(splats.opacities[g] * np.exp(-sigma), ALPHA_MAX)
-        box = (abs(dx) <= splats.extents[g, 0]) & (abs(dy) <= splats.extents[g, 1])
-        evaluated += live & box & listed[tile, g]
-        reached = live & (alpha >= ALPHA_MIN)
-        behind = transmittance * (1 - alpha)
-        drawn = reached & (behind > TRANSMITTANCE_MIN)
-        accepted += drawn
-        live &= ~reached | drawn
-        transmittance = np.where(drawn, behind, transmittance)
-    return evaluated, accepted, live
-
-
-@pytest.mark.parametrize("tile_size", [8, 16])
-def test_pairs_are_those_of_brute_force(device64, tile_size):
-    gaussians, camera = synthetic_scene(300, seed=3)
-    gaussians.logit_opacities[:] += 1
-    gaussians.logit_opacities[::4] = 9  # clamped at ALPHA_MAX near their centres
-    config = RenderConfig(tile_size=tile_size)
-    run = forward(device64, upload(device64, gaussians), camera, config, np.zeros(3), 0)
-    splats = Splats(*(array.get() for array in run.splats))
-    bins = reference.bin_splats(splats, camera.width, camera.height, tile_size)
-    evaluated, accepted, live = brute_force_pairs(splats, bins)
-    assert 0.1 < live.mean() < 0.9, "the scene must have pixels that stop and pixels that do not"
-    assert (evaluated > accepted).mean() > 0.5, "boxes must hold pairs that are not drawn"
-    found = count_pairs(device64, run.splats, run.bins)
-    np.testing.assert_array_equal(found[0], evaluated)
-    np.testing.assert_array_equal(found[1], accepted)
-
-
 def test_the_reference_workload_is_what_the_figures_are_about(device):
     workload = synthetic("100k-640x480")
     run = forward(device, upload(device, workload.gaussians), workload.view.camera, RenderConfig(), np.zeros(3), 0)
-    _, accepted = count_pairs(device, run.splats, run.bins)
+    accepted = ops.count_pairs(device, run.splats, run.bins)[1].get()
     # Rounding moves single pairs; the scene was tuned to 62.0 pairs per pixel and 0.365 M intersections.
     assert accepted.mean() == pytest.approx(62.0, abs=0.2)
     assert run.bins.gauss_ids.shape[0] == pytest.approx(365_000, rel=2e-3)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clsplat import ops
 from clsplat.bench.environment import describe
 from clsplat.bench.roof import measure_roof
-from clsplat.bench.workloads import Workload, count_pairs
+from clsplat.bench.workloads import Workload
 from clsplat.checkpoint import State
 from clsplat.config import BACKGROUNDS, OptimConfig, RenderConfig, TrainConfig
 from clsplat.densify import STRATEGIES
@@ -143,7 +143,7 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
     config = TrainConfig(render=render, optim=STILL)
     background = BACKGROUNDS[config.data.background]
     run = forward(device, upload(device, gaussians), view.camera, render, background, gaussians.sh_degree)
-    evaluated, accepted = (int(a.sum(dtype=np.uint64)) for a in count_pairs(device, run.splats, run.bins))
+    evaluated, accepted = (int(a.get().sum(dtype=np.uint64)) for a in ops.count_pairs(device, run.splats, run.bins))
     counts = {
         "visible": int((run.splats.extents.get()[:, 0] > 0).sum()),
         "intersections": int(run.bins.gauss_ids.shape[0]),

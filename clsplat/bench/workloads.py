@@ -1,22 +1,16 @@
-"""What is timed: Gaussians and a view of them, synthetic or from files; and how many pairs the view has."""
+"""What is timed: Gaussians and a view of them, synthetic or from files."""
 
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config import DataConfig, Mode
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.scene import View
-from clsplat.stages import Bins, Splats
-
-if TYPE_CHECKING:
-    from clsplat.device import Device
 
 DEFAULT = ("10k-640x480", "100k-640x480", "1M-640x480", "100k-1280x720")
 """What is timed unless told otherwise."""
@@ -131,26 +125,3 @@ def from_files(scene: Path, cameras: Path, views: int, data: DataConfig) -> list
         Workload(f"{scene.stem}: {dataset.train[i].name}", gaussians, dataset.train[i], dataset.extent, mode)
         for i in chosen
     ]
-
-
-def count_pairs(device: "Device", splats: Splats, bins: Bins) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """Pairs of a splat and a pixel.
-
-    Parameters
-    ----------
-    splats : Splats
-    bins : Bins of the same splats
-
-    Returns
-    -------
-    evaluated : (H, W) uint32
-        Splats of the tile's list in whose box of extents the pixel lies, until the pixel is finished.
-    accepted : (H, W) uint32
-        Those that are drawn.
-    """
-    counts: list[Any] = [device.empty("pairs", (bins.height, bins.width), np.uint32) for _ in range(2)]
-    geometry = [splats.means2d, splats.conics, splats.extents, splats.opacities, bins.gauss_ids, bins.tile_ranges]
-    arguments = [bins.width, bins.height, *geometry, *counts]
-    defines = {"TILE": bins.tile_size}
-    device.launch("count", "count_pairs", (bins.height * bins.width,), arguments, defines=defines)
-    return counts[0].get(), counts[1].get()

@@ -3,6 +3,7 @@
 from clsplat.ops.adam import adam_step
 from clsplat.ops.bin import bin_splats
 from clsplat.ops.composite import composite_bwd, composite_fwd
+from clsplat.ops.count import count_pairs
 from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.noise import add_noise
@@ -20,6 +21,7 @@ __all__ = [
     "bin_splats",
     "composite_bwd",
     "composite_fwd",
+    "count_pairs",
     "exclusive_scan",
     "exposure_bwd",
     "exposure_fwd",

@@ -3,6 +3,7 @@
 from clsplat.reference.adam import adam_step
 from clsplat.reference.bin import bin_splats
 from clsplat.reference.composite import composite_bwd, composite_fwd
+from clsplat.reference.count import count_pairs
 from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.noise import add_noise
@@ -20,6 +21,7 @@ __all__ = [
     "bin_splats",
     "composite_bwd",
     "composite_fwd",
+    "count_pairs",
     "exclusive_scan",
     "exposure_bwd",
     "exposure_fwd",

@@ -25,6 +25,7 @@ class Hit(NamedTuple):
     dy: Array
     alpha: Array  # not clamped, 0 where the splat is not drawn
     before: Array  # transmittance in front of the splat
+    live: NDArray[np.bool_]  # where no splat in front has finished the pixel
 
 
 def hits(
@@ -49,13 +50,13 @@ def hits(
             a, b, c = splats.conics[g]
             sigma = 0.5 * (a * dx**2 + c * dy**2) + b * dx * dy
             alpha = splats.opacities[g] * np.exp(-sigma)
-            before = transmittance[box].copy()
+            before, was_live = transmittance[box].copy(), live[box].copy()
             behind = before * (1 - np.minimum(alpha, ALPHA_MAX))
-            reached = live[box] & (alpha >= ALPHA_MIN) & (sigma >= 0)
+            reached = was_live & (alpha >= ALPHA_MIN) & (sigma >= 0)
             drawn = reached & (behind > transmittance_min)
             live[box] &= ~reached | drawn
             transmittance[box] = np.where(drawn, behind, before)
-            yield Hit(int(g), box, dx, dy, np.where(drawn, alpha, 0), before)
+            yield Hit(int(g), box, dx, dy, np.where(drawn, alpha, 0), before, was_live)
 
 
 def composite_fwd(splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto") -> Image:

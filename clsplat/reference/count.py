@@ -1,0 +1,20 @@
+"""Twin of the stage count: what compositing would meet, counted."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.reference.composite import hits
+from clsplat.stages import Bins, Splats
+
+Array = NDArray[Any]
+
+
+def count_pairs(splats: Splats, bins: Bins) -> tuple[Array, Array]:
+    """Pairs of a splat and a pixel; arguments and result as `clsplat.ops.count_pairs`."""
+    evaluated, accepted = np.zeros((2, bins.height, bins.width), np.uint32)
+    for hit in hits(splats, bins, np.empty(evaluated.shape)):
+        evaluated[hit.box] += hit.live
+        accepted[hit.box] += hit.alpha > 0
+    return evaluated, accepted
