@@ -13,6 +13,7 @@ from clsplat.commands.console import say
 from clsplat.commands.files import Devices, Export, Sfm
 from clsplat.commands.pictures import Eval, Render
 from clsplat.commands.training import Demo, Train
+from clsplat.commands.viewing import View
 from clsplat.errors import ClsplatError
 
 BENCHMARKS = (
@@ -32,7 +33,7 @@ class Bench:
         self.what.run()
 
 
-COMMANDS = Devices | Sfm | Train | Eval | Render | Export | Compact | Demo | Bench
+COMMANDS = Devices | Sfm | Train | Eval | Render | View | Export | Compact | Demo | Bench
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -1,13 +1,16 @@
 """Camera paths: an orbit around what the training cameras look at; viewpoints for a scene without cameras."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.camera import Camera, focus_point
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+
+Array = NDArray[Any]
 
 FULL_CIRCLE_GAP = math.pi / 2
 """Where the photos leave out more of the circle than this, in radians, the path swings over the rest instead of
@@ -24,6 +27,12 @@ the field of view below spans 1.7 radii to either side: the scene and some of wh
 FIELD_OF_VIEW = math.pi / 3
 """Of `surround`, across the longer edge, in radians: that of a phone's or a compact camera's standard lens is 60 to
 70 degrees."""
+
+OVERVIEW_HEIGHT = math.radians(20)
+"""Of `overview` above the horizon, in radians: as a person looks at a table."""
+
+OVERVIEW_SIZE = (1280, 720)
+"""Of `overview`, in pixels."""
 
 
 def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[Camera]:
@@ -55,10 +64,7 @@ def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[C
     centre = focus_point(cameras)
     if frames < 1:
         raise InputError(f"frames: expected at least 1, found {frames}")
-    ups = np.array([-camera.viewmat[1, :3] for camera in cameras])
-    up = ups.mean(axis=0)
-    up = up if np.linalg.norm(up) > 1e-3 else ups[0]  # as many upside down as not: the first decides
-    up /= np.linalg.norm(up)
+    up = _up(cameras)
 
     arms = np.array([camera.position for camera in cameras]) - centre
     heights = arms @ up
@@ -91,8 +97,7 @@ def surround(gaussians: Gaussians, count: int, width: int, height: int) -> list[
 
     At each of `STATIONS` the directions are spread evenly over the sphere (a Fibonacci lattice, turned from one
     station to the next), since nothing says where up is: some will look at the scene from below, or stand inside of
-    something. The scene's centre is the median of the Gaussians' positions by opacity, its radius the median distance
-    from there: a background far away moves neither.
+    something.
 
     Parameters
     ----------
@@ -108,10 +113,7 @@ def surround(gaussians: Gaussians, count: int, width: int, height: int) -> list[
     list of lists of Camera
         Per station. The images' upper edge is towards -y, where most scenes of photogrammetry have their sky.
     """
-    means, weights = gaussians.means.astype(np.float64), gaussians.opacities.astype(np.float64)
-    centre = np.array([_median(means[:, axis], weights) for axis in range(3)])
-    radius = _median(np.linalg.norm(means - centre, axis=1), weights)
-    radius = radius if radius > 0 else float(np.exp(gaussians.log_scales.max()))
+    centre, radius = _bounds(gaussians)
     fx = max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2)
     y = 1 - (2 * np.arange(count) + 1) / count
 
@@ -123,6 +125,53 @@ def surround(gaussians: Gaussians, count: int, width: int, height: int) -> list[
         return [Camera.look_at(eye, eye + gaze * (eye - centre), (0, -1, 0), fx, width, height) for eye in eyes]
 
     return [look(station) for station in range(len(STATIONS))]
+
+
+class Viewpoint(NamedTuple):
+    """Where a scene is first looked at from: a camera; the focus (3,), what there is to look at; and what is up (3,),
+    a unit vector."""
+
+    camera: Camera
+    focus: Array
+    up: Array
+
+
+def first_photo(cameras: list[Camera]) -> Viewpoint:
+    """The first of a scene's cameras.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    return Viewpoint(cameras[0], focus_point(cameras), _up(cameras))
+
+
+def overview(gaussians: Gaussians) -> Viewpoint:
+    """A first look at a scene of which no cameras are known: from before it and a little above, `FIELD_OF_VIEW`
+    across the shorter edge of the picture. Up is -y, as in most scenes of photogrammetry."""
+    centre, radius = _bounds(gaussians)
+    up = np.array([0.0, -1.0, 0.0])
+    eye = centre + STATIONS[0][0] * radius * (math.sin(OVERVIEW_HEIGHT) * up - [0, 0, math.cos(OVERVIEW_HEIGHT)])
+    fx = OVERVIEW_SIZE[1] / 2 / math.tan(FIELD_OF_VIEW / 2)
+    return Viewpoint(Camera.look_at(eye, centre, up, fx, *OVERVIEW_SIZE), centre, up)
+
+
+def _up(cameras: list[Camera]) -> Array:
+    """The mean of the directions to the photos' upper edges, a unit vector."""
+    ups = np.array([-camera.viewmat[1, :3] for camera in cameras])
+    up = ups.mean(axis=0)
+    up = up if np.linalg.norm(up) > 1e-3 else ups[0]  # as many upside down as not: the first decides
+    return np.asarray(up / np.linalg.norm(up))
+
+
+def _bounds(gaussians: Gaussians) -> tuple[Array, float]:
+    """Centre and radius of a scene: the median of the Gaussians' positions by opacity, and the median distance from
+    there. A background far away moves neither."""
+    means, weights = gaussians.means.astype(np.float64), gaussians.opacities.astype(np.float64)
+    centre = np.array([_median(means[:, axis], weights) for axis in range(3)])
+    radius = _median(np.linalg.norm(means - centre, axis=1), weights)
+    return centre, radius if radius > 0 else float(np.exp(gaussians.log_scales.max()))
 
 
 def _median(values: Any, weights: Any) -> float:

@@ -63,8 +63,9 @@ def train(
     evaluate : callable, optional
         Called every `config.eval_every` iterations; what it returns is logged. Its time does not count.
     progress : callable
-        Called after every iteration with iteration, loss and num_gaussians. If it raises KeyboardInterrupt, a
-        checkpoint is written before the run ends.
+        Called after every iteration with iteration, loss, num_gaussians and gaussians, which are the ones that train:
+        to be looked at only. Its time does not count. If it raises KeyboardInterrupt, a checkpoint is written before
+        the run ends.
 
     Returns
     -------
@@ -133,15 +134,18 @@ def train(
                 record |= evaluate(fetch(state.gaussians))
                 started = time.perf_counter() - state.seconds
             if record:
-                about = {"iteration": iteration, "num_gaussians": len(state.gaussians), "seconds": state.seconds}
-                log(about | record)
+                at = {"iteration": iteration, "num_gaussians": len(state.gaussians), "seconds": state.seconds}
+                log(at | record)
             if iteration % config.checkpoint_every == 0 or iteration == config.iterations:
                 save_state(out / "checkpoint.npz", state, config)
+            left = time.perf_counter()
+            about = {"iteration": iteration, "loss": loss, "num_gaussians": len(state.gaussians)}
             try:
-                progress({"iteration": iteration, "loss": loss, "num_gaussians": len(state.gaussians)})
+                progress(about | {"gaussians": state.gaussians})
             except KeyboardInterrupt:
                 save_state(out / "checkpoint.npz", state, config)
                 raise
+            started += time.perf_counter() - left
     if state.exposures or state.poses:
         write_photos(out / "photos.json", state, scene)
     if not state.search:

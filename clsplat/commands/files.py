@@ -2,12 +2,16 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from clsplat.commands.console import Out, say
-from clsplat.config import SfmConfig
+from clsplat.commands.console import moved, say
+from clsplat.config import DataConfig, Mode, SfmConfig
+from clsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from clsplat.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
@@ -52,17 +56,42 @@ class Sfm:
 
 @dataclass(frozen=True)
 class Export:
-    """Convert a file of Gaussians; formats are told by the suffix."""
+    """Convert a file of Gaussians, or make a page of it that shows the scene in any browser, without a network."""
 
     scene: tyro.conf.Positional[Path]
     """File of Gaussians."""
-    out: Out
-    """File to write."""
+    to: tyro.conf.Positional[Path | None] = None
+    """File to write; its suffix names the format, and .html a page for the browser."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """The same, for those who look for -o."""
+    data: Path | None = None
+    """For a page: dataset, as given to `train`, whose first photo is the first view and whose cameras tell what is
+    upright."""
+    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
 
     def run(self) -> None:
         """Run the command."""
         from clsplat.io import load_gaussians, save_gaussians
 
+        if (self.to is None) == (self.out is None):
+            raise InputError("export: expected one file to write, as in: clsplat export scene.ply scene.spz")
+        out = self.to or self.out
+        assert out is not None
         gaussians, mode, offset = load_gaussians(self.scene)
-        save_gaussians(self.out, gaussians, mode, offset)
-        say(f"{self.out}: {len(gaussians)} Gaussians")
+        if out.suffix.lower() == ".html":
+            self._page(out, gaussians, mode, offset)
+        else:
+            save_gaussians(out, gaussians, mode, offset)
+        say(f"{out}: {len(gaussians)} Gaussians, {out.stat().st_size / 1e6:.3g} MB")
+
+    def _page(self, out: Path, gaussians: "Gaussians", mode: Mode, offset: Any) -> None:
+        from clsplat.io import load_scene
+        from clsplat.orbit import first_photo, overview
+        from clsplat.page import save_page
+
+        views = []
+        if self.data is not None:
+            scene = load_scene(self.data, self.data_config)
+            gaussians, views = moved(gaussians, offset - scene.offset), scene.train + scene.test
+        start = first_photo([view.camera for view in views]) if views else overview(gaussians)
+        save_page(out, gaussians, mode, start, self.data_config.background)

@@ -4,6 +4,7 @@ import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from clsplat.device import Device
     from clsplat.gaussians import Gaussians
     from clsplat.scene import Scene
+    from clsplat.viewer import Viewer
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Train:
     whose name without the suffix becomes the folder."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
+    viewer: bool = False
+    """Watch and pause the training in the browser; needs the extra `viewer`."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
     """A named set of settings to start from, in the place of the defaults; flags given beside it count."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -70,13 +74,35 @@ class Train:
         say(need.describe(start, config.max_gaussians, device.memory_limit))
         new_folder(out)
         write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
-        gaussians = train_and_report(scene, config, device, out, self.resume)
+        viewer = open_viewer(scene, config, device) if self.viewer else None
+        gaussians = train_and_report(scene, config, device, out, self.resume, viewer)
         if suffix:
             save_gaussians(self.out, gaussians, config.render.mode, scene.offset)
             say(f"{self.out}: {self.out.stat().st_size / 1e6:.3g} MB")
+        if viewer:
+            say(f"viewer: {viewer.address} stays open; Ctrl-C ends it")
+            with suppress(KeyboardInterrupt):
+                viewer.hold(gaussians)
+            viewer.close()
 
 
-def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out: Path, resume: bool) -> "Gaussians":
+def open_viewer(scene: "Scene", config: TrainConfig, device: "Device") -> "Viewer":
+    """A viewer of a training, at its first photo."""
+    from clsplat.orbit import first_photo
+    from clsplat.viewer import Viewer
+
+    if not scene.train:
+        raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
+    start = first_photo([view.camera for view in scene.train])
+    background = BACKGROUNDS[config.data.background]
+    viewer = Viewer(device, config.render, start, scene.train, background)
+    say(f"viewer: open {viewer.address} in a browser")
+    return viewer
+
+
+def train_and_report(
+    scene: "Scene", config: TrainConfig, device: "Device", out: Path, resume: bool, viewer: "Viewer | None" = None
+) -> "Gaussians":
     """Train with a progress bar; write scene.ply, the evaluation and the training curve to `out`."""
     from tqdm import tqdm
 
@@ -89,6 +115,7 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
 
     background = BACKGROUNDS[config.data.background]
     interrupted = threading.Event()
+    facts: dict[str, str] = {}  # what the viewer says beside its pictures
 
     def interrupt(*_: object) -> None:
         interrupted.set()
@@ -101,13 +128,20 @@ def train_and_report(scene: "Scene", config: TrainConfig, device: "Device", out:
             if bar.n == 0:
                 bar.write(f"first iteration: done {time.perf_counter() - STARTED:.1f} s after the start", sys.stderr)
             bar.update(record["iteration"] - bar.n)
+            bar.set_postfix_str(f"loss={record['loss']:.4f}, N={record['num_gaussians']}", refresh=False)
+            if viewer:
+                facts["Iteration"] = f"{record['iteration']:,} of {config.iterations:,}"
+                facts["Gaussians"], facts["Loss"] = f"{record['num_gaussians']:,}", f"{record['loss']:.4f}"
+                viewer.tell(facts)
+                viewer.follow(record["gaussians"], interrupted.is_set)
             if interrupted.is_set():
                 say(f"\n{out}: stopped after iteration {record['iteration']}; --resume continues from there")
                 raise KeyboardInterrupt
-            bar.set_postfix_str(f"loss={record['loss']:.4f}, N={record['num_gaussians']}", refresh=False)
 
         def held_out(gaussians: "Gaussians") -> dict[str, float]:
-            return mean_metrics(gaussians, scene.test, config.render, device, background)
+            means = mean_metrics(gaussians, scene.test, config.render, device, background)
+            facts["Held-out photos"] = ", ".join(f"{name.upper()} {value:.4g}" for name, value in means.items())
+            return means
 
         gaussians = train(
             scene, config, device, out, resume=resume, evaluate=held_out if scene.test else None, progress=progress

@@ -1,0 +1,52 @@
+"""The command `view`."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from clsplat.commands.console import moved, open_device, say
+from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a scene in the browser, rendered here; needs the extra `viewer`."""
+
+    scene: tyro.conf.Positional[Path]
+    """File of Gaussians."""
+    data: Path | None = None
+    """Dataset, as given to `train`: its cameras are shown, and a click on one goes there."""
+    host: str = "127.0.0.1"
+    """Address to listen at; 0.0.0.0 lets other machines in, too."""
+    port: int = 8080
+    """Where to listen; if it is taken, the next free one."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
+    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.io import load_gaussians, load_scene
+        from clsplat.orbit import first_photo, overview
+        from clsplat.viewer import Viewer
+
+        gaussians, mode, offset = load_gaussians(self.scene)
+        device = open_device(self.device)
+        views = []
+        if self.data is not None:
+            scene = load_scene(self.data, self.data_config)
+            gaussians = moved(gaussians, offset - scene.offset)
+            views = scene.train + scene.test
+        start = first_photo([view.camera for view in views]) if views else overview(gaussians)
+        background = BACKGROUNDS[self.data_config.background]
+        config = replace(self.render, mode=mode)
+        viewer = Viewer(device, config, start, views, background, host=self.host, port=self.port)
+        viewer.tell({"File": self.scene.name, "Gaussians": f"{len(gaussians):,}", "Device": device.label})
+        say(f"viewer: open {viewer.address} in a browser; Ctrl-C ends it")
+        try:
+            viewer.hold(gaussians)
+        finally:
+            viewer.close()

@@ -1,0 +1,100 @@
+"""Headless Chromium for tests of what a browser shows, driven through its DevTools protocol."""
+
+import base64
+import io
+import json
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+PATIENCE = 90
+"""Seconds until a page that does not become what is waited for counts as broken: WebGL without a GPU is slow."""
+
+
+class Page:
+    """One page of the browser; `requests` are the addresses it asked for."""
+
+    def __init__(self, socket: Any):
+        self._socket, self._last, self.requests = socket, 0, []
+        self.log: list[str] = []
+        for domain in ("Page", "Network", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Send a command, and return its result."""
+        self._last += 1
+        self._socket.send(json.dumps({"id": self._last, "method": method, "params": parameters}))
+        while True:
+            message = json.loads(self._socket.recv(PATIENCE))
+            if message.get("method") == "Network.requestWillBeSent":
+                self.requests.append(message["params"]["request"]["url"])
+            if message.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled"):
+                self.log.append(json.dumps(message["params"])[:2000])
+            if message.get("id") == self._last:
+                assert "error" not in message, message["error"]
+                return message["result"]
+
+    def evaluate(self, expression: str) -> Any:
+        """The value of a JavaScript expression."""
+        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    def screenshot(self) -> np.ndarray:
+        """What is seen, (H, W, 3) uint8."""
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+    def click(self, x: float, y: float) -> None:
+        """Press and release the left button."""
+        where = {"x": x, "y": y, "button": "left", "clickCount": 1}
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        time.sleep(0.3)  # what is under the pointer is found out between two frames
+        self.call("Input.dispatchMouseEvent", type="mousePressed", **where)
+        self.call("Input.dispatchMouseEvent", type="mouseReleased", **where)
+
+
+@contextmanager
+def browser(profile: Path, url: str, width: int, height: int) -> Iterator[Page]:
+    """A page in a new headless Chromium that reaches nothing but this machine."""
+    connect = pytest.importorskip("websockets.sync.client", reason="websockets, which comes with viser").connect
+    if CHROMIUM is None:
+        pytest.skip("chromium is missing: install it to see what a browser shows")
+    flags = ["--headless", "--no-sandbox", "--remote-debugging-port=0", "--hide-scrollbars", "--mute-audio"]
+    flags += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
+    flags += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
+    flags += [f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"]
+    process = subprocess.Popen([CHROMIUM, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        started = profile / "DevToolsActivePort"
+        wait_for(lambda: started.is_file() and started.read_text().count("\n") == 1, "the browser's start")
+        port, path = started.read_text().split("\n")
+        with connect(f"ws://127.0.0.1:{port}{path}", max_size=None) as top:
+            top.send(json.dumps({"id": 1, "method": "Target.getTargets"}))
+            targets = json.loads(top.recv(PATIENCE))["result"]["targetInfos"]
+        target = next(t["targetId"] for t in targets if t["type"] == "page")
+        with connect(f"ws://127.0.0.1:{port}/devtools/page/{target}", max_size=None) as socket:
+            page = Page(socket)
+            size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+            page.call("Emulation.setDeviceMetricsOverride", **size)
+            page.call("Page.navigate", url=url)
+            yield page
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def wait_for(condition: Any, what: str) -> None:
+    """Ask until the answer is yes."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, f"waited {PATIENCE} s for {what}"
+        time.sleep(0.2)
