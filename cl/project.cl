@@ -6,6 +6,7 @@
 //   cov2d = J W Sigma W^T J^T + BLUR I,  Sigma = R S S^T R^T          (Kerbl et al. 2023, equations 5 and 6)
 //   colour = max(SH(direction) + 1/2, 0)                               (original code)
 //   antialiased: opacity * sqrt(det(cov2d - BLUR I)/det(cov2d))        (Yu et al. 2024, "Mip-Splatting", equation 10)
+// and, where pixels are sorted one by one, the disparity 1/z at which a pixel's ray meets it (project_disparities).
 // docs/stages/project.md derives the gradients; clsplat/reference/project.py is the float64 twin.
 //
 // Mapping: one work-item per Gaussian, no local memory except for VIEWMAT_GRAD.
@@ -15,6 +16,7 @@
 //   out  means2d[N,2] px, conics[N,3] px^-2 (xx, xy, yy), depths[N] world, extents[N,2] px, opacities[N],
 //        colors[N,C] (RGB, then the depth if C is 4)
 //        An invisible Gaussian has extents 0 and all its other outputs 0.
+//   out  disparities[N,3] of project_disparities: 1/z at the centre in 1/world, and its derivatives by x and y per px
 //   v_x  is the gradient with respect to x; v_viewmat[groups,12] holds a partial sum per work-group of the
 //        gradient with respect to rotation (9, row-major) and translation (3).
 //
@@ -222,6 +224,33 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
 #if CHANNELS == 4
     colors[CHANNELS * i + 3] = visible ? f.p.z : 0;
 #endif
+}
+
+// Where along the ray of a pixel is a Gaussian densest? In the local affine approximation depth and image position are
+// jointly normal: given a pixel at d from the centre, the depth is densest at its conditional mean
+//   z + g.d,   g = cov2d^-1 (J W Sigma W^T e_z).
+// The disparity 1/z of a plane is affine in the image, so 1/z - (g/z^2).d has the same value and slope at the centre and
+// is exact for discs (cf. Radl et al. 2024, "StopThePop", equation 10, which is that of the Gaussian without blur).
+__kernel void project_disparities(const uint n, const Camera camera, const __global real *means,
+                                  const __global real *log_scales, const __global real *quats,
+                                  const __global real *extents, const __global real *conics,
+                                  __global real *disparities) {
+    const size_t i = get_global_id(0);
+    if (i >= n)
+        return;
+    real3 disparity = 0;
+    if (extents[2 * i] > 0) {
+        const real4 quat = load4(quats, i);
+        const Footprint f =
+            footprint(&camera, load3(means, i), activate(load3(log_scales, i), 0).xyz, quat / sqrt(dot4(quat, quat)));
+        const real3 b2 = mat3_tmul(f.rotation, camera_rotation(&camera).row2) * f.scales, conic = load3(conics, i);
+        const real xz = dot3(f.b0, b2), yz = dot3(f.b1, b2), inv_z = 1 / f.p.z;
+        const real2 slope = -inv_z * inv_z * (real2)(conic.x * xz + conic.y * yz, conic.y * xz + conic.z * yz);
+        // What is not finite at some pixel has no order.
+        const bool finite = 0 * (slope.x * extents[2 * i] + slope.y * extents[2 * i + 1]) == 0;
+        disparity = (real3)(inv_z, finite ? slope : (real2)0);
+    }
+    store3(disparities, i, disparity);
 }
 
 // Gradients of one visible Gaussian, those with respect to its spherical harmonics as factors: of coefficient k,

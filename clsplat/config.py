@@ -30,10 +30,11 @@ class RenderConfig:
     """Edge of a tile in pixels; changes speed, not the image."""
     compositor: Literal["auto", "cpu", "gpu"] = "auto"
     """Kernel variant of the compositing stage; auto takes the one for the device's type."""
-    sort: Literal["auto", "global", "per_tile"] = "auto"
-    """How splats are brought into the order of their depths: all of them before they are distributed to tiles
-    (global), or within each tile afterwards. Changes speed, not the image; auto takes global, the faster one where
-    measured."""
+    sort: Literal["auto", "global", "per_tile", "pixel"] = "auto"
+    """How splats are brought into the order of their centres' depths: all of them before they are distributed to
+    tiles (global), or within each tile afterwards (per_tile). Changes speed, not the image; auto takes global, the
+    faster one where measured. pixel sorts anew in each pixel, by where its ray meets the Gaussians: nothing pops when
+    the camera turns, but it is slower (StopThePop)."""
 
 
 @dataclass(frozen=True)

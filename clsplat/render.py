@@ -46,7 +46,10 @@ def stage_functions(device: "Device | None") -> Any:
 
 @dataclass(frozen=True)
 class Pass:
-    """A forward pass: what `backward` needs of it. Arrays live where the stages ran."""
+    """A forward pass: what `backward` needs of it. Arrays live where the stages ran.
+
+    disparities: of the splats, where pixels are sorted.
+    """
 
     gaussians: Gaussians
     camera: Camera
@@ -55,6 +58,7 @@ class Pass:
     splats: Splats
     bins: Bins
     image: Image
+    disparities: Any = None
 
 
 def forward(
@@ -84,16 +88,19 @@ def forward(
     splats = stage.project_fwd(gaussians, camera, sh_degree, antialiased=antialiased, channels=len(background))
     # The twins work splat by splat and gain nothing from tiles.
     tile_size = max(camera.width, camera.height) if device is None else config.tile_size
-    bins = stage.bin_splats(splats, camera.width, camera.height, tile_size, gradients=gradients, scheme=config.sort)
-    image = stage.composite_fwd(splats, bins, background, compositor=config.compositor)
-    return Pass(gaussians, camera, config, sh_degree, splats, bins, image)
+    by_pixel = config.sort == "pixel"
+    scheme = "auto" if by_pixel else config.sort
+    bins = stage.bin_splats(splats, camera.width, camera.height, tile_size, gradients=gradients, scheme=scheme)
+    disparities = stage.project_disparities(gaussians, camera, splats) if by_pixel else None
+    image = stage.composite_fwd(splats, bins, background, compositor=config.compositor, disparities=disparities)
+    return Pass(gaussians, camera, config, sh_degree, splats, bins, image, disparities)
 
 
 def backward_to_splats(device: "Device | None", run: Pass, v_image: Image) -> SplatGrads:
     """The first half of `backward`: gradients with respect to the splats."""
     stage = stage_functions(device)
     v_splats: SplatGrads = stage.composite_bwd(
-        run.splats, run.bins, run.image, v_image, compositor=run.config.compositor
+        run.splats, run.bins, run.image, v_image, compositor=run.config.compositor, disparities=run.disparities
     )
     return v_splats
 

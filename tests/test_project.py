@@ -12,6 +12,7 @@ from clsplat.config import OptimConfig
 from clsplat.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN, NEAR
 from clsplat.gaussians import Gaussians, logit
 from clsplat.optim import adam_settings
+from clsplat.reference.project import rotations as reference_rotations
 from clsplat.render import download, upload
 from clsplat.stages import SplatGrads, Splats
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene, threshold_distances
@@ -231,6 +232,44 @@ def test_the_scene_keeps_its_margin():
         assert threshold_distances(gaussians, camera, antialiased=antialiased).min() >= 1e-3
 
 
+def test_disparities_match_twin(any_device):
+    gaussians, camera = wide_scene()
+    if any_device.real == np.float32:  # as in test_float_matches_twin
+        z = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        gaussians = gaussians.take((z < 0) | (z > 0.2))
+    splats = reference.project_fwd(gaussians, camera, 0)
+    uploaded = Splats(*(any_device.upload("splats", a) for a in splats))
+    found = ops.project_disparities(any_device, upload(any_device, gaussians), camera, uploaded).get()
+    expected = reference.project_disparities(gaussians, camera, splats)
+    table = DOUBLE if any_device.real == np.float64 else FLOAT
+    for column in range(3):
+        assert_matches("disparities", found[:, column], expected[:, column], table)
+    assert (found[splats.extents[:, 0] == 0] == 0).all()
+
+
+def test_disparities_are_where_a_ray_meets_the_gaussian():
+    """Discs are met in their plane; along any ray a Gaussian is densest where the sum of squares is least."""
+    gaussians, camera = synthetic_scene(40, seed=3, width=970, height=610)  # large in pixels: the blur is nothing
+    gaussians.log_scales[:] = np.log([0.2, 0.1, 1e-4])
+    splats = reference.project_fwd(gaussians, camera, 0)
+    disparities = reference.project_disparities(gaussians, camera, splats)
+    axes = reference_rotations(gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True))
+    checked = 0
+    for g in np.flatnonzero(splats.extents[:, 0] > 0):
+        offset = 0.2 * splats.extents[g]
+        pixel = splats.means2d[g] + offset
+        ray = np.append((pixel - [camera.cx, camera.cy]) / [camera.fx, camera.fy], 1)
+        whiten = (camera.viewmat[:3, :3] @ axes[g]) / gaussians.scales[g]
+        point = camera.viewmat[:3, :3] @ gaussians.means[g] + camera.viewmat[:3, 3]
+        towards, centre = ray @ whiten, point @ whiten
+        expected = (towards @ towards) / (towards @ centre)
+        if np.linalg.norm(whiten[:, 2] * 1e-4 @ [0, 0, 1]) < 0.3:
+            continue  # edge on: the blur counts
+        assert disparities[g] @ [1, *offset] == pytest.approx(expected, rel=2e-3)
+        checked += abs(expected * splats.depths[g] - 1) > 0.01
+    assert checked > 10, "the centre's depth would do"
+
+
 NAN, INF = np.nan, np.inf
 INVISIBLE = {
     "mean is NaN": ("means", (NAN, 0, 0)),
@@ -328,6 +367,9 @@ def test_extreme_gaussians_stay_finite(any_device, antialiased):
     clean = forward(any_device, mixed.take(healthy), camera, **options)
     for name in Splats._fields:
         np.testing.assert_array_equal(getattr(splats, name)[healthy], getattr(clean, name), err_msg=name)
+    uploaded = Splats(*(any_device.upload("splats", a) for a in splats))
+    disparities = ops.project_disparities(any_device, upload(any_device, mixed), camera, uploaded).get()
+    assert np.isfinite(disparities).all() and (disparities[:, 0] >= 0).all()
 
 
 def test_quaternion_whose_norm_overflows_is_invisible(any_device):

@@ -8,7 +8,7 @@ from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
-from clsplat.ops.project import project_bwd, project_bwd_adam, project_fwd
+from clsplat.ops.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
 from clsplat.ops.removal import removal
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
@@ -29,6 +29,7 @@ __all__ = [
     "observe",
     "project_bwd",
     "project_bwd_adam",
+    "project_disparities",
     "project_fwd",
     "removal",
 ]

@@ -60,6 +60,30 @@ def project_fwd(
     return splats
 
 
+def project_disparities(device: Device, gaussians: Gaussians, camera: Camera, splats: Splats) -> Any:
+    """The disparity at which a pixel's ray meets each Gaussian where it is densest, as a plane over the image.
+
+    Parameters
+    ----------
+    gaussians, camera
+        As given to `project_fwd`.
+    splats : Splats
+        Its result.
+
+    Returns
+    -------
+    (N, 3)
+        1/z at the splat's centre, in inverse world units, and its derivatives by x and y, per pixel; 0 for invisible
+        Gaussians. It has no gradient: only the order within a pixel depends on it.
+    """
+    n, g = len(gaussians), gaussians
+    result = device.empty("disparities", (n, 3))
+    arguments = [n, camera_struct(camera, device.real), g.means, g.log_scales, g.quats, splats.extents, splats.conics]
+    defines = {"CHANNELS": splats.colors.shape[1], "ANTIALIASED": 0, "VIEWMAT_GRAD": 0}
+    device.launch("project", "project_disparities", (n,), [*arguments, result], defines=defines)
+    return result
+
+
 def project_bwd(
     device: Device,
     gaussians: Gaussians,

@@ -8,7 +8,7 @@ from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
-from clsplat.reference.project import project_bwd, project_bwd_adam, project_fwd
+from clsplat.reference.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
 from clsplat.reference.removal import removal
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
@@ -29,6 +29,7 @@ __all__ = [
     "observe",
     "project_bwd",
     "project_bwd_adam",
+    "project_disparities",
     "project_fwd",
     "removal",
 ]

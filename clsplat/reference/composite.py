@@ -28,6 +28,17 @@ class Hit(NamedTuple):
     live: NDArray[np.bool_]  # where no splat in front has finished the pixel
 
 
+class Layer(NamedTuple):
+    """One splat in each of P different pixels; arrays (P,)."""
+
+    pixels: tuple[NDArray[np.intp], NDArray[np.intp]]  # rows, columns
+    splats: NDArray[np.intp]
+    dx: Array
+    dy: Array
+    alpha: Array  # as in Hit
+    before: Array
+
+
 def hits(
     splats: Splats, bins: Bins, transmittance: Array, transmittance_min: float = TRANSMITTANCE_MIN
 ) -> Iterator[Hit]:
@@ -59,42 +70,96 @@ def hits(
             yield Hit(int(g), box, dx, dy, np.where(drawn, alpha, 0), before, was_live)
 
 
-def composite_fwd(splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto") -> Image:
-    """Composite splats front to back; arguments and result as `clsplat.ops.composite_fwd`."""
+def layers(splats: Splats, bins: Bins, disparities: Array, transmittance: Array) -> Iterator[Layer]:
+    """Yield the splats of all pixels by disparity: first the nearest of each pixel, then the second, and so on.
+
+    `transmittance` is brought from 1 to its end, as by `hits`.
+    """
+    found = [np.zeros((7, 0))]
+    for hit in hits(splats, bins, transmittance, transmittance_min=-1.0):  # all that are seen: no pixel stops
+        y, x = np.nonzero(hit.alpha)
+        dx, dy = hit.dx[0, x], hit.dy[y, 0]
+        disparity = disparities[hit.splat] @ [np.ones(len(x)), dx, dy]
+        rows, columns = y + hit.box[0].start, x + hit.box[1].start
+        found.append(np.stack([rows, columns, np.full(len(x), hit.splat), disparity, dx, dy, hit.alpha[y, x]]))
+    pairs = np.concatenate(found, axis=1)
+    pairs = pairs[:, np.lexsort((-pairs[3], pairs[1], pairs[0]))]  # stable: ties keep the order of the lists
+    pixel = pairs[0] * bins.width + pairs[1]
+    rank = np.arange(len(pixel)) - np.searchsorted(pixel, pixel)
+    transmittance[:] = 1
+    live = np.ones(transmittance.shape, dtype=bool)
+    for r in range(int(rank.max(initial=-1)) + 1):
+        rows, columns, splat = pairs[:3, rank == r].astype(int)
+        dx, dy, alpha = pairs[4:, rank == r]
+        pixels = rows, columns
+        before = transmittance[pixels]
+        behind = before * (1 - np.minimum(alpha, ALPHA_MAX))
+        live[pixels] &= behind > TRANSMITTANCE_MIN
+        transmittance[pixels] = np.where(live[pixels], behind, before)
+        yield Layer(pixels, splat, dx, dy, np.where(live[pixels], alpha, 0), before)
+
+
+def composite_fwd(
+    splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto", disparities: Any = None
+) -> Image:
+    """Composite splats front to back, pixels exactly sorted; arguments and result as `clsplat.ops.composite_fwd`."""
     transmittance = np.empty((bins.height, bins.width))
     image = np.zeros((bins.height, bins.width, splats.colors.shape[1]))
-    for hit in hits(splats, bins, transmittance):
-        weight = np.minimum(hit.alpha, ALPHA_MAX) * hit.before
-        image[hit.box] += weight[:, :, None] * splats.colors[hit.splat]
+    if disparities is None:
+        for hit in hits(splats, bins, transmittance):
+            weight = np.minimum(hit.alpha, ALPHA_MAX) * hit.before
+            image[hit.box] += weight[:, :, None] * splats.colors[hit.splat]
+    else:
+        for layer in layers(splats, bins, disparities, transmittance):
+            weight = np.minimum(layer.alpha, ALPHA_MAX) * layer.before
+            image[layer.pixels] += weight[:, None] * splats.colors[layer.splats]
     return Image(image + transmittance[:, :, None] * np.asarray(background, dtype=np.float64), 1 - transmittance)
 
 
 def composite_bwd(
-    splats: Splats, bins: Bins, image: Image, v_image: Image, *, compositor: str = "auto"
+    splats: Splats,
+    bins: Bins,
+    image: Image,
+    v_image: Image,
+    *,
+    compositor: str = "auto",
+    disparities: Any = None,
 ) -> SplatGrads:
-    """Gradients of `composite_fwd`; arguments and result as `clsplat.ops.composite_bwd`.
+    """Gradients of `composite_fwd`; arguments and result as `clsplat.ops.composite_bwd`."""
+    v = SplatGrads(*(np.zeros_like(a) for a in (splats.means2d, splats.conics, splats.opacities, splats.colors)))
+    transmittance = np.empty((bins.height, bins.width))
+    behind = (image.image * v_image.image).sum(axis=2) - (1 - image.alpha) * v_image.alpha
+    if disparities is None:
+        for hit in hits(splats, bins, transmittance):
+            g, dx, dy, v_pixels = hit.splat, hit.dx, hit.dy, v_image.image[hit.box]
+            u = v_pixels @ splats.colors[g]
+            v_sigma, weight, behind[hit.box] = _v_sigma(hit.alpha, hit.before, u, behind[hit.box])
+            a, b, c = splats.conics[g]
+            v.means2d[g] -= [(v_sigma * (a * dx + b * dy)).sum(), (v_sigma * (b * dx + c * dy)).sum()]
+            v.conics[g] += [(v_sigma * square).sum() for square in (0.5 * dx**2, dx * dy, 0.5 * dy**2)]
+            v.opacities[g] -= v_sigma.sum() / splats.opacities[g]
+            v.colors[g] += np.einsum("hw,hwc->c", weight, v_pixels)
+    else:
+        for layer in layers(splats, bins, disparities, transmittance):
+            many, dx, dy, v_pixels = layer.splats, layer.dx, layer.dy, v_image.image[layer.pixels]
+            u = (v_pixels * splats.colors[many]).sum(axis=1)
+            v_sigma, weight, behind[layer.pixels] = _v_sigma(layer.alpha, layer.before, u, behind[layer.pixels])
+            a, b, c = splats.conics[many].T
+            np.subtract.at(v.means2d, many, (v_sigma * [a * dx + b * dy, b * dx + c * dy]).T)
+            np.add.at(v.conics, many, (v_sigma * [0.5 * dx**2, dx * dy, 0.5 * dy**2]).T)
+            np.subtract.at(v.opacities, many, v_sigma / splats.opacities[many])
+            np.add.at(v.colors, many, weight[:, None] * v_pixels)
+    return v
+
+
+def _v_sigma(alpha: Array, before: Array, u: Array, behind: Array) -> tuple[Array, Array, Array]:
+    """Gradient of sigma, the weight, and `behind` without this splat's term.
 
     With u = colour . v_image and `behind` the sum of u alpha T over the splats behind, the background and alpha's own
     term included, v_alpha = T u - behind/(1 - alpha).
     """
-    v = SplatGrads(*(np.zeros_like(a) for a in (splats.means2d, splats.conics, splats.opacities, splats.colors)))
-    transmittance = np.empty((bins.height, bins.width))
-    behind = (image.image * v_image.image).sum(axis=2) - (1 - image.alpha) * v_image.alpha
-    for hit in hits(splats, bins, transmittance):
-        g, dx, dy = hit.splat, hit.dx, hit.dy
-        clamped = np.minimum(hit.alpha, ALPHA_MAX)
-        weight = clamped * hit.before
-        u = v_image.image[hit.box] @ splats.colors[g]
-        behind[hit.box] -= weight * u
-        v_alpha = hit.before * u - behind[hit.box] / (1 - clamped)
-        v_sigma = np.where(hit.alpha < ALPHA_MAX, -hit.alpha * v_alpha, 0)
-        a, b, c = splats.conics[g]
-        v.means2d[g] -= [(v_sigma * (a * dx + b * dy)).sum(), (v_sigma * (b * dx + c * dy)).sum()]
-        v.conics[g] += [
-            0.5 * (v_sigma * dx**2).sum(),
-            (v_sigma * dx * dy).sum(),
-            0.5 * (v_sigma * dy**2).sum(),
-        ]
-        v.opacities[g] -= v_sigma.sum() / splats.opacities[g]
-        v.colors[g] += np.einsum("hw,hwc->c", weight, v_image.image[hit.box])
-    return v
+    clamped = np.minimum(alpha, ALPHA_MAX)
+    weight = clamped * before
+    behind = behind - weight * u
+    v_alpha = before * u - behind / (1 - clamped)
+    return np.where(alpha < ALPHA_MAX, -alpha * v_alpha, 0), weight, behind

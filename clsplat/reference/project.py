@@ -115,6 +115,21 @@ def project_fwd(
     return Splats(*(np.where(visible.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in splats))
 
 
+def project_disparities(gaussians: Gaussians, camera: Camera, splats: Splats) -> Array:
+    """Disparity along the rays of pixels; arguments and result as `clsplat.ops.project_disparities`.
+
+    Image position and depth are jointly normal, with covariance root root^T where root has a third row for the depth.
+    """
+    shown = splats.extents[:, 0] > 0
+    f = _forward(gaussians.take(shown), camera, 0)
+    z, (a, b, c) = f["p"][:, 2], splats.conics[shown].T
+    depth_root = camera.viewmat[2, :3] @ f["rotation"] * f["g"].scales
+    xz, yz = np.einsum("nij,nj->in", f["root"], depth_root)
+    result = np.zeros((len(gaussians), 3))
+    result[shown] = np.stack([1 / z, -(a * xz + b * yz) / z**2, -(b * xz + c * yz) / z**2], axis=1)
+    return result
+
+
 def project_bwd(
     gaussians: Gaussians,
     camera: Camera,

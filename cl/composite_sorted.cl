@@ -1,0 +1,274 @@
+// Stage composite, variant that sorts the splats of each pixel (--sort pixel): splats to pixels, and gradients back.
+//
+// The equations are those of composite_cpu.cl. There all pixels take the splats in the order of their centres' depths,
+// and where two swap their order the image jumps at once wherever both are seen: it pops when the camera turns. Here a
+// pixel takes them in the order in which its ray meets them (project_disparities in project.cl), which changes from
+// place to place and moves on steadily with the camera (Radl et al. 2024, "StopThePop").
+//
+// How is a pixel sorted, exactly and in fixed memory? In rounds over the tile's list. In each a window gathers the
+// WINDOW nearest of the splats that the pixel sees and has not composited yet; then they are composited, and the next
+// round looks beyond the last of them. Ties go by the list, that is by the depth of the centres and by index. Most
+// pixels are finished after a few rounds; the list, which is nearly in order, fills a window early, and what lies
+// behind all of a block's windows costs no more than to find that out.
+//
+// Mapping: one work-item per tile, its pixels in blocks (composite_blocks.h). This variant serves all devices. At
+// one place of a block's windows are up to 16 different splats: their colours are gathered, and in the backward pass
+// their sums scattered, lane by lane. A work-item alone writes the records of its tile, in a fixed order: no atomics,
+// the same bits each run.
+//
+// Buffers: as in composite_cpu.cl, and
+//   in   disparities[N,3], as in project.cl
+// -DTILE=8|16   edge of a tile, px
+// -DCHANNELS    colour channels, 1 or more
+// -DWINDOW      entries of a pixel's window, 1 or more
+#include "common.h"
+#include "composite_blocks.h"
+
+#if !defined(WINDOW) || WINDOW < 1
+#error "-DWINDOW must give the number of entries of a pixel's window, 1 or more"
+#endif
+
+#ifdef USE_DOUBLE
+#define ENTRY_LANE(vector, i) (((const long *)&(vector))[i])
+#else
+#define ENTRY_LANE(vector, i) (((const int *)&(vector))[i])
+#endif
+
+// One splat in each pixel of a block.
+typedef struct {
+    REALV disparity;
+    REALV alpha; // not clamped; 0: none
+    MASKV entry; // in the list of intersections
+} Entry;
+
+#define NOWHERE ((REALV)-INFINITY) // a disparity behind all
+
+// Puts an entry into a window that holds at most `count` in any pixel, nearest first; the farthest drops out of a full
+// one. Those that come late belong far behind: the search begins there and ends where no pixel needs to go on.
+static inline void window_insert(Entry *window, int count, Entry e) {
+    int j = LESSER(count, WINDOW - 1);
+    const MASKV kept = window[j].disparity >= e.disparity; // only where the window is full
+    e.disparity = kept ? window[j].disparity : e.disparity;
+    e.alpha = kept ? window[j].alpha : e.alpha;
+    e.entry = kept ? window[j].entry : e.entry;
+    for (; j > 0; --j) {
+        const Entry here = window[j - 1];
+        const MASKV nearer = e.disparity > here.disparity;
+        if (!any_lane(nearer))
+            break;
+        window[j].disparity = nearer ? here.disparity : e.disparity;
+        window[j].alpha = nearer ? here.alpha : e.alpha;
+        window[j].entry = nearer ? here.entry : e.entry;
+        e.disparity = nearer ? e.disparity : here.disparity;
+        e.alpha = nearer ? e.alpha : here.alpha;
+        e.entry = nearer ? e.entry : here.entry;
+    }
+    window[j] = e;
+}
+
+// A tile as both passes need it.
+typedef struct {
+    const __global Splat *splats;
+    const __global real *disparities;
+    const __global uint *gauss_ids, *slots;
+    __global real *records; // 0: forward
+    int x0, y0;
+} Tile;
+
+// The pixels of a tile; `sums` is the colour in the forward pass, v_image in the backward one.
+typedef struct {
+    REALV transmittance[BLOCKS], behind[BLOCKS], sums[BLOCKS][CHANNELS];
+    REALV last_disparity[BLOCKS]; // of what was composited last; NOWHERE: nothing is left
+    MASKV last_entry[BLOCKS];
+    int counts[BLOCKS];
+    Entry windows[BLOCKS][WINDOW];
+} Pixels;
+
+static inline void composite_forward(const Tile *tile, Pixels *pixels, int b, const Entry *e, REALV weight) {
+    for (int lane = 0; lane < 16; ++lane) {
+        const real w = LANE(weight, lane);
+        if (!(w > 0))
+            continue;
+        const __global Splat *s = &tile->splats[tile->gauss_ids[ENTRY_LANE(e->entry, lane)]];
+        for (int k = 0; k < CHANNELS; ++k)
+            ((real *)&pixels->sums[b][k])[lane] += w * s->color[k];
+    }
+}
+
+static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, const Entry *e, MASKV drawn,
+                                      REALV weight) {
+    REALV u = 0;
+    for (int lane = 0; lane < 16; ++lane) {
+        if (!(LANE(weight, lane) > 0))
+            continue;
+        const __global Splat *s = &tile->splats[tile->gauss_ids[ENTRY_LANE(e->entry, lane)]];
+        real sum = 0;
+        for (int k = 0; k < CHANNELS; ++k)
+            sum += s->color[k] * LANE(pixels->sums[b][k], lane);
+        ((real *)&u)[lane] = sum;
+    }
+    const REALV v_sigma = splat_over_vjp(e->alpha, drawn, weight, u, &pixels->behind[b]);
+    const REALV x = U + (real)(2 + b % BLOCKS_IN_ROW * 4 + tile->x0),
+                y = V + (real)(2 + b / BLOCKS_IN_ROW * 4 + tile->y0);
+    for (int lane = 0; lane < 16; ++lane) {
+        const real w = LANE(weight, lane), v = LANE(v_sigma, lane);
+        if (!(w > 0))
+            continue;
+        const uint i = ENTRY_LANE(e->entry, lane);
+        const __global Splat *s = &tile->splats[tile->gauss_ids[i]];
+        const real dx = LANE(x, lane) - s->x, dy = LANE(y, lane) - s->y;
+        __global real *record = tile->records + (size_t)RECORD * tile->slots[i];
+        record[0] += v;
+        record[1] += v * dx;
+        record[2] += v * dy;
+        record[3] += v * dx * dx;
+        record[4] += v * dx * dy;
+        record[5] += v * dy * dy;
+        for (int k = 0; k < CHANNELS; ++k)
+            record[6 + k] += w * LANE(pixels->sums[b][k], lane);
+    }
+}
+
+// Takes a splat to the window of block b if a pixel there has not composited it yet and sees it among the nearest.
+static inline void gather_splat(const Over *over, real3 disparity, uint entry, Pixels *pixels, int b) {
+    const REALV t = block_exponent(over, b, curvature(&over->splat));
+    const REALV x = LANE(over->x, b) + U, y = LANE(over->y, b) + V;
+    const REALV here = disparity.x + (x * disparity.y + y * disparity.z), last = pixels->last_disparity[b];
+    const MASKV beyond = (here < last) | ((here == last) & ((MASKV)entry > pixels->last_entry[b]));
+    const MASKV wanted = splat_seen(&over->splat, t) & beyond;
+    Entry e;
+    e.disparity = wanted ? here : NOWHERE;
+    if (!any_lane(e.disparity > pixels->windows[b][WINDOW - 1].disparity))
+        return;
+    e.alpha = power16(t);
+    e.entry = (MASKV)entry;
+    window_insert(pixels->windows[b], pixels->counts[b], e);
+    pixels->counts[b] += pixels->counts[b] < WINDOW;
+}
+
+// Composites the window of block b and empties it.
+static inline void composite_window(const Tile *tile, Pixels *pixels, int b) {
+    Entry *window = pixels->windows[b];
+    pixels->counts[b] = 0;
+    pixels->last_disparity[b] = window[WINDOW - 1].disparity;
+    pixels->last_entry[b] = window[WINDOW - 1].entry;
+    for (int j = 0; j < WINDOW; ++j) {
+        const Entry e = window[j];
+        MASKV drawn = e.disparity > NOWHERE;
+        if (!any_lane(drawn))
+            break;
+        window[j].disparity = NOWHERE;
+        const REALV weight = splat_over(e.alpha, TRANSMITTANCE_MIN, &drawn, &pixels->transmittance[b]);
+        if (tile->records)
+            composite_backward(tile, pixels, b, &e, drawn, weight);
+        else
+            composite_forward(tile, pixels, b, &e, weight);
+    }
+    pixels->last_disparity[b] = pixels->transmittance[b] > 0 ? pixels->last_disparity[b] : NOWHERE;
+}
+
+// All that a tile's pixels see, in rounds.
+static inline void composite_list(const Tile *tile, uint begin, uint end, Pixels *pixels) {
+    uint open = begin < end ? unfinished_blocks(pixels->transmittance) : 0;
+    for (int b = 0; b < BLOCKS; ++b) {
+        pixels->last_disparity[b] = pixels->transmittance[b] > 0 ? (REALV)INFINITY : NOWHERE;
+        pixels->counts[b] = 0;
+        for (int j = 0; j < WINDOW; ++j)
+            pixels->windows[b][j].disparity = NOWHERE;
+    }
+    Over batch[BATCH];
+    while (open) {
+        for (uint first = begin; first < end; first += BATCH) {
+            const uint count = load_batch(tile->splats, tile->gauss_ids, first, end, tile->x0, tile->y0, batch);
+            // Block by block: its window stays in the nearest cache.
+            for (uint blocks = open; blocks;) {
+                const int b = take_block(&blocks);
+                for (uint j = 0; j < count; ++j) {
+                    if (batch[j].blocks >> b & 1)
+                        gather_splat(&batch[j], load3(tile->disparities, tile->gauss_ids[first + j]), first + j,
+                                     pixels, b);
+                }
+            }
+        }
+        for (uint blocks = open; blocks;) {
+            const int b = take_block(&blocks);
+            composite_window(tile, pixels, b);
+            open ^= any_lane(pixels->last_disparity[b] > NOWHERE) ? 0 : 1u << b;
+        }
+    }
+}
+
+// Number of the tile's first pixel, and how much of the tile lies inside the image.
+static inline int4 tile_box(uint t, int width, int height) {
+    const int tiles_x = (width + TILE - 1) / TILE;
+    const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
+    return (int4)(x0, y0, LESSER(TILE, width - x0), LESSER(TILE, height - y0));
+}
+
+__kernel void composite_fwd(const int width, const int height, const __global Splat *splats,
+                            const __global uint *gauss_ids, const __global uint *tile_ranges,
+                            const __global real *background, __global real *image, __global real *alpha_image,
+                            const __global real *disparities) {
+    const uint t = get_global_id(0);
+    const int4 box = tile_box(t, width, height);
+    const Tile tile = {splats, disparities, gauss_ids, 0, 0, box.x, box.y};
+
+    Pixels pixels;
+    for (int b = 0; b < BLOCKS; ++b) {
+        pixels.transmittance[b] = transmittance_at_first(b, box.w, box.z);
+        for (int k = 0; k < CHANNELS; ++k)
+            pixels.sums[b][k] = 0;
+    }
+    composite_list(&tile, tile_ranges[2 * t], tile_ranges[2 * t + 1], &pixels);
+
+    for (int r = 0; r < box.w; ++r) {
+        const size_t first = (size_t)(box.y + r) * width + box.x;
+        for (int x = 0; x < box.z; ++x) {
+            const int b = r / 4 * BLOCKS_IN_ROW + x / 4, lane = r % 4 * 4 + x % 4;
+            const real left = ABSOLUTE(LANE(pixels.transmittance[b], lane));
+            for (int k = 0; k < CHANNELS; ++k)
+                image[CHANNELS * (first + x) + k] = LANE(pixels.sums[b][k], lane) + left * background[k];
+            alpha_image[first + x] = 1 - left;
+        }
+    }
+}
+
+__kernel void composite_bwd(const int width, const int height, const __global Splat *splats,
+                            const __global uint *gauss_ids, const __global uint *tile_ranges,
+                            const __global uint *slots, const __global real *image, const __global real *alpha_image,
+                            const __global real *v_image, const __global real *v_alpha_image, __global real *records,
+                            const __global real *disparities) {
+    const uint t = get_global_id(0);
+    const int4 box = tile_box(t, width, height);
+    const Tile tile = {splats, disparities, gauss_ids, slots, records, box.x, box.y};
+
+    Pixels pixels;
+    for (int b = 0; b < BLOCKS; ++b) {
+        pixels.transmittance[b] = transmittance_at_first(b, box.w, box.z);
+        pixels.behind[b] = 0;
+        for (int k = 0; k < CHANNELS; ++k)
+            pixels.sums[b][k] = 0;
+    }
+    for (int r = 0; r < box.w; ++r) {
+        const size_t first = (size_t)(box.y + r) * width + box.x;
+        for (int x = 0; x < box.z; ++x) {
+            const int b = r / 4 * BLOCKS_IN_ROW + x / 4, lane = r % 4 * 4 + x % 4;
+            real sum = (alpha_image[first + x] - 1) * v_alpha_image[first + x];
+            for (int k = 0; k < CHANNELS; ++k) {
+                const real v = v_image[CHANNELS * (first + x) + k];
+                sum += image[CHANNELS * (first + x) + k] * v;
+                ((real *)&pixels.sums[b][k])[lane] = v;
+            }
+            ((real *)&pixels.behind[b])[lane] = sum;
+        }
+    }
+
+    const uint begin = tile_ranges[2 * t], end = tile_ranges[2 * t + 1];
+    for (uint i = begin; i < end; ++i) {
+        for (int k = 0; k < RECORD; ++k)
+            records[(size_t)RECORD * slots[i] + k] = 0;
+    }
+    composite_list(&tile, begin, end, &pixels);
+}
+
+#include "composite_splats.h"
