@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from clsplat.bench.commands import Kernels, Stability
+from clsplat.bench.commands import Chart, Kernels, Quality, Stability
 from clsplat.commands.compact import Compact
 from clsplat.commands.console import say
 from clsplat.commands.files import Devices, Export, Sfm
@@ -17,7 +17,10 @@ from clsplat.commands.viewing import View
 from clsplat.errors import ClsplatError
 
 BENCHMARKS = (
-    Annotated[Kernels, tyro.conf.subcommand("kernels")] | Annotated[Stability, tyro.conf.subcommand("stability")]
+    Annotated[Kernels, tyro.conf.subcommand("kernels")]
+    | Annotated[Quality, tyro.conf.subcommand("quality")]
+    | Annotated[Chart, tyro.conf.subcommand("chart")]
+    | Annotated[Stability, tyro.conf.subcommand("stability")]
 )
 
 

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from clsplat.device import Device
 
 Result = TypeVar("Result")
+Metric = Callable[..., float | None]
 
 
 def mean_metrics(
@@ -33,20 +34,26 @@ def mean_metrics(
     config: RenderConfig = RenderConfig(),
     device: "Device | None" = None,
     background: Color = (0.0, 0.0, 0.0),
-) -> dict[str, float]:
-    """Mean PSNR and SSIM over views, for the log of a training run; parameters as of `evaluate`.
+    metrics: Iterable[Metric] = (psnr, ssim),
+) -> dict[str, Any]:
+    """Mean metrics over views, for the log of a training run; parameters as of `evaluate`.
+
+    Parameters
+    ----------
+    metrics : iterable of functions of `clsplat.metrics`
 
     Returns
     -------
     dict
-        psnr in decibels, ssim.
+        By the metrics' names: psnr in decibels, ssim, flip. None where a metric is not installed.
     """
+    metrics = list(metrics)
 
-    def compare(_: int, view: View, image: NDArray[np.uint8]) -> tuple[float, float]:
-        return psnr(image, view.image, view.mask), ssim(image, view.image, view.mask)
+    def compare(_: int, view: View, image: NDArray[np.uint8]) -> list[float | None]:
+        return [metric(image, view.image, view.mask) for metric in metrics]
 
-    means = np.mean(_compared(compare, gaussians, list(views), config, device, background), axis=0)
-    return {"psnr": float(means[0]), "ssim": float(means[1])}
+    figures = zip(*_compared(compare, gaussians, list(views), config, device, background), strict=True)
+    return {m.__name__: _mean(values) for m, values in zip(metrics, figures, strict=True)}
 
 
 def evaluate(
@@ -111,12 +118,8 @@ def evaluate(
 
     records = _compared(compare, gaussians, views, config, device, background)
 
-    def mean(metric: str) -> float | None:
-        values = [record[metric] for record in records]
-        return None if None in values else float(np.mean(values))
-
     result = {
-        "mean": {metric: mean(metric) for metric in ("psnr", "psnr_fitted", "ssim", "flip")},
+        "mean": {metric: _mean([r[metric] for r in records]) for metric in ("psnr", "psnr_fitted", "ssim", "flip")},
         "num_gaussians": len(gaussians),
         "sh_degree": gaussians.sh_degree,
         "mode": config.mode,
@@ -128,6 +131,11 @@ def evaluate(
         file.write((json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode())
     write_page(out / "index.html", result)
     return result
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
 
 
 def _compared(

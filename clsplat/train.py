@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -46,6 +46,7 @@ def train(
     *,
     resume: bool = False,
     evaluate: Callable[[Gaussians], dict[str, float]] | None = None,
+    evaluate_after: Container[int] | None = None,
     progress: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> Gaussians:
     """Train Gaussians on a scene's photos.
@@ -62,6 +63,8 @@ def train(
         Continue from the checkpoint in `out`, to the same bits as a run that was never interrupted.
     evaluate : callable, optional
         Called every `config.eval_every` iterations; what it returns is logged. Its time does not count.
+    evaluate_after : container of int, optional
+        The iterations after which `evaluate` is called, in the place of those.
     progress : callable
         Called after every iteration with iteration, loss, num_gaussians and gaussians, which are the ones that train:
         to be looked at only. Its time does not count. If it raises KeyboardInterrupt, a checkpoint is written before
@@ -91,6 +94,10 @@ def train(
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
     state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
+    if evaluate_after is None:
+        evaluate_after = (
+            range(config.eval_every, config.iterations + 1, config.eval_every) if config.eval_every else ()
+        )
     photos, need = Photos(device), Footprint.of(scene, config, device)
     if config.optimizer == "device":
         move(state, device)
@@ -130,7 +137,7 @@ def train(
             if iteration % LOG_EVERY == 0 or iteration == config.iterations:
                 record = {"loss": float(np.mean(losses))}
                 losses.clear()
-            if evaluate and config.eval_every and iteration % config.eval_every == 0:
+            if evaluate and iteration in evaluate_after:
                 record |= evaluate(fetch(state.gaussians))
                 started = time.perf_counter() - state.seconds
             if record:

@@ -124,6 +124,64 @@ class Stability:
             raise ClsplatError(f"experiments failed, see above: {', '.join(failed)}")
 
 
+@dataclass(frozen=True)
+class Quality:
+    """Train on scenes by several methods, and chart what time, Gaussians, bytes and memory buy in quality."""
+
+    data: tyro.conf.Positional[tuple[str, ...]]
+    """Datasets, as given to `train`; how photos are read follows a colon: lego:background=white, fern:downscale=2."""
+    methods: tuple[str, ...] = ("paper-7k", "fast")
+    """Presets of `train`, or files as its --config takes them."""
+    budgets: tuple[str, ...] = ("own",)
+    """Caps on the number of Gaussians: a method's own, a factor of it such as x0.5, or a number such as 40000."""
+    iterations: tuple[int, ...] = ()
+    """Optimisation steps; default: each method's own."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("clsplat-quality")
+    """Folder for results.jsonl and the charts. Trainings that it holds are not repeated; failed ones are."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+    memory_limit: str | None = None
+    """Device memory that a training may use, such as 4GB."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.bench.quality import make_cells, run_cells
+        from clsplat.bench.results import FILE
+        from clsplat.device import Device, select_device
+
+        cells = make_cells(self.data, self.methods, self.budgets, self.iterations, self.memory_limit)
+        device = Device(select_device(self.device))
+        _say(f"device: {device.label}")
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.out}: expected a folder that can be made, found: {error.strerror}") from error
+        try:
+            run_cells(cells, device, self.out / FILE, _say)
+        except KeyboardInterrupt:
+            _say(f"{self.out}: the same command continues after the last training that ended")
+            raise
+        Chart(self.out).run()
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Draw the charts of `bench quality` from its results."""
+
+    out: tyro.conf.Positional[Path]
+    """Folder with results.jsonl, for index.html, and for the charts as PNG and SVG."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.bench.page import write_charts
+        from clsplat.bench.results import FILE, read_records
+
+        if not (self.out / FILE).is_file():
+            raise InputError(f"{self.out}: expected a folder with {FILE}, which `bench quality` writes, found none")
+        write_charts(read_records(self.out / FILE), self.out)
+        _say(f"charts: {self.out / 'index.html'}")
+
+
 def _read_results(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}

@@ -1,0 +1,244 @@
+"""What results of `clsplat bench quality` say: trainings, their means over scenes, Pareto fronts, tables."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clsplat.bench.results import KEYS, Record
+
+MEAN = "mean"
+"""The panel of means over scenes."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of results: its name, unit, how it is written, whether less of it is better."""
+
+    name: str
+    unit: str
+    text: Callable[[float], str]
+    less_is_better: bool = True
+
+    def written(self, value: float | None) -> str:
+        """With its unit."""
+        return "" if value is None else f"{self.text(value)} {self.unit}".strip()
+
+
+def short(value: float) -> str:
+    """A number in three digits at most: 840, 13.6k, 1.2M."""
+    for factor, suffix in ((1e6, "M"), (1e3, "k")):
+        if value >= 0.9995 * factor:
+            return f"{value / factor:.3g}{suffix}"
+    return f"{value:.3g}"
+
+
+def _megabytes(value: float) -> str:
+    return f"{value / 1e6:.3g}" if value < 999.5e6 else f"{value / 1e6:.0f}"
+
+
+def _two_digits(value: float) -> str:
+    return f"{value:.2g}" if value < 9.95 else f"{value:.0f}"
+
+
+METRICS = {
+    "psnr": Quantity("PSNR", "dB", lambda v: f"{v:.2f}", less_is_better=False),
+    "ssim": Quantity("SSIM", "", lambda v: f"{v:.3f}", less_is_better=False),
+    "flip": Quantity("FLIP", "", lambda v: f"{v:.3f}"),
+}
+"""What quality is measured by."""
+
+COSTS = {
+    "seconds": Quantity("training time", "s", _two_digits),
+    "num_gaussians": Quantity("Gaussians", "", short),
+    "spz_bytes": Quantity("file (.spz)", "MB", _megabytes),
+    "memory_bytes": Quantity("device memory", "MB", _megabytes),
+    "fps": Quantity("rendering speed", "frames/s", _two_digits, less_is_better=False),
+}
+"""What quality is charted against."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A training that ended: `samples` in the order of their iterations, the last one at its end."""
+
+    scene: str
+    method: str
+    max_gaussians: int | None
+    iterations: int
+    samples: tuple[Record, ...]
+
+    @property
+    def setting(self) -> str:
+        """Method, cap and iterations."""
+        cap = "" if self.max_gaussians is None else f" · ≤{short(self.max_gaussians)}"
+        return f"{self.method}{cap} · {short(self.iterations)} it"
+
+    @property
+    def last(self) -> Record:
+        """The sample at the end."""
+        return self.samples[-1]
+
+
+def runs(records: Iterable[Record]) -> list[Run]:
+    """The trainings that ended, in the order of the records; of several devices, methods say on which."""
+    records = [record for record in records if "iteration" in record]
+    several = len({record["device"] for record in records}) > 1
+    groups: dict[tuple[Any, ...], list[Record]] = {}
+    for record in records:
+        groups.setdefault(tuple(record[name] for name in KEYS), []).append(record)
+    return [
+        Run(
+            scene=of_key[0]["scene"],
+            method=of_key[0]["method"] + (f" ({of_key[0]['device']})" if several else ""),
+            max_gaussians=of_key[0]["max_gaussians"],
+            iterations=of_key[0]["iterations"],
+            samples=tuple(sorted(of_key, key=lambda record: int(record["iteration"]))),
+        )
+        for of_key in groups.values()
+        if any("fps" in record for record in of_key)
+    ]
+
+
+def failures(records: Iterable[Record]) -> list[tuple[str, str]]:
+    """Of each training that failed: what it was, and why."""
+    return [
+        (f"{r['scene']}, {Run('', r['method'], r['max_gaussians'], r['iterations'], ()).setting}", r["failed"])
+        for r in records
+        if "failed" in r
+    ]
+
+
+def scene_names(finished: Iterable[Run]) -> list[str]:
+    """Scenes in the order of the runs."""
+    return list(dict.fromkeys(run.scene for run in finished))
+
+
+def title(scene: str) -> str:
+    """A scene's name without how its photos were read."""
+    return scene.split(":")[0]
+
+
+def panels(finished: list[Run]) -> dict[str, list[Run]]:
+    """What is charted side by side: with several scenes the means over them, then each."""
+    scenes = scene_names(finished)
+    by_scene = {scene: [run for run in finished if run.scene == scene] for scene in scenes}
+    return by_scene if len(scenes) < 2 else {MEAN: means(finished), **by_scene}
+
+
+def means(finished: list[Run]) -> list[Run]:
+    """The mean over scenes of each setting that ended on all of them, sample by sample.
+
+    All quantities by the arithmetic mean but the rate of frames: the mean time of a frame counts.
+    """
+    scenes = scene_names(finished)
+    settings: dict[str, list[Run]] = {}
+    for run in finished:
+        settings.setdefault(run.setting, []).append(run)
+    return [
+        Run(MEAN, group[0].method, group[0].max_gaussians, group[0].iterations, _mean_samples(group))
+        for group in settings.values()
+        if len(group) == len(scenes)
+    ]
+
+
+def _mean_samples(group: list[Run]) -> tuple[Record, ...]:
+    def mean(name: str, at: tuple[Record, ...]) -> float | None:
+        values = [sample[name] for sample in at if sample.get(name) is not None]
+        if len(values) < len(at):
+            return None
+        return float(1 / np.mean(1 / np.array(values))) if name == "fps" else float(np.mean(values))
+
+    names = ["iteration", "ply_bytes", *COSTS, *METRICS]
+    return tuple({name: mean(name, at) for name in names} for at in zip(*(r.samples for r in group), strict=True))
+
+
+def front(points: list[tuple[float, float]]) -> list[int]:
+    """Indices of the points that no other one beats, by their first coordinate.
+
+    Parameters
+    ----------
+    points : list of (cost, loss)
+        Less of both is better. One point beats another that it equals in one of them and betters in the other.
+    """
+    order = sorted(range(len(points)), key=lambda i: points[i])
+    kept: list[int] = []
+    for i in order:
+        if not kept or points[i][1] < points[kept[-1]][1] or points[i] == points[kept[-1]]:
+            kept.append(i)
+    return kept
+
+
+def coordinates(sample: Record, cost: str, metric: str) -> tuple[float, float] | None:
+    """A sample as `front` takes it; None where one of both was not measured."""
+    x, y = sample.get(cost), sample.get(metric)
+    if x is None or y is None:
+        return None
+    return (x if COSTS[cost].less_is_better else -x), (y if METRICS[metric].less_is_better else -y)
+
+
+def best_settings(of_panel: list[Run], cost: str, metric: str) -> list[Run]:
+    """The runs whose end is on the Pareto front, the cheapest first."""
+    placed = [(run, point) for run in of_panel if (point := coordinates(run.last, cost, metric)) is not None]
+    return [placed[i][0] for i in front([point for _, point in placed])]
+
+
+def measured_metrics(finished: Iterable[Run]) -> list[str]:
+    """The metrics that at least one run has."""
+    return [name for name in METRICS if any(run.last.get(name) is not None for run in finished)]
+
+
+def table(finished: list[Run], cost: str) -> list[list[str]]:
+    """A row per setting and a column per panel: the cost, then the metrics. The first row is the header."""
+    metrics = measured_metrics(finished)
+    columns = panels(finished)
+    settings = list(dict.fromkeys(run.setting for run in finished))
+    head = f"{COSTS[cost].name}: {', '.join(METRICS[name].name for name in metrics)}"
+    rows = [[head, *map(title, columns)]]
+    for setting in settings:
+        row = [setting]
+        for of_panel in columns.values():
+            found = next((run.last for run in of_panel if run.setting == setting), None)
+            if found is None:
+                row.append("")
+                continue
+            figures = " / ".join(METRICS[name].text(found[name]) for name in metrics if found[name] is not None)
+            row.append(f"{COSTS[cost].written(found[cost])}: {figures}")
+        rows.append(row)
+    return rows
+
+
+def verdict(finished: list[Run], cost: str, metric: str) -> list[str]:
+    """In words: which settings are on the Pareto front, a sentence per panel."""
+    quantity, goal = COSTS[cost], METRICS[metric].name
+    sentences = []
+    for panel, of_panel in panels(finished).items():
+        best = best_settings(of_panel, cost, metric)
+        if not best:
+            continue
+        names = ", ".join(run.setting for run in best)
+        beaten = [run.setting for run in of_panel if run not in best]
+        where = "On the mean" if panel == MEAN else title(panel)
+        others = f"; beaten: {', '.join(beaten)}" if beaten else "; nothing is beaten"
+        sentences.append(f"{where}, on the Pareto front of {quantity.name} and {goal}: {names}{others}.")
+    return sentences
+
+
+def origins(records: Iterable[Record]) -> list[str]:
+    """A line per device, driver and commit: what was measured when on it."""
+    groups: dict[tuple[str, ...], list[Record]] = {}
+    for record in records:
+        key = (record["device"], str(record["driver"]), str(record["version"]), record["commit"] or "unknown")
+        groups.setdefault(key, []).append(record)
+    lines = []
+    for (device, driver, version, commit), of_key in groups.items():
+        dates = sorted(record["date"][:10] for record in of_key)
+        when = dates[0] if dates[0] == dates[-1] else f"{dates[0]} to {dates[-1]}"
+        loads = [record["load"] for record in of_key if record["load"] is not None]
+        busy = f", load of the machine before it {max(loads):.1f}" if loads else ""
+        units = of_key[0]["compute_units"]
+        lines.append(
+            f"{device}, {units} compute units, driver {driver}; clsplat {version}, commit {commit}; {when}{busy}"
+        )
+    return lines
