@@ -47,7 +47,7 @@ TRAINING_SHARE = 0.1
 JPEG_QUALITY = 90
 """Of frames: 75, viser's default, shows blocks in smooth depths."""
 
-FRUSTUM_SHARE = 0.05
+FRUSTUM_SHARE = 0.025
 """Size of a camera's frustum, in mean distances of the cameras from what they look at: some fifty do not hide it."""
 
 TEXT_EVERY = 0.25
@@ -218,7 +218,10 @@ class Viewer:
         self._server.scene.set_up_direction(tuple(start.up))
         first, initial = start.camera, self._server.initial_camera
         initial.position, initial.look_at = tuple(first.position), tuple(self._target(first))
-        initial.up, initial.fov = tuple(-first.viewmat[1, :3]), whole_view(first, first.width / first.height)
+        # Up without its part to the right looks as the photo does, and tilts the mouse's axis no more than needed.
+        right = first.viewmat[0, :3]
+        initial.up = tuple(start.up - (start.up @ right) * right)
+        initial.fov = whole_view(first, first.width / first.height)
         centres = np.array([view.camera.position for view in views])
         for view in views:
             self._frustum(view, FRUSTUM_SHARE * float(np.linalg.norm(centres - start.focus, axis=1).mean()))

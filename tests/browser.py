@@ -27,6 +27,7 @@ class Page:
     def __init__(self, socket: Any):
         self._socket, self._last, self.requests = socket, 0, []
         self.log: list[str] = []
+        self.loaded = False
         for domain in ("Page", "Network", "Runtime", "Log"):
             self.call(f"{domain}.enable")
 
@@ -38,6 +39,7 @@ class Page:
             message = json.loads(self._socket.recv(PATIENCE))
             if message.get("method") == "Network.requestWillBeSent":
                 self.requests.append(message["params"]["request"]["url"])
+            self.loaded |= message.get("method") == "Page.loadEventFired"
             if message.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled"):
                 self.log.append(json.dumps(message["params"])[:2000])
             if message.get("id") == self._last:
@@ -85,7 +87,10 @@ def browser(profile: Path, url: str, width: int, height: int) -> Iterator[Page]:
             page = Page(socket)
             size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
             page.call("Emulation.setDeviceMetricsOverride", **size)
+            page.loaded = False
             page.call("Page.navigate", url=url)
+            # Until then there is nothing to take a picture of. Any call takes in what has happened.
+            wait_for(lambda: page.call("Browser.getVersion") and page.loaded, "the page")
             yield page
     finally:
         process.terminate()
