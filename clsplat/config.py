@@ -116,6 +116,16 @@ class OptimConfig:
 
 
 @dataclass(frozen=True)
+class CoarseConfig:
+    """Coarse to fine: the first iterations see smaller photos, in less time (Chen et al. 2025, "DashGaussian")."""
+
+    factor: Literal[1, 2, 4, 8] = 1
+    """By which the photos' edges are divided at the start; halved at equal intervals. 1: no smaller photos."""
+    until: float = 0.5
+    """Fraction of the iterations after which the photos have their full size."""
+
+
+@dataclass(frozen=True)
 class AdcConfig:
     """Adaptive density control (paper, section 5.2; the original's values)."""
 
@@ -231,6 +241,7 @@ class TrainConfig:
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     init: InitConfig = field(default_factory=InitConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
+    coarse: CoarseConfig = field(default_factory=CoarseConfig)
     adc: AdcConfig = field(default_factory=AdcConfig)
     mcmc: McmcConfig = field(default_factory=McmcConfig)
     error: ErrorConfig = field(default_factory=ErrorConfig)

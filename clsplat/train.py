@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clsplat import exposure, poses, size
+from clsplat import exposure, poses, pyramid, size
 from clsplat.checkpoint import State, load_state, log_file, save_state, write_photos
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.densify import STRATEGIES, Contributions, Edit
@@ -102,12 +102,16 @@ def train(
     if config.optimizer == "device":
         move(state, device)
     losses: list[float] = []
+    training, factor = scene.train, 1
     with log_file(out / "log.jsonl", state.iteration) as log:
         started = time.perf_counter() - state.seconds
         for iteration in range(state.iteration + 1, config.iterations + 1):
+            if factor != pyramid.factor_at(iteration, config):
+                factor = pyramid.factor_at(iteration, config)
+                training, photos = [pyramid.shrunk(view, factor) for view in scene.train], Photos(device)
             intersections = state.intersections or INTERSECTIONS
             photos.keep_within(device.memory_limit - need.total(len(state.gaussians), intersections))
-            views = size.training_views(scene.train, state.search)
+            views = size.training_views(training, state.search)
             if state.strategy.due(iteration):
                 fitting = need.most_gaussians(device.memory_limit, intersections)
                 state.strategy.max_gaussians = min(config.max_gaussians or fitting, fitting)

@@ -26,7 +26,7 @@ LAYERS = """
     camera gaussians lenses
     sfm
     scene structs device reference perphoto metrics raytrace orbit
-    ops io testing still_life memory
+    ops io testing still_life memory pyramid
     page render optim densify initialize exposure report demo
     prune rasterization survey poses
     size

@@ -11,7 +11,7 @@ import pytest
 
 from clsplat.camera import Camera
 from clsplat.checkpoint import State, load_state, log_file, save_state
-from clsplat.config import AdcConfig, ErrorConfig, InitConfig, McmcConfig, OptimConfig, TrainConfig
+from clsplat.config import AdcConfig, CoarseConfig, ErrorConfig, InitConfig, McmcConfig, OptimConfig, TrainConfig
 from clsplat.densify import STRATEGIES, Edit
 from clsplat.device import Device
 from clsplat.errors import InputError
@@ -22,7 +22,7 @@ from clsplat.render import render
 from clsplat.scene import Scene, View
 from clsplat.survey import contributions
 from clsplat.testing import synthetic_scene
-from clsplat.train import _apply, initial_state, train, view_at
+from clsplat.train import _apply, initial_state, step, train, view_at
 
 SIZE = (40, 32)
 EACH_STRATEGY = pytest.mark.parametrize("strategy", STRATEGIES)
@@ -195,6 +195,41 @@ def test_noise_and_penalties_are_part_of_a_step(
         after = train(scene, replace(config, mcmc=replace(still, **{change: 1e5})), device, tmp_path)
         for name, array in after.arrays().items():
             assert (array != getattr(before, name)).any() == (name == moved), (change, name)
+
+
+def test_training_goes_from_small_photos_to_whole_ones(
+    scene: Scene, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is trained on and what growth is decided by; resumed at the second size, to the same bits."""
+    sizes: dict[int, set[tuple[int, ...]]] = {}
+    module = sys.modules["clsplat.train"]
+
+    def recorded(state: State, iteration: int, view: View, *rest: Any) -> float:
+        sizes.setdefault(view.camera.width, set()).add(view.image.shape)
+        widths.append(view.camera.width)
+        return step(state, iteration, view, *rest)
+
+    def surveyed(device: Device, gaussians: Gaussians, views: list[View], *rest: Any) -> Any:
+        assert {view.camera.width for view in views} == {widths[-1]}
+        return contributions(device, gaussians, views, *rest)
+
+    widths: list[int] = []
+    monkeypatch.setattr(module, "step", recorded)
+    monkeypatch.setattr(module, "contributions", surveyed)
+    config = replace(with_strategy("error"), coarse=CoarseConfig(factor=4, until=0.8))
+    expected = train(scene, config, device, tmp_path)
+    assert widths == 24 * [10] + 24 * [20] + 12 * [40]
+    assert sizes == {10: {(8, 10, 3)}, 20: {(16, 20, 3)}, 40: {(32, 40, 3)}}
+
+    def interrupt(record: dict[str, object]) -> None:
+        if record["iteration"] == 33:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(scene, config, device, tmp_path, progress=interrupt)
+    widths.clear()
+    assert same(train(scene, config, device, tmp_path, resume=True), expected)
+    assert widths == 15 * [20] + 12 * [40]
 
 
 def test_each_round_surveys_photos_of_its_own(
