@@ -2,12 +2,12 @@
 
 import sys
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
 
-from clsplat.bench.commands import Chart, Kernels, Quality, Stability
+from clsplat.bench.commands import Chart, Kernels, Knobs, Quality, Stability
 from clsplat.commands.compact import Compact
 from clsplat.commands.console import say
 from clsplat.commands.files import Devices, Export, Sfm
@@ -18,6 +18,7 @@ from clsplat.errors import ClsplatError
 
 BENCHMARKS = (
     Annotated[Kernels, tyro.conf.subcommand("kernels")]
+    | Annotated[Knobs, tyro.conf.subcommand("knobs")]
     | Annotated[Quality, tyro.conf.subcommand("quality")]
     | Annotated[Chart, tyro.conf.subcommand("chart")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
@@ -42,15 +43,10 @@ COMMANDS = Devices | Sfm | Train | Eval | Render | View | Export | Compact | Dem
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``clsplat``: errors that are the user's to mend print one sentence and exit with 2."""
     warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
-    arguments = sys.argv[1:] if arguments is None else arguments
     command = tyro.cli(
         COMMANDS, prog="clsplat", args=arguments, description="3D Gaussian Splatting on any OpenCL device."
     )
     try:
-        if isinstance(command, Train) and (base := command.base()):
-            # Read again: flags are told from defaults by what they are put into.
-            start = replace(command, settings=base)
-            command = tyro.cli(Train, prog="clsplat train", args=arguments[1:], default=start)
         command.run()
     except ClsplatError as error:
         say(f"clsplat: {error}")

@@ -3,7 +3,9 @@
 import os
 import re
 import warnings
+from collections.abc import Mapping
 from functools import cached_property
+from math import log2
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import pyopencl.array
 from numpy.typing import DTypeLike
 
 from clsplat import constants
-from clsplat.errors import DeviceError
+from clsplat.errors import DeviceError, InputError
 
 POCL_HINT = "install one, for example the embedded CPU driver: pip install 'clsplat[pocl]'"
 
@@ -126,6 +128,9 @@ class Device:
         Type of every real number on the device. float64 needs cl_khr_fp64 and is meant for tests.
     memory_limit : int, optional
         Bytes that buffers may take together, those kept for reuse included; default and maximum: the device's memory.
+    model : mapping, optional
+        Other values of constants of the rendering model, by their names in `MODEL_CONSTANTS`: to measure what they
+        buy. LOG2_ALPHA_MIN follows ALPHA_MIN; the twins keep the values of `clsplat.constants`.
 
     Attributes
     ----------
@@ -136,8 +141,17 @@ class Device:
     """
 
     def __init__(
-        self, cl_device: cl.Device | None = None, real: DTypeLike = np.float32, memory_limit: int | None = None
+        self,
+        cl_device: cl.Device | None = None,
+        real: DTypeLike = np.float32,
+        memory_limit: int | None = None,
+        model: Mapping[str, float] = {},
     ):
+        unknown = sorted(set(model) - set(MODEL_CONSTANTS))
+        if unknown:
+            raise InputError(f"model: expected names of {', '.join(MODEL_CONSTANTS)}, found {', '.join(unknown)}")
+        self._model = {name: getattr(constants, name) for name in MODEL_CONSTANTS} | dict(model)
+        self._model["LOG2_ALPHA_MIN"] = log2(self._model["ALPHA_MIN"])
         self.cl_device = cl_device if cl_device is not None else select_device()
         self.real: np.dtype[Any] = np.dtype(real)
         if self.real == np.float64 and "cl_khr_fp64" not in self.cl_device.extensions:
@@ -305,7 +319,7 @@ class Device:
             options.append("-DUSE_DOUBLE")
         else:
             options.append("-cl-single-precision-constant")
-        values = {name: getattr(constants, name) for name in MODEL_CONSTANTS} | defines
+        values = self._model | defines
         options += [
             f"-D{name}={value!r}" if isinstance(value, float) else f"-D{name}={value}"
             for name, value in values.items()

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from clsplat.bench.workloads import DEFAULT, Workload, from_files, scaling_names, synthetic
+from clsplat.bench.workloads import DEFAULT, KNOBS_DEFAULT, Workload, from_files, scaling_names, synthetic
 from clsplat.config import DataConfig, RenderConfig
 from clsplat.errors import ClsplatError, InputError
 
@@ -48,24 +48,13 @@ class Kernels:
         from clsplat.bench.kernels import bench_kernels
         from clsplat.bench.report import details, save_scaling_chart, summary
         from clsplat.device import Device, select_device
-        from clsplat.io.atomic import replacing
 
-        if self.repeats < 1:
-            raise InputError(f"--repeats: expected 1 or more, found {self.repeats}")
-        if self.scaling is not None and self.scaling.suffix.lower() not in CHART_SUFFIXES:
-            raise InputError(f"--scaling: expected a file named *{', *'.join(CHART_SUFFIXES)}, found {self.scaling}")
-        for path in filter(None, (self.out, self.scaling)):
-            if not path.absolute().parent.is_dir():  # said now, not after minutes of measuring
-                raise InputError(f"{path}: expected a file in a folder that exists, found no folder {path.parent}")
+        _check(self.repeats, self.out, "--scaling", self.scaling)
         workloads = self._workloads()
         device = Device(select_device(self.device))
         _say(f"device: {device.label}")
         results = bench_kernels(workloads, self.render, device, self.repeats, lambda text: _say(f"timing: {text}"))
-        # Before anything is printed: a pipe may end early.
-        if self.out is not None:
-            with replacing(self.out) as file:
-                file.write((json.dumps(results, indent=1) + "\n").encode())
-            _say(f"results: {self.out}")
+        _write(self.out, results)
         if self.scaling is not None:
             save_scaling_chart(results, self.scaling)
             _say(f"chart: {self.scaling}")
@@ -74,14 +63,56 @@ class Kernels:
             print(f"\n{details(workload)}")
 
     def _workloads(self) -> list[Workload]:
-        if (self.scene is None) != (self.cameras is None):
-            raise InputError("--scene and --cameras: expected both or neither, found one of them")
-        if self.scene is not None and self.cameras is not None:
-            if self.scaling is not None:
-                raise InputError("--scaling: expected synthetic workloads, found --scene; leave one of them out")
-            return from_files(self.scene, self.cameras, self.views, DataConfig(downscale=self.downscale))
+        if self.scene is not None and self.scaling is not None:
+            raise InputError("--scaling: expected synthetic workloads, found --scene; leave one of them out")
         names = [*self.workloads, *(scaling_names() if self.scaling is not None else ())]
-        return [synthetic(name) for name in dict.fromkeys(names)]
+        return _of_files(self.scene, self.cameras, self.views, self.downscale) or [
+            synthetic(name) for name in dict.fromkeys(names)
+        ]
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """Turn each knob of the renderer, one at a time: what it buys in time, and its error against the float64 twin."""
+
+    workload: str = KNOBS_DEFAULT
+    """Synthetic scene: number of Gaussians and image size."""
+    scene: Path | None = None
+    """File of Gaussians to use instead; needs --cameras."""
+    cameras: Path | None = None
+    """Dataset whose views the scene is seen from, as given to `train`."""
+    views: int = 1
+    """Views of the dataset, evenly spread, each a workload of its own."""
+    downscale: Literal[1, 2, 4, 8] = 1
+    """Of the dataset's photos, as given to `train`."""
+    repeats: int = 7
+    """Runs of each setting that count, in turn with as many of the default."""
+    chart: Path | None = None
+    """Error against time, for the first workload (.png, .svg, .pdf)."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """JSON file for all results."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+    """What the knobs are turned from."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.bench.knob_report import knobs_text, save_knobs_chart
+        from clsplat.bench.knobs import bench_knobs
+        from clsplat.device import Device, select_device
+
+        _check(self.repeats, self.out, "--chart", self.chart)
+        files = _of_files(self.scene, self.cameras, self.views, self.downscale)
+        device = Device(select_device(self.device))
+        _say(f"device: {device.label}")
+        workloads = files or [synthetic(self.workload)]
+        results = bench_knobs(workloads, self.render, device, self.repeats, lambda text: _say(f"turning: {text}"))
+        _write(self.out, results)
+        if self.chart is not None:
+            save_knobs_chart(results, self.chart)
+            _say(f"chart: {self.chart}")
+        print(knobs_text(results))
 
 
 @dataclass(frozen=True)
@@ -180,6 +211,38 @@ class Chart:
             raise InputError(f"{self.out}: expected a folder with {FILE}, which `bench quality` writes, found none")
         write_charts(read_records(self.out / FILE), self.out)
         _say(f"charts: {self.out / 'index.html'}")
+
+
+def _check(repeats: int, out: Path | None, chart_option: str, chart: Path | None) -> None:
+    """Refuse now what would fail after minutes of measuring."""
+    if repeats < 1:
+        raise InputError(f"--repeats: expected 1 or more, found {repeats}")
+    if chart is not None and chart.suffix.lower() not in CHART_SUFFIXES:
+        raise InputError(f"{chart_option}: expected a file named *{', *'.join(CHART_SUFFIXES)}, found {chart}")
+    for path in filter(None, (out, chart)):
+        if not path.absolute().parent.is_dir():
+            raise InputError(f"{path}: expected a file in a folder that exists, found no folder {path.parent}")
+
+
+def _write(out: Path | None, results: dict[str, Any]) -> None:
+    """The results as JSON; before anything is printed, since a pipe may end early."""
+    from clsplat.io.atomic import replacing
+
+    if out is not None:
+        with replacing(out) as file:
+            file.write((json.dumps(results, indent=1) + "\n").encode())
+        _say(f"results: {out}")
+
+
+def _of_files(
+    scene: Path | None, cameras: Path | None, views: int, downscale: Literal[1, 2, 4, 8]
+) -> list[Workload] | None:
+    """Workloads of --scene and --cameras; None where neither is given."""
+    if (scene is None) != (cameras is None):
+        raise InputError("--scene and --cameras: expected both or neither, found one of them")
+    if scene is None or cameras is None:
+        return None
+    return from_files(scene, cameras, views, DataConfig(downscale=downscale))
 
 
 def _read_results(path: Path) -> dict[str, Any]:

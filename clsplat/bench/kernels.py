@@ -1,6 +1,5 @@
 """Timings of training's step, of its stages and of their kernels, and what part of the device's limits they reach."""
 
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,39 +8,21 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat import ops
 from clsplat.bench.environment import describe
 from clsplat.bench.roof import measure_roof
+from clsplat.bench.timing import STILL, Clock, clock, quartiles, training_step
 from clsplat.bench.workloads import Workload
-from clsplat.checkpoint import State
-from clsplat.config import BACKGROUNDS, OptimConfig, RenderConfig, TrainConfig
-from clsplat.densify import STRATEGIES
+from clsplat.config import BACKGROUNDS, RenderConfig, TrainConfig
 from clsplat.device import Device
-from clsplat.memory import Photos
-from clsplat.optim import Moments
 from clsplat.render import forward, upload
-from clsplat.train import move, step
-
-ITERATION = 3001
-"""Of a default run: all bands of the spherical harmonics are trained, densification watches, and no edit is due."""
-
-STILL = OptimConfig(1e-30, 1e-30, 1e-30, 1e-30, 1e-30, 1e-30, 1e-30)
-"""Learning rates that leave every parameter as it is, so that all steps of a measurement do the same work."""
 
 WARM_UP = 2
 """Steps of each kind before those that count: they build kernels and fill the pool of buffers."""
 
 REAL = 4
 """Bytes of a real number."""
-
-# Wall time, CPU time of the process, both in seconds.
-Clock = NDArray[np.float64]
-
-
-def _clock() -> Clock:
-    return np.array([time.perf_counter(), time.process_time()])
 
 
 class _Spent:
@@ -59,10 +40,10 @@ def _watched(device: Device, kernels: bool) -> Iterator[_Spent]:
     launch, stage = device.launch, ""
 
     def timed(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        start = _clock()
+        start = clock()
         result = function(*args, **kwargs)
         device.queue.finish()
-        spent.time[name] += _clock() - start
+        spent.time[name] += clock() - start
         spent.calls[name] += 1
         return result
 
@@ -84,16 +65,6 @@ def _watched(device: Device, kernels: bool) -> Iterator[_Spent]:
         vars(device).pop("launch", None)
         for name, function in stages.items():
             setattr(ops, name, function)
-
-
-def _summary(samples: list[Clock], cores: int | None) -> dict[str, float]:
-    """Median and quartiles of wall times; median CPU time per core where the device's cores are the host's."""
-    wall, cpu = 1e3 * np.array(samples).T
-    q1, median, q3 = np.percentile(wall, [25, 50, 75])
-    result = {"median_ms": median, "q1_ms": q1, "q3_ms": q3}
-    if cores is not None:
-        result["cpu_ms"] = float(np.median(cpu)) / cores
-    return {key: round(float(value), 4) for key, value in result.items()}  # to 0.1 us
 
 
 def stage_bytes(n: int, sh_degree: int, pixels: int, intersections: int) -> dict[str, int]:
@@ -152,36 +123,21 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
     }
     del run
 
-    photos = Photos(device)
-    photos.keep_within(4 * view.image.nbytes)  # the photo and its mask stay on the device
-    state = State(
-        ITERATION - 1,
-        0.0,
-        workload.extent,
-        gaussians,
-        Moments.zeros(gaussians),
-        STRATEGIES[config.strategy](config, workload.extent, len(gaussians)),
-    )
-    move(state, device)
-
-    def one_step() -> None:
-        step(state, ITERATION, view, photos, config, device)
-        device.queue.finish()
-
+    one_step = training_step(workload, config, device)
     steps: list[Clock] = []
     samples: defaultdict[str, list[Clock]] = defaultdict(list)
     calls: dict[str, int] = {}
     for repeat in range(-WARM_UP, repeats):
-        start = _clock()
+        start = clock()
         one_step()
-        whole = _clock() - start
+        whole = clock() - start
         for kernels in (False, True):
             with _watched(device, kernels) as spent:
                 one_step()
             if repeat >= 0:
                 calls |= spent.calls
-                for name, clock in spent.time.items():
-                    samples[name].append(clock)
+                for name, time in spent.time.items():
+                    samples[name].append(time)
         if repeat >= 0:
             steps.append(whole)
 
@@ -190,9 +146,9 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
     for name, clocks in samples.items():
         stage, _, kernel = name.partition("/")
         if kernel:
-            stages[stage]["kernels"][kernel] = {"launches": calls[name], **_summary(clocks, cores)}
+            stages[stage]["kernels"][kernel] = {"launches": calls[name], **quartiles(clocks, cores)}
         else:
-            stages[stage] = {**_summary(clocks, cores), "kernels": {}}
+            stages[stage] = {**quartiles(clocks, cores), "kernels": {}}
     pixels = view.camera.width * view.camera.height
     for name, moved in stage_bytes(len(gaussians), gaussians.sh_degree, pixels, counts["intersections"]).items():
         if name in stages:
@@ -205,7 +161,7 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
         "sh_degree": gaussians.sh_degree,
         "mode": render.mode,
         "counts": counts,
-        "step": _summary(steps, cores),
+        "step": quartiles(steps, cores),
         "stages": stages,
     }
 

@@ -14,7 +14,7 @@ COLORS = ("#0072b2", "#e69f00", "#d55e00", "#009e73", "#56b4e9", "#cc79a7", "#8c
 """Okabe and Ito's, told apart with any colour vision; in the order of the stages."""
 
 
-def _table(rows: Iterable[Iterable[str]]) -> str:
+def table(rows: Iterable[Iterable[str]]) -> str:
     """Markdown: the first row is the header; all columns but the first are flush right."""
     cells = [[str(cell) for cell in row] for row in rows]
     widths = [max(3, *(len(row[i]) for row in cells)) for i in range(len(cells[0]))]
@@ -28,7 +28,8 @@ def _table(rows: Iterable[Iterable[str]]) -> str:
     return "\n".join([lines[0], rule, *lines[1:]])
 
 
-def _ms(value: float) -> str:
+def milliseconds(value: float) -> str:
+    """A time in milliseconds, to four digits."""
     return f"{value:.3f}" if value < 1 else f"{value:.4g}" if value < 1000 else f"{value:.0f}"
 
 
@@ -36,18 +37,25 @@ def _percent(fraction: float) -> str:
     return f"{100 * fraction:.3g} %"
 
 
-def summary(results: Results) -> str:
-    """The device, what it can do, and a row for each workload."""
-    device, software, settings, roof = (results[key] for key in ("device", "software", "settings", "roof"))
+def origin(results: Results) -> list[str]:
+    """Device, driver, software, date and load of a measurement, a line each."""
+    device, software = results["device"], results["software"]
     facts = [
         f"{device['label']}, {device['compute_units']} compute units",
         f"driver {device['driver']}, {device['opencl']}",
         f"clsplat {software['clsplat']}, commit {software['commit'] or 'unknown'}",
-        f"measured {results['date']}, {settings['repeats']} repeats",
-        f"compositor {settings['compositor']}, tiles of {settings['tile_size']} px",
+        f"measured {results['date']}, {results['settings']['repeats']} repeats",
     ]
     if results["load"] is not None:
         facts.append(f"{results['load']:.2f} processes ran on the machine before it")
+    return facts
+
+
+def summary(results: Results) -> str:
+    """The device, what it can do, and a row for each workload."""
+    settings, roof = results["settings"], results["roof"]
+    facts = origin(results)
+    facts.append(f"compositor {settings['compositor']}, tiles of {settings['tile_size']} px")
     limits = [
         ("multiply-add", "exp", "exp2", "copy", "triad", "buffers", "launch", "queued"),
         (
@@ -81,15 +89,15 @@ def summary(results: Results) -> str:
                 w["name"],
                 f"{w['counts']['intersections'] / 1e6:.3g} M",
                 f"{w['counts']['pairs_accepted'] / pixels:.1f}",
-                _ms(w["step"]["median_ms"]),
-                _ms(fwd["median_ms"]),
+                milliseconds(w["step"]["median_ms"]),
+                milliseconds(fwd["median_ms"]),
                 _percent(fwd["roof_fraction"]),
-                _ms(bwd["median_ms"]),
+                milliseconds(bwd["median_ms"]),
                 _percent(bwd["roof_fraction"]),
                 f"{w['step_over_compositing']:.2f}",
             )
         )
-    return "\n\n".join(["\n".join(f"- {fact}" for fact in facts), _table(limits), _table(rows)])
+    return "\n\n".join(["\n".join(f"- {fact}" for fact in facts), table(limits), table(rows)])
 
 
 def details(workload: Results) -> str:
@@ -108,15 +116,24 @@ def details(workload: Results) -> str:
         rate = f"{s['gpairs_per_s']:.3g} Gpairs/s" if "gpairs_per_s" in s else ""
         rate = f"{s['gb_per_s']:.3g} GB/s" if "gb_per_s" in s else rate
         roof = f"{_percent(s['roof_fraction'])} {s['roof']}" if "roof" in s else ""
-        quartiles = f"{_ms(s['q1_ms'])}-{_ms(s['q3_ms'])}"
-        rows.append((name, _ms(s["median_ms"]), quartiles, _ms(s["cpu_ms"]) if "cpu_ms" in s else "", rate, roof))
+        quartiles = f"{milliseconds(s['q1_ms'])}-{milliseconds(s['q3_ms'])}"
+        rows.append(
+            (
+                name,
+                milliseconds(s["median_ms"]),
+                quartiles,
+                milliseconds(s["cpu_ms"]) if "cpu_ms" in s else "",
+                rate,
+                roof,
+            )
+        )
 
     for name, stage in workload["stages"].items():
         row(name, stage)
         for kernel, s in stage["kernels"].items() if len(stage["kernels"]) > 1 else ():
             row(f"- {kernel}" + (f", {s['launches']} launches" if s["launches"] > 1 else ""), s)
     row("whole step", workload["step"])
-    return f"{text}\n\n{_table(rows)}"
+    return f"{text}\n\n{table(rows)}"
 
 
 def scaling_chart(results: Results, figure: Any) -> None:

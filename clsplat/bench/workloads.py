@@ -13,6 +13,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.scene import View
 
 DEFAULT = ("10k-640x480", "100k-640x480", "1M-640x480", "100k-1280x720")
+KNOBS_DEFAULT = "100k-640x480"
 """What is timed unless told otherwise."""
 
 SCALING_GAUSSIANS = ("10k", "30k", "100k", "300k", "1M")

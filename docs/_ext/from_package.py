@@ -25,6 +25,7 @@ from sphinx.util.docutils import SphinxDirective
 
 from clsplat import cli, config, constants, presets
 from clsplat.bench import report
+from clsplat.bench.knob_report import knobs_text
 from clsplat.bench.stability import EXPERIMENTS
 from clsplat.bench.stability import report as stability
 
@@ -204,6 +205,17 @@ class BenchKernels(SphinxDirective):
         return self.parse_text_to_nodes(report.details(workload))
 
 
+class BenchKnobs(SphinxDirective):
+    """``{bench_knobs} FILE``; the file lies beside the page."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        relative, path = self.env.relfn2path(self.arguments[0])
+        self.env.note_dependency(relative)
+        return self.parse_text_to_nodes(knobs_text(json.loads(Path(path).read_text())))
+
+
 class BenchStability(SphinxDirective):
     """``{bench_stability} FILE``; the file and its charts lie in a folder beside the page."""
 
@@ -227,5 +239,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("presets", Presets)
     app.add_directive("command", Command)
     app.add_directive("bench_kernels", BenchKernels)
+    app.add_directive("bench_knobs", BenchKnobs)
     app.add_directive("bench_stability", BenchStability)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

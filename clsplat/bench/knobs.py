@@ -1,0 +1,215 @@
+"""What each knob of the renderer buys in time and costs in accuracy, one turned at a time."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal, get_args, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.bench.environment import describe
+from clsplat.bench.timing import STILL, Clock, clock, quartiles, training_step
+from clsplat.bench.workloads import Workload
+from clsplat.config import BACKGROUNDS, RenderConfig, TrainConfig
+from clsplat.constants import ALPHA_MIN, TRANSMITTANCE_MIN
+from clsplat.device import Device
+from clsplat.gaussians import Gaussians
+from clsplat.prune import with_degree
+from clsplat.render import download, forward, upload
+
+ALPHA_MINS = (0.5 * ALPHA_MIN, 2 * ALPHA_MIN, 4 * ALPHA_MIN, 8 * ALPHA_MIN)
+TRANSMITTANCE_MINS = (0.1 * TRANSMITTANCE_MIN, 10 * TRANSMITTANCE_MIN, 100 * TRANSMITTANCE_MIN)
+"""Values beside the default: one more careful, the others ever less."""
+
+RENDER_KNOBS = ("tile_size", "sort", "compositor", "mode")
+"""Fields of RenderConfig: each of their values is a setting."""
+
+WARM_UP = 1
+"""Runs of each kind before those that count: they build kernels and fill the pool of buffers."""
+
+Image = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One position of one knob; everything else is as in the base."""
+
+    knob: str
+    value: str
+    render: RenderConfig
+    model: dict[str, float] = field(default_factory=dict)
+    sh_degree: int | None = None
+    real: Literal["float32", "float64"] = "float32"
+    optimizer: Literal["device", "numpy"] = "device"
+
+    @property
+    def renders(self) -> bool:
+        """Whether rendering knows the knob."""
+        return self.optimizer == "device"
+
+    @property
+    def trains(self) -> bool:
+        """Whether training does: it has no float64."""
+        return self.real == "float32"
+
+
+def settings(base: RenderConfig, sh_degree: int, device: Device) -> Iterator[Setting]:
+    """The base, then every other position of every knob that the device has.
+
+    Parameters
+    ----------
+    base : RenderConfig
+    sh_degree : int
+        Stored with the Gaussians.
+    device : Device
+    """
+    yield Setting("default", "", base)
+    hints = get_type_hints(RenderConfig)
+    for knob in RENDER_KNOBS:
+        for value in get_args(hints[knob]):
+            if value not in (getattr(base, knob), "auto"):
+                yield Setting(knob, str(value), replace(base, **{knob: value}))
+    for name, values, default in (
+        ("ALPHA_MIN", ALPHA_MINS, ALPHA_MIN),
+        ("TRANSMITTANCE_MIN", TRANSMITTANCE_MINS, TRANSMITTANCE_MIN),
+    ):
+        for value in values:
+            yield Setting(name, f"{value / default:g} x", base, model={name: value})
+    for degree in range(sh_degree):
+        yield Setting("SH degree", str(degree), base, sh_degree=degree)
+    if "cl_khr_fp64" in device.cl_device.extensions:
+        yield Setting("real", "float64", base, real="float64")
+    yield Setting("optimizer", "numpy", base, optimizer="numpy")
+
+
+class _Run:
+    """A setting's two jobs on a workload, ready to be timed: rendering its view, and a step of training."""
+
+    def __init__(self, setting: Setting, workload: Workload, device: Device) -> None:
+        gaussians = workload.gaussians
+        if setting.sh_degree is not None:
+            gaussians = with_degree(gaussians, setting.sh_degree)
+        self.device = Device(device.cl_device, setting.real, device.memory_limit, setting.model)
+        self.config, self.camera, self.degree = setting.render, workload.view.camera, gaussians.sh_degree
+        self.gaussians = upload(self.device, gaussians)
+        if setting.trains:
+            config = TrainConfig(render=setting.render, optim=STILL, optimizer=setting.optimizer)
+            self.step = training_step(replace(workload, gaussians=gaussians), config, self.device)
+
+    def render(self) -> Any:
+        """The image, on the device and finished."""
+        black = BACKGROUNDS["black"]
+        run = forward(self.device, self.gaussians, self.camera, self.config, black, self.degree, gradients=False)
+        self.device.queue.finish()
+        return run.image.image
+
+
+def twin_image(gaussians: Gaussians, workload: Workload, base: RenderConfig) -> Image:
+    """What everything is held against: the float64 twin with the default constants and all spherical harmonics."""
+    black = BACKGROUNDS["black"]
+    host, camera = upload(None, gaussians), workload.view.camera
+    image: Image = forward(None, host, camera, base, black, gaussians.sh_degree, gradients=False).image.image
+    return image
+
+
+def error(image: NDArray[Any], truth: Image) -> dict[str, float]:
+    """Largest and root-mean-square difference of an image from the twin's, neither clamped, and PSNR in dB."""
+    difference = np.abs(image - truth)
+    rms = float(np.sqrt(np.mean(difference**2)))
+    return {"max_abs": float(difference.max()), "rms": rms, "psnr": float(-20 * np.log10(max(rms, 1e-300)))}
+
+
+def bench_workload(
+    workload: Workload, base: RenderConfig, device: Device, repeats: int, progress: Callable[[str], None]
+) -> dict[str, Any]:
+    """Time and error of every setting on a workload.
+
+    A setting is timed in turn with the default, so that what else the machine does meets both: `ratio` is the median
+    of the quotients of neighbouring runs.
+
+    Returns
+    -------
+    dict
+        name, gaussians, width, height, sh_degree, mode; results: per setting knob, value, render and step (each a
+        summary as of `clsplat bench kernels`, and ratio; null where the job does not know the knob), error (max_abs,
+        rms, psnr).
+    """
+    gaussians, camera = workload.gaussians, workload.view.camera
+    progress(f"{workload.name}: float64 twin")
+    truth = twin_image(gaussians, workload, base)
+    cores = device.cl_device.max_compute_units if device.is_cpu else None
+    default, *others = settings(base, gaussians.sh_degree, device)
+    reference = _Run(default, workload, device)
+    results = []
+    for setting in (default, *others):
+        progress(f"{workload.name}: {setting.knob} {setting.value}".rstrip())
+        run = reference if setting is default else _Run(setting, workload, device)
+        render = _paired(reference.render, run.render, repeats, cores) if setting.renders else None
+        step = _paired(reference.step, run.step, repeats, cores) if setting.trains else None
+        found = {"render": render, "step": step, "error": error(download(run.render()), truth)}
+        results.append({"knob": setting.knob, "value": setting.value, **found})
+    return {
+        "name": workload.name,
+        "gaussians": len(gaussians),
+        "width": camera.width,
+        "height": camera.height,
+        "sh_degree": gaussians.sh_degree,
+        "mode": base.mode,
+        "results": results,
+    }
+
+
+def _paired(
+    reference: Callable[[], Any], job: Callable[[], Any], repeats: int, cores: int | None
+) -> dict[str, float]:
+    """Quartiles of a job's times, and the median of its time over that of the reference run before it."""
+    samples: list[Clock] = []
+    quotients = []
+    for repeat in range(-WARM_UP, repeats):
+        start = clock()
+        reference()
+        middle = clock()
+        job()
+        end = clock()
+        if repeat >= 0:
+            samples.append(end - middle)
+            # CPU time where it counts the device's work: what else runs on the machine does not add to it.
+            which = 0 if cores is None else 1
+            quotients.append((end - middle)[which] / (middle - start)[which])
+    return {**quartiles(samples, cores), "ratio": round(float(np.median(quotients)), 4)}
+
+
+def bench_knobs(
+    workloads: list[Workload],
+    render: RenderConfig,
+    device: Device,
+    repeats: int,
+    progress: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """Turn every knob of the renderer on every workload.
+
+    Parameters
+    ----------
+    workloads : list of Workload
+    render : RenderConfig
+        What the knobs are turned from; the mode of a workload from a file comes first.
+    device : Device
+    repeats : int
+        Runs of each kind that count; at least 1.
+    progress : callable
+        Told what is being done.
+
+    Returns
+    -------
+    dict
+        What `clsplat bench knobs -o FILE` writes: device, software, date, settings, workloads.
+    """
+    results: dict[str, Any] = {
+        "benchmark": "knobs",
+        **describe(device),
+        "settings": {"repeats": repeats, **asdict(render)},
+    }
+    results["workloads"] = [
+        bench_workload(w, replace(render, mode=w.mode or render.mode), device, repeats, progress) for w in workloads
+    ]
+    return results

@@ -1,0 +1,57 @@
+"""Clocks, what becomes of their readings, and the training step that is timed."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.bench.workloads import Workload
+from clsplat.checkpoint import State
+from clsplat.config import OptimConfig, TrainConfig
+from clsplat.densify import STRATEGIES
+from clsplat.device import Device
+from clsplat.memory import Photos
+from clsplat.optim import Moments
+from clsplat.train import move, step
+
+ITERATION = 3001
+"""Of a default run: all bands of the spherical harmonics are trained, densification watches, and no edit is due."""
+
+STILL = OptimConfig(1e-30, 1e-30, 1e-30, 1e-30, 1e-30, 1e-30, 1e-30)
+"""Learning rates that leave every parameter as it is, so that all steps of a measurement do the same work."""
+
+# Wall time, CPU time of the process, both in seconds.
+Clock = NDArray[np.float64]
+
+
+def clock() -> Clock:
+    """Now."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def quartiles(samples: list[Clock], cores: int | None) -> dict[str, float]:
+    """Median and quartiles of wall times; median CPU time per core where the device's cores are the host's."""
+    wall, cpu = 1e3 * np.array(samples).T
+    q1, median, q3 = np.percentile(wall, [25, 50, 75])
+    result = {"median_ms": median, "q1_ms": q1, "q3_ms": q3}
+    if cores is not None:
+        result["cpu_ms"] = float(np.median(cpu)) / cores
+    return {key: round(float(value), 4) for key, value in result.items()}  # to 0.1 us
+
+
+def training_step(workload: Workload, config: TrainConfig, device: Device) -> Callable[[], None]:
+    """A function that runs the same step of training on a workload, whole and to its end, each time it is called."""
+    photos = Photos(device)
+    photos.keep_within(4 * workload.view.image.nbytes)  # the photo and its mask stay on the device
+    strategy = STRATEGIES[config.strategy](config, workload.extent, len(workload.gaussians))
+    moments = Moments.zeros(workload.gaussians)
+    state = State(ITERATION - 1, 0.0, workload.extent, workload.gaussians, moments, strategy)
+    if config.optimizer == "device":
+        move(state, device)
+
+    def one_step() -> None:
+        step(state, ITERATION, workload.view, photos, config, device)
+        device.queue.finish()
+
+    return one_step
