@@ -1,11 +1,12 @@
 """How much the method's known failures cost without their remedies and with them: `clsplat bench stability`."""
 
-from clsplat.bench.stability import coordinates, order
+from clsplat.bench.stability import coordinates, order, popping
 from clsplat.bench.stability.experiment import Experiment
 
 EXPERIMENTS: dict[str, Experiment] = {
     "world-offset": coordinates.WORLD_OFFSET,
     "equal-depths": order.EQUAL_DEPTHS,
     "repeated-runs": order.REPEATED_RUNS,
+    "popping": popping.POPPING,
 }
 """In the order of docs/stability.md; a line enrols an experiment in the command, the page and the tests."""
