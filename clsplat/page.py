@@ -30,9 +30,10 @@ VENDOR = Path(__file__).resolve().parent / "vendor"
 
 TITLE = "<title>SuperSplat Viewer</title>"
 BOOTSTRAP = '<script type="application/json" id="sse-bootstrap">\n            null\n'
-MOVING = "noanim: url.searchParams.has('noanim')"
-"""Where the viewer's page says its own name, expects what it is to show, and chooses whether the camera circles by
-itself at first, which soon shows what no photo did."""
+STILL = "noanim: url.searchParams.has('noanim')"
+ANTIALIASED = "aa: url.searchParams.has('aa')"
+"""Where the viewer's page says its own name, expects what it is to show, and chooses whether the camera stands still
+at first (else it circles, and soon shows what no photo did) and whether opacities are Mip-Splatting's."""
 
 SAMPLES = 64
 """Random directions at which spherical harmonics are compared: more than the 16 coefficients of degree 3."""
@@ -100,7 +101,8 @@ def save_page(path: str | Path, gaussians: Gaussians, mode: Mode, start: Viewpoi
         (TITLE, f"<title>{html.escape(path.stem)}</title>"),
         # No "<" may stand in a script, where "</script>" would end it.
         (BOOTSTRAP, BOOTSTRAP.replace("null", json.dumps(shown).replace("<", "\\u003c"))),
-        (MOVING, "noanim: true"),
+        (STILL, "noanim: true"),
+        (ANTIALIASED, f"aa: {'true' if mode == 'antialiased' else 'false'}"),
         ("<head>", f"{notice}<head>"),
     ):
         assert page.count(place) == 1, f"clsplat/vendor: expected a page with {place!r} once"

@@ -208,6 +208,8 @@ class Viewer:
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False)
         show = gui.add_dropdown("Show", MODES)
+        if views:
+            self._add_cameras(views)
         self._text = gui.add_markdown("")
 
         @show.on_update
@@ -222,11 +224,20 @@ class Viewer:
         right = first.viewmat[0, :3]
         initial.up = tuple(start.up - (start.up @ right) * right)
         initial.fov = whole_view(first, first.width / first.height)
-        centres = np.array([view.camera.position for view in views])
-        for view in views:
-            self._frustum(view, FRUSTUM_SHARE * float(np.linalg.norm(centres - start.focus, axis=1).mean()))
         self._server.on_client_connect(self._connect)
         self._server.on_client_disconnect(self._disconnect)
+
+    def _add_cameras(self, views: "list[View]") -> None:
+        """A frustum each, and a box to tick: those that stand nearest hide the scene."""
+        parent = self._server.scene.add_frame("/cameras", show_axes=False)
+        shown = self._server.gui.add_checkbox("Cameras", True)
+        centres = np.array([view.camera.position for view in views])
+        for view in views:
+            self._frustum(view, FRUSTUM_SHARE * float(np.linalg.norm(centres - self._focus, axis=1).mean()))
+
+        @shown.on_update
+        def _(_: Any) -> None:
+            parent.visible = shown.value
 
     def _target(self, camera: Camera) -> NDArray[np.float64]:
         """The point on a camera's axis beside the focus; or as far ahead as that is behind."""
@@ -321,6 +332,8 @@ class Viewer:
             frame, legend = picture(self._device, gaussians, small, self._config, self._background, mode)
         except DeviceError as error:  # a training goes on without a picture
             frame, legend = np.zeros((1, 1, 3), np.uint8), str(error)
+        if not any(c is client for c in self._clients.values()):
+            return  # the browser has been closed in the meantime
         client.handle.scene.set_background_image(frame, format="jpeg", jpeg_quality=JPEG_QUALITY)
         now = time.perf_counter()
         if share == client.share:

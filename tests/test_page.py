@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
 from clsplat.cli import main
+from clsplat.config import RenderConfig
 from clsplat.io import load_gaussians, save_gaussians
 from clsplat.metrics import psnr, to_uint8
 from clsplat.orbit import Viewpoint, overview
@@ -84,20 +85,33 @@ class TestExport:
         assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
 
 
-@pytest.mark.parametrize("up", [(0, -1, 0), (0.5, -0.2, 0.7)], ids=["y down", "tilted world"])
-def test_a_browser_without_a_network_shows_our_render(device, tmp_path: Path, up):
+@pytest.mark.parametrize(
+    ("up", "mode"),
+    [((0, -1, 0), "classic"), ((0.5, -0.2, 0.7), "antialiased")],
+    ids=["y down", "tilted world, antialiased"],
+)
+def test_a_browser_without_a_network_shows_our_render(device, tmp_path: Path, up, mode):
     gaussians = scene()
+    gaussians.log_scales[::2] -= 3  # smaller than pixels: the modes differ there
+    gaussians.logit_opacities[::2] += 3
     centre, up = overview(gaussians).focus, np.array(up) / np.linalg.norm(up)
     beside = np.cross(up, [1.0, 2.0, 3.0])
     camera = Camera.look_at(centre + 3 * beside / np.linalg.norm(beside) + 0.8 * up, centre, up, 400, *WINDOW)
-    save_page(tmp_path / "scene.html", gaussians, "classic", Viewpoint(camera, centre, up), "black")
+    save_page(tmp_path / "scene.html", gaussians, mode, Viewpoint(camera, centre, up), "black")
     save_gaussians(tmp_path / "scene.sog", gaussians)  # the page shows what this format keeps
-    ours = to_uint8(render(load_gaussians(tmp_path / "scene.sog")[0], camera, device=device).rgb)
+    stored = load_gaussians(tmp_path / "scene.sog")[0]
+    ours, other = (
+        to_uint8(render(stored, camera, RenderConfig(mode=m), device).rgb)
+        for m in (mode, "classic" if mode == "antialiased" else "antialiased")
+    )
     url = (tmp_path / "scene.html").as_uri() + "?noui&webgl"
     with browser(tmp_path / "profile", url, *WINDOW) as page:
-        # 30 dB: mirrored, turned or upside down it has less than 15; the two blend with different roundings.
+        # 30 dB: mirrored, turned or upside down it has less than 20; the two blend with different roundings.
         wait_for(lambda: psnr(page.screenshot(), ours) > 30, "the scene as we render it")
-        assert psnr(page.screenshot()[:, ::-1], ours) < 20
-        page.call("Page.getLayoutMetrics")  # drains what the page has asked for
+        shot = page.screenshot()
+        apart = np.abs(ours.astype(int) - other) > 20
+        away_from = [np.abs(shot.astype(int) - image)[apart].mean() for image in (ours, other)]
+        assert apart.any() and away_from[0] < away_from[1], "opacities of the other mode"
+        assert psnr(shot[:, ::-1], ours) < 20
         assert page.requests[0] == url
         assert all(request.startswith(("data:", "blob:")) for request in page.requests[1:])

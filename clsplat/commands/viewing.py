@@ -1,5 +1,6 @@
 """The command `view`."""
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -46,7 +47,6 @@ class View:
         viewer = Viewer(device, config, start, views, background, host=self.host, port=self.port)
         viewer.tell({"File": self.scene.name, "Gaussians": f"{len(gaussians):,}", "Device": device.label})
         say(f"viewer: open {viewer.address} in a browser; Ctrl-C ends it")
-        try:
+        with suppress(KeyboardInterrupt):
             viewer.hold(gaussians)
-        finally:
-            viewer.close()
+        viewer.close()
