@@ -1,6 +1,8 @@
 """What a run leaves in its folder so that it can go on: the checkpoint and the log."""
 
+import io
 import json
+import math
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -97,31 +99,47 @@ def load_state(path: Path, extent: float, config: TrainConfig) -> State:
         If the file is missing or damaged, or it was made with another configuration.
     """
     arrays = _load_arrays(path)
-    saved, asked = json.loads(str(arrays["config"])), json.loads(json.dumps(asdict(config)))
-    # They do not change the result, but for a limit that is reached: whoever ran out of memory lowers it.
-    for free in ("device", "checkpoint_every", "eval_every", "memory_limit"):
-        saved.pop(free, None), asked.pop(free, None)
-    if saved != asked:
+    try:
+        saved, asked = json.loads(str(arrays["config"])), json.loads(json.dumps(asdict(config)))
+        # They do not change the result, but for a limit that is reached: whoever ran out of memory lowers it.
+        for free in ("device", "checkpoint_every", "eval_every", "memory_limit"):
+            saved.pop(free, None), asked.pop(free, None)
         changed = sorted(k for k in asked if asked[k] != saved.get(k))
+        state = None if saved != asked else _to_state(arrays, extent, config)
+    except (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected a checkpoint of clsplat, found a damaged file: {error!r}") from error
+    if state is None:
         raise InputError(f"{path}: expected the configuration it was made with, found other {', '.join(changed)}")
+    return state
 
-    def part(name: str) -> Gaussians:
-        return Gaussians(**{k: arrays[f"{name}.{k}"] for k in Gaussians.__dataclass_fields__})
 
-    gaussians = part("gaussians")
-    strategy = STRATEGIES[config.strategy](config, extent, len(gaussians))
-    strategy.statistics = {k: arrays[f"statistics.{k}"] for k in strategy.statistics}
-    moments = Moments(part("first"), part("second"))
+def _to_state(arrays: dict[str, NDArray[Any]], extent: float, config: TrainConfig) -> State:
+    def part(name: str, like: Gaussians | None = None) -> Gaussians:
+        gaussians = Gaussians(**{k: arrays[f"{name}.{k}"] for k in Gaussians.__dataclass_fields__}).validate()
+        for field, array in gaussians.arrays().items():
+            if array.dtype != np.float32 or array.shape != (like or gaussians).arrays()[field].shape:
+                raise ValueError(f"{name}.{field} of type {array.dtype} and shape {array.shape}")
+        return gaussians
+
+    def kept(gaussians: str, prefix: str) -> Kept:
+        rows = part(gaussians)
+        statistics = STRATEGIES[config.strategy](config, extent, len(rows)).statistics
+        for name, fresh in statistics.items():
+            array = statistics[name] = arrays[f"{prefix}statistics.{name}"]
+            if array.dtype != fresh.dtype or array.shape != fresh.shape:
+                raise ValueError(f"{prefix}statistics.{name} of type {array.dtype} and shape {array.shape}")
+        return Kept(rows, Moments(part(f"{prefix}first", rows), part(f"{prefix}second", rows)), statistics)
+
+    now, search = kept("gaussians", ""), None
+    strategy = STRATEGIES[config.strategy](config, extent, len(now.gaussians))
+    strategy.statistics = now.statistics
     numbers = int(arrays["iteration"]), float(arrays["seconds"]), extent
-    search = None
     if "search" in arrays:
         saved = json.loads(str(arrays["search"]))
         search = Search([Point(*p) for p in saved["points"]], saved["grown"], saved["settled"])
         if "best.means" in arrays:
-            best = Moments(part("best.first"), part("best.second"))
-            rows = {k: arrays[f"best.statistics.{k}"] for k in strategy.statistics}
-            search.best = Kept(part("best"), best, rows)
-    state = State(*numbers, gaussians, moments, strategy, float(arrays["intersections"]), search)
+            search.best = kept("best", "best.")
+    state = State(*numbers, now.gaussians, now.moments, strategy, float(arrays["intersections"]), search)
     for name in ("exposures", "poses"):
         learned = {k.removeprefix(f"{name}."): a for k, a in arrays.items() if k.startswith(f"{name}.")}
         if learned:
@@ -131,14 +149,32 @@ def load_state(path: Path, extent: float, config: TrainConfig) -> State:
 
 def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            return dict(file)
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            if any(member.file_size > member.compress_size for member in members):
+                raise ValueError("compressed arrays")  # NumPy's savez leaves them as they are
+            return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}
     except FileNotFoundError as error:
         raise InputError(
             f"{path}: expected a checkpoint to resume from, found none; start without --resume"
         ) from error
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (EOFError, NotImplementedError, OSError, RuntimeError, ValueError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: expected a checkpoint of clsplat, found a damaged file: {error}") from error
+
+
+def _array(content: bytes) -> NDArray[Any]:
+    """The array of an .npy file. NumPy's own reader allocates whatever the header says, before it looks for it."""
+    file = io.BytesIO(content)
+    try:
+        if np.lib.format.read_magic(file) != (1, 0):
+            raise ValueError("an array in another version of NumPy's format")
+        shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
+    except Exception as error:  # the header is Python, and is parsed as such: SyntaxError, TokenError, MemoryError ...
+        raise ValueError(f"an array whose header cannot be read: {error}") from error
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content) - file.tell():
+        raise ValueError(f"an array of shape {shape} and type {dtype} in {len(content)} bytes")
+    flat = np.frombuffer(content, dtype, offset=file.tell())
+    return flat.reshape(shape, order="F" if fortran_order else "C").copy()
 
 
 @contextmanager

@@ -157,7 +157,10 @@ def _read(folder: Path, name: str, read_bin: Any, read_txt: Any) -> tuple[Path, 
 
 
 def _viewmat(quat: Any, translation: Any, name: str, path: Path) -> NDArray[np.float64]:
-    w, x, y, z = np.asarray(quat, dtype=np.float64) / np.linalg.norm(quat) if any(quat) else [np.nan] * 4
+    largest = max(map(abs, quat))  # divided by first: the squares of what a damaged file holds may overflow
+    known = 0 < largest < np.inf and np.isfinite((*quat, *translation)).all()
+    scaled = np.array(quat) / largest if known else np.full(4, np.nan)
+    w, x, y, z = scaled / np.linalg.norm(scaled)
     viewmat = np.eye(4)
     viewmat[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

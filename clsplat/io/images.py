@@ -154,12 +154,19 @@ def warn_of_missing(source: Path, names: Sequence[str], files: Sequence[Path | N
 def _find(root: Path, name: str, downscale: int = 1) -> Path | None:
     folder, _, rest = name.partition("/")
     path = root / (name if downscale == 1 else f"{folder}_{downscale}/{rest}")
-    if path.is_file():
+    if _is_file(path):
         return path
     # Smaller copies often have another ending, and Blender's transforms leave it out.
     stem = path.with_suffix("") if path.suffix.lower() in SUFFIXES else path
     candidates = (stem.with_name(stem.name + case) for suffix in SUFFIXES for case in (suffix, suffix.upper()))
-    return next((file for file in candidates if file.is_file()), None)
+    return next((file for file in candidates if _is_file(file)), None)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is longer than the system's files have
+        return False
 
 
 def find_mask(folder: Path, name: str) -> Path:
@@ -173,7 +180,7 @@ def find_mask(folder: Path, name: str) -> Path:
     plain = folder / name
     candidates = [plain.with_suffix(".png"), plain.with_name(plain.name + ".png")]
     for file in candidates:
-        if file.is_file():
+        if _is_file(file):
             return file
     raise InputError(
         f"{candidates[0]}: expected the mask of photo {name} there or in {candidates[1].name}, found none"

@@ -1,0 +1,375 @@
+"""Damaged files of every kind: read, or refused by an error that names the file; never more memory than they are worth.
+
+A file is made as a program writes it, then cut, flipped, spliced, and given extreme numbers where it has numbers; inside
+its compression too. `make fuzz` runs the same tests with many more cases.
+"""
+
+import gzip
+import io
+import json
+import re
+import struct
+import tracemalloc
+import warnings
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from test_io_colmap import write_bin, write_photos, write_txt
+from test_io_dataset import write_transforms
+
+from clsplat.checkpoint import load_state, save_state
+from clsplat.config import DataConfig, TrainConfig
+from clsplat.errors import InputError
+from clsplat.io import FORMATS, colmap, load_gaussians, load_scene, save_gaussians, transforms
+from clsplat.io.compact import EXPANSION_FREE
+from clsplat.photos import orientation, photo_size, read_photo
+from clsplat.testing import synthetic_scene
+from clsplat.train import initial_state
+from clsplat.scene import Scene, View
+
+MEMORY_MAX = 3 * EXPANSION_FREE
+"""Bytes that reading a file of some kB may allocate: what files unfold to at most, and float copies of it."""
+
+EXTREMES = [
+    *(struct.pack("<Q", n) for n in (0, 1, 255, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**53, 2**63 - 1, 2**64 - 1)),
+    *(struct.pack("<I", n) for n in (0, 1, 3, 2**24, 2**31 - 1, 2**31, 2**32 - 1)),
+    *(struct.pack("<f", x) for x in (np.nan, np.inf, -np.inf, 1e-45, 1e-38, 3e38, -3e38)),
+    *(struct.pack("<d", x) for x in (np.nan, np.inf, -np.inf, 5e-324, 1e308, -1e308, 1e200)),
+    *(bytes([n]) for n in (0, 1, 9, 10, 32, 34, 46, 47, 92, 127, 128, 255)),
+]
+NUMBERS = [
+    *("0", "-1", "1", "2", "255", "256", "65536", "4294967296", "1000000000000", "-9223372036854775808", "9" * 400),
+    *("nan", "NaN", "inf", "-Infinity", "1e308", "1e999", "-1e-320", "0x10", "1_0", "", " ", "\0", "x", "\n", "٣"),
+]
+JSON_VALUES = [
+    *(None, True, False, 0, -1, 1, 0.5, 1e308, -1e308, 10**400, 2**63, float("nan"), float("inf"), 1e-320),
+    *("", "x", "../x.png", "/etc/passwd", "a\0b.png", "C:\\x.png", "x" * 300, "\ud800", ".", "a/../../b.png"),
+    *([], {}, [[]], [1, 2, 3], {"x": 1}, [[1, 2], [3]], ["x"]),
+]
+PLACES = st.integers(0, 2**20)
+CUT = st.tuples(st.just("cut"), PLACES)
+FLIP = st.tuples(st.just("flip"), PLACES, st.integers(0, 7))
+PUT = st.tuples(st.just("put"), PLACES, st.sampled_from(EXTREMES))
+SPLICE = st.tuples(st.just("splice"), PLACES, PLACES, PLACES)
+NUMBER = st.tuples(st.just("number"), PLACES, st.sampled_from(NUMBERS))
+BINARY = st.lists(st.one_of(CUT, FLIP, PUT, SPLICE), min_size=1, max_size=4)
+TEXT = st.lists(st.one_of(NUMBER, NUMBER, CUT, FLIP, PUT, SPLICE), min_size=1, max_size=4)
+ANY = st.one_of(BINARY, TEXT)
+
+
+def damaged(content, changes):
+    """The bytes after changes of the kinds above; places count modulo what is there."""
+    for kind, *at in changes:
+        if not content:
+            break
+        place = at[0] % len(content)
+        if kind == "cut":
+            content = content[:place]
+        elif kind == "flip":
+            content = content[:place] + bytes([content[place] ^ 1 << at[1]]) + content[place + 1 :]
+        elif kind == "put":
+            content = content[:place] + at[1] + content[place + len(at[1]) :]
+        elif kind == "splice":
+            start = at[1] % len(content)
+            content = content[:place] + content[start : start + at[2] % 64] + content[place:]
+        elif kind == "number":
+            if found := list(re.finditer(rb"[-+.\w]+", content)):
+                match = found[at[0] % len(found)]
+                content = content[: match.start()] + at[1].encode() + content[match.end() :]
+    return content
+
+
+def changed(value, place, new):
+    """A JSON value with one of its parts, of any depth, replaced or removed (where `new` is ...)."""
+    paths = []
+
+    def walk(part, path):
+        paths.append(path)
+        for key, inner in part.items() if isinstance(part, dict) else enumerate(part) if isinstance(part, list) else ():
+            walk(inner, (*path, key))
+
+    walk(value, ())
+    path = paths[place % len(paths)]
+    if not path:
+        return None if new is ... else new
+    part = value = json.loads(json.dumps(value))
+    for key in path[:-1]:
+        part = part[key]
+    if new is ...:
+        del part[path[-1]]
+    else:
+        part[path[-1]] = new
+    return value
+
+
+JSON_CHANGES = st.lists(st.tuples(PLACES, st.sampled_from([*JSON_VALUES, ...])), min_size=1, max_size=3)
+
+
+def read(load, name):
+    """What `load` returns, or None where it refuses the file by `name`; anything else is a failure."""
+    tracemalloc.start()
+    try:
+        with warnings.catch_warnings():
+            # Words to the user, and Pillow's about large images; NumPy's would mean that something went unchecked.
+            warnings.simplefilter("ignore", UserWarning)
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            return load()
+    except InputError as error:
+        assert name in str(error), f"the message does not name {name}: {error}"
+        return None
+    finally:
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < MEMORY_MAX, f"{peak} bytes"
+
+
+def check_gaussians(path, content, cases):
+    path.write_bytes(content)
+    cases["files of Gaussians"] += 1
+    found = read(lambda: load_gaussians(path), path.name)
+    if found is not None:
+        gaussians, mode, offset = found
+        assert len(gaussians.validate()) > 0 and mode in ("classic", "antialiased")
+        assert all(np.isfinite(array).all() for array in gaussians.arrays().values()) and np.isfinite(offset).all()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@pytest.fixture(scope="module")
+def originals(folder):
+    """A whole file of each format, and the ASCII kind of PLY."""
+    scene = synthetic_scene(9, sh_degree=1)[0].astype(np.float32)
+    files = {}
+    for suffix in FORMATS:
+        path = folder / f"whole{suffix}"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            save_gaussians(path, scene, "antialiased")
+        files[suffix] = path.read_bytes()
+    from plyfile import PlyData
+
+    text = PlyData.read(folder / "whole.ply")
+    text.text = True
+    text.write(folder / "text.ply")
+    files["ascii"] = (folder / "text.ply").read_bytes()
+    return files
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_damaged_files_of_gaussians(folder, originals, cases, suffix):
+    """Bytes of the file as it is: headers, counts, compressed streams."""
+
+    @given(ANY)
+    def check(changes):
+        check_gaussians(folder / f"damaged{suffix}", damaged(originals[suffix], changes), cases)
+
+    check()
+
+
+def test_damaged_text_ply(folder, originals, cases):
+    @given(TEXT)
+    def check(changes):
+        check_gaussians(folder / "damaged.ply", damaged(originals["ascii"], changes), cases)
+
+    check()
+
+
+def test_damage_inside_spz(folder, originals, cases):
+    plain = gzip.decompress(originals[".spz"])
+
+    @given(BINARY)
+    def check(changes):
+        check_gaussians(folder / "inner.spz", gzip.compress(damaged(plain, changes), 1), cases)
+
+    check()
+
+
+def test_damage_inside_sog(folder, originals, cases):
+    with zipfile.ZipFile(io.BytesIO(originals[".sog"])) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(parts["meta.json"])
+
+    @given(JSON_CHANGES, st.sampled_from(["", *parts]), ANY)
+    def check(edits, name, changes):
+        edited = meta
+        for place, new in edits:
+            edited = changed(edited, place, new)
+        files = {**parts, "meta.json": json.dumps(edited).encode()}
+        if name:
+            files[name] = damaged(files[name], changes)
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w") as archive:
+            for entry, content in files.items():
+                archive.writestr(entry, content)
+        check_gaussians(folder / "inner.sog", file.getvalue(), cases)
+
+    check()
+
+
+@pytest.mark.parametrize("ending", ["bin", "txt"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_damaged_colmap_models(folder, cases, ending, name):
+    model = folder / f"{ending}-{name}"
+    {"bin": write_bin, "txt": write_txt}[ending](model)
+    path = model / f"{name}.{ending}"
+    whole = path.read_bytes()
+
+    @given(TEXT if ending == "txt" else ANY)
+    def check(changes):
+        path.write_bytes(damaged(whole, changes))
+        cases["COLMAP models"] += 1
+        # A camera that is missing is missed by the photos, which name both files.
+        found = read(lambda: colmap.read_model(model), f"{model.name}/")
+        if found is not None:
+            _, images, points, _ = found
+            assert images and np.isfinite(points).all()
+            for _, _, viewmat in images:
+                rotation = viewmat[:3, :3]
+                assert np.isfinite(viewmat).all()
+                np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+
+    check()
+
+
+NAMES = st.one_of(
+    st.sampled_from([v for v in JSON_VALUES if isinstance(v, str)]),
+    st.lists(st.sampled_from(["..", ".", "a", "a.png", "/", "\\", "C:", "~", " ", "images", "%2e%2e"]), max_size=5).map(
+        "/".join
+    ),
+    st.text(max_size=20),
+)
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt", "transforms"])
+def test_names_of_photos_stay_in_the_folder(folder, cases, kind):
+    """What lies outside of the dataset is not read, whatever path leads there."""
+    outside = folder / kind
+    root = outside / "inner" / "data"
+    photos = [("a.png", 1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0))]
+    for place in (root / "images", root / "images" / "a", root, outside, outside / "inner"):
+        write_photos(place, photos)
+
+    @given(NAMES)
+    def check(name):
+        cases["names of photos"] += 1
+        if kind == "transforms":
+            (root / "transforms.json").write_text(
+                json.dumps({"fl_x": 20, "frames": [{"file_path": name, "transform_matrix": np.eye(4).tolist()}]})
+            )
+            found = read(lambda: transforms.read_dataset(root, DataConfig()), root.name)
+        else:
+            rows = [(name.encode("utf-8", "ignore").decode(), *photos[0][1:])]
+            {"bin": write_bin, "txt": write_txt}[kind](root / "sparse", images=rows)
+            found = read(lambda: colmap.read_dataset(root, root / "sparse", DataConfig()), root.name)
+        for photo in found.photos if found is not None else ():
+            assert photo.path.resolve().is_relative_to(root.resolve()), photo.path
+
+    check()
+
+
+def test_damaged_transforms(folder, cases):
+    """Any value of any kind in any place of the JSON, and damage to its text."""
+    root = folder / "transforms"
+    write_transforms(root, ["images/a.png", "images/b.png"])
+    path = root / "transforms.json"
+    meta = json.loads(path.read_text())
+    extra = {"w": 16, "h": 12, "fl_y": 20.0, "cx": 8, "cy": 6, "k1": 0.01, "camera_model": "OPENCV"}
+    meta |= extra | {"ply_file_path": "points.ply", "test_filenames": ["images/a.png"]}
+    meta["frames"][0]["mask_path"] = "images/a.png"
+    (root / "points.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n"
+    )
+
+    @given(JSON_CHANGES, st.one_of(st.just([]), TEXT))
+    def check(edits, changes):
+        edited = meta
+        for place, new in edits:
+            edited = changed(edited, place, new)
+        path.write_bytes(damaged(json.dumps(edited).encode(), changes))
+        cases["transforms.json"] += 1
+        found = read(lambda: load_scene(root, DataConfig(test_every=0)), "")
+        if found is not None:
+            assert all(np.isfinite(view.camera.viewmat).all() for view in found.train)
+
+    check()
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+def test_damaged_points_of_transforms(folder, originals, cases, kind):
+    root = folder / f"points-{kind}"
+    write_transforms(root, ["images/a.png"])
+    meta = json.loads((root / "transforms.json").read_text()) | {"ply_file_path": "points.ply"}
+    (root / "transforms.json").write_text(json.dumps(meta))
+
+    @given(TEXT)
+    def check(changes):
+        (root / "points.ply").write_bytes(damaged(originals["ascii" if kind == "ascii" else ".ply"], changes))
+        cases["points of transforms.json"] += 1
+        found = read(lambda: transforms.read_dataset(root, DataConfig()), "points.ply")
+        assert found is None or np.isfinite(found.points).all()
+
+    check()
+
+
+IMAGES = {"png": "PNG", "jpg": "JPEG", "webp": "WEBP", "tif": "TIFF", "bmp": "BMP"}
+
+
+@pytest.mark.parametrize("ending", IMAGES)
+def test_damaged_photos(folder, cases, ending):
+    path = folder / f"photo.{ending}"
+    pixels = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(pixels).save(path, format=IMAGES[ending], **({} if ending == "bmp" else {"exif": exif}))
+    whole = path.read_bytes()
+
+    @given(BINARY)
+    def check(changes):
+        path.write_bytes(damaged(whole, changes))
+        cases["photos"] += 1
+        size = read(lambda: photo_size(path), path.name)
+        turned = read(lambda: orientation(path), path.name)
+        photo = read(lambda: read_photo(path, (0.0, 0.0, 0.0), upright=True), path.name)
+        assert turned in (None, *range(1, 9)) and (size is None or min(size) >= 0)
+        assert photo is None or (photo.dtype == np.uint8 and photo.ndim == 3 and photo.shape[2] == 3)
+
+    check()
+
+
+def test_damaged_checkpoints(folder, cases):
+    """Bytes of the file, and of the arrays in it: their headers say how much memory to take."""
+    _, camera = synthetic_scene(1)
+    photo = np.zeros((camera.height, camera.width, 3), np.uint8)
+    scene = Scene([View("a", camera, photo)], [], np.random.default_rng(0).normal(size=(9, 3)), np.zeros((9, 3), np.uint8))
+    config = TrainConfig()
+    path = folder / "checkpoint.npz"
+    save_state(path, initial_state(scene, config), config)
+    whole = path.read_bytes()
+    with zipfile.ZipFile(io.BytesIO(whole)) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+
+    @given(st.sampled_from(["", *parts]), ANY, st.sampled_from(["", *parts]))
+    def check(name, changes, removed):
+        content = damaged(whole, changes)
+        if name:
+            file = io.BytesIO()
+            with zipfile.ZipFile(file, "w") as archive:
+                for entry, inner in parts.items():
+                    if entry != removed:
+                        archive.writestr(entry, damaged(inner, changes) if entry == name else inner)
+            content = file.getvalue()
+        path.write_bytes(content)
+        cases["checkpoints"] += 1
+        found = read(lambda: load_state(path, 1.0, config), path.name)
+        if found is not None:
+            n = len(found.gaussians.validate())
+            assert {len(found.moments.first.validate()), len(found.moments.second.validate())} == {n} and n > 0
+
+    check()
