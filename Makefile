@@ -1,6 +1,6 @@
 PYTHON = python
 
-.PHONY: test test-slow stability lint docs check-races bench bench-stability formats
+.PHONY: test test-slow stability fuzz lint docs check-races bench bench-stability formats
 
 # The default tests: a few minutes on two cores.
 test:
@@ -13,6 +13,11 @@ test-slow:
 # Of these, the trainings that show that a known failure of the method is held off.
 stability:
 	$(PYTHON) -m pytest -m slow tests/stability tests/test_faults.py
+
+# The fuzzed tests with CASES cases each, drawn anew: more than 100 000 in all, about half an hour.
+CASES = 4000
+fuzz:
+	CLSPLAT_FUZZ=$(CASES) $(PYTHON) -m pytest --hypothesis-profile=fuzz $(shell ls tests/stability/test_fuzz_*.py)
 
 # Style, types, and the kernels' format.
 lint:

@@ -27,7 +27,7 @@ class Camera:
     Raises
     ------
     InputError
-        If a value is not finite, a focal length or a size is not positive, or the rotation is not one
+        If a value is not finite as float32, a focal length or a size is not positive, or the rotation is not one
         (not orthonormal to 1e-3, or a reflection).
     """
 
@@ -45,8 +45,9 @@ class Camera:
             raise InputError(f"viewmat: expected shape (4, 4), found {viewmat.shape}")
         object.__setattr__(self, "viewmat", viewmat)
         intrinsics = np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64)
-        if not np.isfinite(viewmat).all() or not np.isfinite(intrinsics).all():
-            raise InputError("camera: expected finite viewmat and intrinsics, found NaN or infinity")
+        values = np.abs(np.append(viewmat, intrinsics))
+        if not (values <= np.finfo(np.float32).max).all():
+            raise InputError(f"camera: expected finite viewmat and intrinsics, as float32, found {values.max()}")
         if self.fx <= 0 or self.fy <= 0:
             raise InputError(f"camera: expected positive focal lengths, found fx={self.fx}, fy={self.fy}")
         if self.width < 1 or self.height < 1:

@@ -169,7 +169,9 @@ def _array(content: bytes) -> NDArray[Any]:
         if np.lib.format.read_magic(file) != (1, 0):
             raise ValueError("an array in another version of NumPy's format")
         shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
-    except Exception as error:  # the header is Python, and is parsed as such: SyntaxError, TokenError, MemoryError ...
+    except (
+        Exception
+    ) as error:  # the header is Python, and is parsed as such: SyntaxError, TokenError, MemoryError ...
         raise ValueError(f"an array whose header cannot be read: {error}") from error
     if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content) - file.tell():
         raise ValueError(f"an array of shape {shape} and type {dtype} in {len(content)} bytes")

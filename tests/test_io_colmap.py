@@ -165,6 +165,21 @@ def test_bad_values_are_refused_with_file_and_photo(tmp_path, ending, change, me
         read_model(tmp_path)
 
 
+def test_quaternions_of_any_length_are_directions(tmp_path, ending):
+    """The squares of 1e200 overflow: the rotation had silently become none."""
+    WRITERS[ending](tmp_path / "plain")
+    WRITERS[ending](tmp_path / "long", images=changed(IMAGES, 1, (1e200, 0.0, 1e200, 0.0), IMAGES[1][3]))
+    plain, long = (read_model(tmp_path / name)[1][1][2] for name in ("plain", "long"))
+    np.testing.assert_allclose(long, plain, atol=1e-15)
+
+
+def test_a_name_longer_than_files_have_is_a_missing_photo(tmp_path):
+    write_txt(tmp_path / "sparse", images=changed(IMAGES, 0, "x" * 300, *IMAGES[0][1:]))
+    write_photos(tmp_path / "images", IMAGES[1:])
+    with pytest.warns(UserWarning, match="1 of 3 photos have no file"):
+        assert len(read_dataset(tmp_path, tmp_path / "sparse", DataConfig()).photos) == 2
+
+
 def test_unknown_camera_models_are_refused(tmp_path):
     write_bin(tmp_path)
     path = tmp_path / "cameras.bin"

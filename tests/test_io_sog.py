@@ -162,6 +162,16 @@ def broken_files():
         "words": (PICTURES, meta2(scales={"codebook": ["a"] * 256, "files": ["scales.webp"]}), "lacking: ValueError"),
         "nan": (PICTURES, meta2(scales={"codebook": [np.nan] * 256, "files": ["scales.webp"]}), "found log_scales"),
         "range": (PICTURES, meta2(means=meta2()["means"] | {"maxs": [1e9, 1, 1]}), "found means"),
+        "beyond floats": (
+            PICTURES,
+            meta2(means=meta2()["means"] | {"maxs": [10**400, 1, 1]}),
+            "lacking: OverflowErr",
+        ),
+        "one range": (
+            PICTURES,
+            meta2(means=meta2()["means"] | {"mins": [0], "maxs": [1]}),
+            r"means of shape \(2, 3\)",
+        ),
         "picture": (PICTURES | {"quats.webp": b"RIFF"}, meta2(), "quats.webp to be a picture"),
         "cut": (PICTURES | {"quats.webp": PICTURES["quats.webp"][:-9]}, meta2(), "expected"),
         "no picture": ({k: v for k, v in PICTURES.items() if k != "quats.webp"}, meta2(), "lacking: KeyError"),

@@ -316,3 +316,39 @@ def test_fox_agrees_with_its_colmap_model(shared, tmp_path, downscale):
         assert np.degrees(np.arccos((np.trace(relative) - 1) / 2)) < 1.0
     np.testing.assert_allclose(ours[0].camera.fx, theirs[0].camera.fx, rtol=0.001)
     np.testing.assert_allclose(ours[0].image.shape, theirs[0].image.shape, atol=4)
+
+
+def test_whole_numbers_in_text_are_not_wrapped(root):
+    """300 as uchar would be 44."""
+    header = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    colours = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    (root / "points.ply").write_text(f"{header}{colours}end_header\n1 2 3 300 0 0\n")
+    write(root, fl_x=50, ply_file_path="points.ply")
+    with pytest.raises(InputError, match=r"points\.ply: expected red within uint8"):
+        read_dataset(root, DataConfig())
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_points_declared_but_not_there_take_no_memory(root, kind):
+    header = f"ply\nformat {kind} 1.0\nelement vertex 100000000000\n" + "".join(
+        f"property float {a}\n" for a in "xyz"
+    )
+    (root / "points.ply").write_text(f"{header}end_header\n1 2 3\n")
+    write(root, fl_x=50, ply_file_path="points.ply")
+    with pytest.raises(InputError, match=r"points\.ply: expected at least \d+ bytes"):
+        read_dataset(root, DataConfig())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"mask_path": None}, {"fl_x": 10**400}, {"w": 1e300, "h": 7.5e299}, {"transform_matrix": [[10**400] * 4] * 4}],
+    ids=["mask", "focal length", "size", "pose"],
+)
+def test_values_that_broke_the_reader(root, change):
+    """Found by fuzzing: TypeError, OverflowError, and lists of 1e300 pixels."""
+    first, *others = frames()
+    (root / "transforms.json").write_text(
+        json.dumps({"frames": [first | {"fl_x": 50} | change, *others], "fl_x": 50})
+    )
+    with pytest.raises(InputError, match="transforms"):
+        read_dataset(root, DataConfig())

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -151,6 +152,22 @@ def test_resume_refuses_what_would_not_continue(scene: Scene, device: Device, tm
     (tmp_path / "checkpoint.npz").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match=r"checkpoint\.npz: .* found a damaged file"):
         train(scene, CONFIG, device, tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("shape", ["(1000000000000, 3)", "(3, 3", "(40, 3), 'x': [" + "(" * 3000])
+def test_arrays_that_lie_take_no_memory(scene: Scene, tmp_path: Path, shape: str) -> None:
+    """NumPy's reader allocates what an array's header says; this one is refused before."""
+    state, path = initial_state(scene, CONFIG), tmp_path / "checkpoint.npz"
+    save_state(path, state, CONFIG)
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, part in parts.items():
+            archive.writestr(name, content if name == "gaussians.means.npy" else part)
+    with pytest.raises(InputError, match=r"checkpoint\.npz: .* found a damaged file: an array"):
+        load_state(path, scene.extent, CONFIG)
 
 
 @EACH_STRATEGY

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clsplat.config import DataConfig
 from clsplat.errors import InputError
 from clsplat.io.images import (
+    SIZE_MAX,
     Dataset,
     PhotosMissing,
     PosedPhoto,
@@ -46,9 +47,6 @@ MODELS: tuple[tuple[str, int], ...] = (
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 """Where a dataset may have its model, in order."""
-
-SIZE_MAX = 1 << 20
-"""Pixels per edge; a larger size is damage, and undistortion takes time in proportion to it."""
 
 Model = tuple[
     dict[int, Intrinsics], list[tuple[str, int, NDArray[np.float64]]], NDArray[np.float64], NDArray[np.uint8]

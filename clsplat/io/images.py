@@ -20,6 +20,9 @@ from clsplat.lenses import Intrinsics, is_pinhole, project, undistorted
 from clsplat.photos import SUFFIXES, orientation, photo_size, read_mask, read_photo
 from clsplat.scene import View
 
+SIZE_MAX = 1 << 20
+"""Pixels per edge; a larger size is damage, and undistortion takes time in proportion to it."""
+
 ASPECT_TOLERANCE = 0.01
 """By how much a photo's aspect ratio may differ from its camera's; a smaller copy is off by up to a pixel besides."""
 
@@ -81,15 +84,16 @@ class Dataset:
     upright: bool = False
 
 
-def checked_name(name: str, source: Path) -> str:
+def checked_name(name: Any, source: Path) -> str:
     """A path inside a dataset with forward slashes and without ``./``.
 
     Raises
     ------
     InputError
-        If it is empty, absolute, or climbs out of the dataset; the message names the file `source` that has it.
+        If it is no text, empty, absolute, or climbs out of the dataset; the message names the file `source` that
+        has it.
     """
-    path = PurePosixPath(name.replace("\\", "/"))
+    path = PurePosixPath(name.replace("\\", "/")) if isinstance(name, str) else PurePosixPath()
     if not path.parts or path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts or "\0" in name:
         raise InputError(f"{source}: expected the names of photos inside the dataset's folder, found {name!r}")
     return path.as_posix()

@@ -150,15 +150,26 @@ def _load(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArray[np
             f"found {rest}"
         )
     wanted = [*REQUIRED, *rest_names]
-    _check_size(path, list(elements.values()), counts, order, (len(header), size))
-    file.seek(len(header))
-    before = list(elements).index("vertex")
-    if order == "=":
-        data = _read_text(path, file, sum(counts[:before]), counts[before], names)
-    else:
-        skipped = sum(n * e.dtype().itemsize for n, e in zip(counts[:before], elements.values(), strict=False))
-        data = np.fromfile(file, vertex.dtype(order), counts[before], offset=skipped)
+    data = _read_vertices(path, file, (elements, counts, order), (len(header), size))
     return _to_gaussians(path, data, wanted), *read_comments(comments)
+
+
+def read_points(path: str | Path, file: BinaryIO) -> Array:
+    """The vertices of any PLY file, a structured array (N,) of the types its header declares, with x, y and z."""
+    header, size = read_header(path, file)
+    elements, counts, order, _ = parse_header(path, header)
+    names = [prop.name for prop in elements["vertex"].properties] if "vertex" in elements else []
+    if missing := set(MEANS) - set(names):
+        raise InputError(f"{path}: expected points with x, y and z, found no {', '.join(sorted(missing))}")
+    data = _read_vertices(path, file, (elements, counts, order), (len(header), size))
+    if order != "=":
+        return data
+    with np.errstate(over="ignore", invalid="ignore"):
+        typed = data.astype(elements["vertex"].dtype())
+    for name in names:
+        if typed[name].dtype.kind in "iu" and (typed[name] != data[name]).any():
+            raise InputError(f"{path}: expected {name} within {typed[name].dtype} as the header says, found others")
+    return typed
 
 
 def read_header(path: str | Path, file: BinaryIO) -> tuple[bytes, int]:
@@ -245,6 +256,22 @@ def _check_size(
             f"{path}: expected at least {needed} bytes for the {count} Gaussians its header declares, found {size}; "
             "the file is truncated or damaged"
         )
+
+
+def _read_vertices(
+    path: str | Path, file: BinaryIO, parsed: tuple[dict[str, "PlyElement"], list[int], str], sizes: tuple[int, int]
+) -> Array:
+    """The rows of the element vertex, (N,), of float64 in an ASCII file; `sizes`: of the header and of the file."""
+    elements, counts, order = parsed
+    _check_size(path, list(elements.values()), counts, order, sizes)
+    file.seek(sizes[0])
+    before, vertex = list(elements).index("vertex"), elements["vertex"]
+    if order == "=":
+        names = [prop.name for prop in vertex.properties]
+        return _read_text(path, file, sum(counts[:before]), counts[before], names)
+    skipped = sum(n * e.dtype().itemsize for n, e in zip(counts[:before], elements.values(), strict=False))
+    data: Array = np.fromfile(file, vertex.dtype(order), counts[before], offset=skipped)
+    return data
 
 
 def _read_text(path: str | Path, file: BinaryIO, skip: int, count: int, names: list[str]) -> Array:

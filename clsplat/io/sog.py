@@ -76,14 +76,15 @@ def load_sog(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
     """
     path = Path(path)
     try:
-        if path.is_dir() or path.name == META:
-            folder = path if path.is_dir() else path.parent
-            return _decode(path, lambda name: (folder / name).read_bytes())
-        with zipfile.ZipFile(path) as archive:
-            return _decode(path, _zip_reader(path, archive))
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite in the end is refused then
+            if path.is_dir() or path.name == META:
+                folder = path if path.is_dir() else path.parent
+                return _decode(path, lambda name: (folder / name).read_bytes())
+            with zipfile.ZipFile(path) as archive:
+                return _decode(path, _zip_reader(path, archive))
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
         raise InputError(f"{path}: expected a whole .sog file, which is a ZIP, found: {error}") from error
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, IndexError, OverflowError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: expected the {META} of a SOG scene, found it lacking: {error!r}") from error
@@ -211,10 +212,18 @@ def _decode(path: Path, read: Reader) -> tuple[Gaussians, Mode, NDArray[np.float
             if book.shape != (CODES,):
                 raise InputError(f"{path}: expected a codebook of {CODES} numbers for {group}, found {book.shape}")
             return book[codes]
-        low, high = (np.asarray(meta[group][end], np.float64) for end in ("mins", "maxs"))
+        low, high = ends(group, codes.shape[-1])
         return (low + (high - low) * (codes / 255)).astype(np.float32)
 
-    low, high = (np.asarray(meta["means"][end], np.float64) for end in ("mins", "maxs"))
+    def ends(group: str, width: int) -> Array:
+        """The range of each component, (2, width); (2,) for shN, which has one."""
+        found = np.array([meta[group]["mins"], meta[group]["maxs"]], np.float64)
+        expected = (2,) if group == "shN" else (2, width)
+        if found.shape != expected:
+            raise InputError(f"{path}: expected mins and maxs of {group} of shape {expected}, found {found.shape}")
+        return found
+
+    low, high = ends("means", 3)
     fractions = (pixels("means")[:, :3] + 256.0 * pixels("means", 1)[:, :3]) / 65535
     logs = low + (high - low) * fractions
     quats = pixels("quats")
@@ -240,14 +249,13 @@ def _decode(path: Path, read: Reader) -> tuple[Gaussians, Mode, NDArray[np.float
         if index.max() >= len(entries):
             raise InputError(f"{path}: expected labels below the palette's {len(entries)}, found {index.max()}")
         sh = np.concatenate([sh, entries[index]], axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        gaussians = Gaussians(
-            np.sign(logs) * np.expm1(np.abs(logs)),
-            values("scales", pixels("scales")[:, :3]),
-            from_smallest_three(quats[:, 3] - QUAT_TAG, (quats[:, :3] / 255 - 0.5) / SQRT1_2),
-            logits,
-            sh,
-        ).astype(np.float32)
+    gaussians = Gaussians(
+        np.sign(logs) * np.expm1(np.abs(logs)),
+        values("scales", pixels("scales")[:, :3]),
+        from_smallest_three(quats[:, 3] - QUAT_TAG, (quats[:, :3] / 255 - 0.5) / SQRT1_2),
+        logits,
+        sh,
+    ).astype(np.float32)
     extras = meta.get("extras")  # whatever an application wants to keep
     own = extras.get("clsplat", {}) if isinstance(extras, dict) else {}
     offset = np.asarray(own.get("offset", np.zeros(3)), np.float64)

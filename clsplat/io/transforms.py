@@ -5,6 +5,7 @@ frame. nerfstudio's ``applied_transform`` is contained in its cameras and points
 """
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from clsplat.config import DataConfig
 from clsplat.errors import InputError
 from clsplat.io.images import (
+    SIZE_MAX,
     Dataset,
     PosedPhoto,
     checked_name,
@@ -22,6 +24,7 @@ from clsplat.io.images import (
     mask_folder,
     warn_of_missing,
 )
+from clsplat.io.ply import read_points
 from clsplat.lenses import Intrinsics
 from clsplat.photos import photo_size
 
@@ -97,7 +100,7 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
 def _read_json(path: Path) -> Json:
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (RecursionError, ValueError) as error:
         raise InputError(f"{path}: expected JSON, found an error: {error}") from error
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames:
@@ -110,7 +113,7 @@ def _read_json(path: Path) -> Json:
 
 def _is_held_out(frame: Json, meta: Json, held_out: bool | None) -> bool | None:
     """The split of the files' names, or nerfstudio's lists of file names."""
-    lists = [meta[key] for key in ("test_filenames", "val_filenames") if key in meta]
+    lists = [meta[key] for key in ("test_filenames", "val_filenames") if isinstance(meta.get(key), list)]
     return any(frame["file_path"] in names for names in lists) if lists and held_out is None else held_out
 
 
@@ -118,9 +121,18 @@ def _number(frame: Json, key: str, where: str) -> float | None:
     if key not in frame:
         return None
     value = frame[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise InputError(f"{where}: expected a finite number as {key}, found {value!r}")
+    if not _is_number(value):
+        raise InputError(f"{where}: expected a finite number as {key}, found {str(value)[:80]!r}")
     return float(value)
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an int beyond all floats
+        return False
 
 
 def _number_or(default: float, frame: Json, key: str, where: str) -> float:
@@ -133,8 +145,8 @@ def _intrinsics(frame: Json, where: str, file: Path, downscaled: int) -> Intrins
     stored = photo_size(file)
     width = round(_number_or(stored[0] * downscaled, frame, "w", where))
     height = round(_number_or(stored[1] * downscaled, frame, "h", where))
-    if width < 1 or height < 1:
-        raise InputError(f"{where}: expected a size of at least 1x1 in w and h, found {width}x{height}")
+    if not (1 <= width <= SIZE_MAX and 1 <= height <= SIZE_MAX):
+        raise InputError(f"{where}: expected 1 to {SIZE_MAX} pixels per edge in w and h, found {width}x{height}")
     fx, fy = _focal(frame, "x", width, where), _focal(frame, "y", height, where)
     fx, fy = fx or fy, fy or fx  # one alone stands for square pixels
     if fx is None or fy is None:
@@ -176,7 +188,7 @@ def _viewmat(frame: Json, path: Path, name: str) -> NDArray[np.float64]:
     """World to camera in OpenCV axes."""
     try:
         matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
-    except (ValueError, TypeError):
+    except (OverflowError, TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise InputError(f"{path}: expected a finite 4x4 transform_matrix for frame {name}, found another or none")
@@ -191,19 +203,20 @@ def _read_points(root: Path, meta: Json, source: Path) -> tuple[NDArray[np.float
     """Positions (P, 3) and colours (P, 3) of ``ply_file_path``; grey where it has no colours."""
     if "ply_file_path" not in meta:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
-    from plyfile import PlyData, PlyParseError
-
-    path = root / checked_name(str(meta["ply_file_path"]), source)
+    path = root / checked_name(meta["ply_file_path"], source)
     try:
-        vertices = PlyData.read(path)["vertex"].data
+        with path.open("rb") as file:
+            vertices = read_points(path, file)
+    except OSError as error:
+        raise InputError(f"{path}: expected a PLY file of points, as {source.name} says: {error.strerror}") from error
+    with np.errstate(invalid="ignore"):  # signalling NaN
         points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
-    except (OSError, PlyParseError, KeyError, ValueError, MemoryError) as error:
-        raise InputError(f"{path}: expected a PLY file of points x, y, z, as {source.name} says: {error}") from error
     if not np.isfinite(points).all():
         raise InputError(f"{path}: expected finite points, found NaN or infinity")
-    if not {"red", "green", "blue"} <= set(vertices.dtype.names):
+    channels = ("red", "green", "blue")
+    if not set(channels) <= set(vertices.dtype.names or ()):
         return points, np.full(points.shape, 128, dtype=np.uint8)
-    colors = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)
+    colors = np.stack([vertices[channel] for channel in channels], axis=-1)
     if colors.dtype != np.uint8:
         raise InputError(f"{path}: expected colours of type uchar, found {colors.dtype}")
     return points, colors

@@ -1,7 +1,8 @@
-"""Damaged files of every kind: read, or refused by an error that names the file; never more memory than they are worth.
+"""Damaged files of every kind: they are read, or refused by an error that names the file, and no memory is taken that
+they are not worth.
 
-A file is made as a program writes it, then cut, flipped, spliced, and given extreme numbers where it has numbers; inside
-its compression too. `make fuzz` runs the same tests with many more cases.
+A file is made as a program writes it, then cut, flipped, spliced, and given extreme numbers where it has numbers;
+inside its compression too. `make fuzz` runs the same tests with many more cases.
 """
 
 import gzip
@@ -27,9 +28,9 @@ from clsplat.errors import InputError
 from clsplat.io import FORMATS, colmap, load_gaussians, load_scene, save_gaussians, transforms
 from clsplat.io.compact import EXPANSION_FREE
 from clsplat.photos import orientation, photo_size, read_photo
+from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
 from clsplat.train import initial_state
-from clsplat.scene import Scene, View
 
 MEMORY_MAX = 3 * EXPANSION_FREE
 """Bytes that reading a file of some kB may allocate: what files unfold to at most, and float copies of it."""
@@ -89,7 +90,9 @@ def changed(value, place, new):
 
     def walk(part, path):
         paths.append(path)
-        for key, inner in part.items() if isinstance(part, dict) else enumerate(part) if isinstance(part, list) else ():
+        for key, inner in (
+            part.items() if isinstance(part, dict) else enumerate(part) if isinstance(part, list) else ()
+        ):
             walk(inner, (*path, key))
 
     walk(value, ())
@@ -240,9 +243,9 @@ def test_damaged_colmap_models(folder, cases, ending, name):
 
 NAMES = st.one_of(
     st.sampled_from([v for v in JSON_VALUES if isinstance(v, str)]),
-    st.lists(st.sampled_from(["..", ".", "a", "a.png", "/", "\\", "C:", "~", " ", "images", "%2e%2e"]), max_size=5).map(
-        "/".join
-    ),
+    st.lists(
+        st.sampled_from(["..", ".", "a", "a.png", "/", "\\", "C:", "~", " ", "images", "%2e%2e"]), max_size=5
+    ).map("/".join),
     st.text(max_size=20),
 )
 
@@ -283,9 +286,8 @@ def test_damaged_transforms(folder, cases):
     extra = {"w": 16, "h": 12, "fl_y": 20.0, "cx": 8, "cy": 6, "k1": 0.01, "camera_model": "OPENCV"}
     meta |= extra | {"ply_file_path": "points.ply", "test_filenames": ["images/a.png"]}
     meta["frames"][0]["mask_path"] = "images/a.png"
-    (root / "points.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n"
-    )
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    (root / "points.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{axes}end_header\n1 2 3\n")
 
     @given(JSON_CHANGES, st.one_of(st.just([]), TEXT))
     def check(edits, changes):
@@ -347,7 +349,9 @@ def test_damaged_checkpoints(folder, cases):
     """Bytes of the file, and of the arrays in it: their headers say how much memory to take."""
     _, camera = synthetic_scene(1)
     photo = np.zeros((camera.height, camera.width, 3), np.uint8)
-    scene = Scene([View("a", camera, photo)], [], np.random.default_rng(0).normal(size=(9, 3)), np.zeros((9, 3), np.uint8))
+    scene = Scene(
+        [View("a", camera, photo)], [], np.random.default_rng(0).normal(size=(9, 3)), np.zeros((9, 3), np.uint8)
+    )
     config = TrainConfig()
     path = folder / "checkpoint.npz"
     save_state(path, initial_state(scene, config), config)
