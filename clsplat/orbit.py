@@ -31,6 +31,9 @@ FIELD_OF_VIEW = math.pi / 3
 OVERVIEW_HEIGHT = math.radians(20)
 """Of `overview` above the horizon, in radians: as a person looks at a table."""
 
+OVERVIEW_RADII = 3.5
+"""Distance of `overview` from the scene's centre, in its radii: half of the weight is within one, two are seen."""
+
 OVERVIEW_SIZE = (1280, 720)
 """Of `overview`, in pixels."""
 
@@ -152,7 +155,7 @@ def overview(gaussians: Gaussians) -> Viewpoint:
     across the shorter edge of the picture. Up is -y, as in most scenes of photogrammetry."""
     centre, radius = _bounds(gaussians)
     up = np.array([0.0, -1.0, 0.0])
-    eye = centre + STATIONS[0][0] * radius * (math.sin(OVERVIEW_HEIGHT) * up - [0, 0, math.cos(OVERVIEW_HEIGHT)])
+    eye = centre + OVERVIEW_RADII * radius * (math.sin(OVERVIEW_HEIGHT) * up - [0, 0, math.cos(OVERVIEW_HEIGHT)])
     fx = OVERVIEW_SIZE[1] / 2 / math.tan(FIELD_OF_VIEW / 2)
     return Viewpoint(Camera.look_at(eye, centre, up, fx, *OVERVIEW_SIZE), centre, up)
 

@@ -347,3 +347,70 @@ def test_a_full_disk_leaves_nothing_half_written(
     monkeypatch.undo()
     assert target.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["copy.ply"]
+
+
+@pytest.fixture
+def held(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Gaussians]]:
+    """What viewers hold, with the text of their panel; each is left by Ctrl-C at once."""
+    pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
+    from clsplat.viewer import Viewer
+
+    seen: list[tuple[str, Gaussians]] = []
+
+    def hold(self: Viewer, gaussians: Gaussians, until: object = None) -> None:
+        seen.append((self._facts, gaussians))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "hold", hold)
+    return seen
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_view_opens_every_format(
+    trained: Path, tmp_path: Path, held: list[tuple[str, Gaussians]], suffix: str
+) -> None:
+    scene = tmp_path / f"scene{suffix}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what the format cannot hold
+        run("export", trained / "scene.ply", scene)
+    run("view", scene, "--port", 18090)
+    ((facts, gaussians),) = held
+    assert scene.name in facts
+    for name, array in load_gaussians(scene)[0].arrays().items():
+        np.testing.assert_array_equal(gaussians.arrays()[name], array)
+
+
+def test_view_goes_to_the_photos(
+    trained: Path, dataset: Path, held: list[tuple[str, Gaussians]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from clsplat.viewer import Viewer
+
+    made: list[tuple[object, ...]] = []
+    start = Viewer.__init__
+
+    def watched(self: Viewer, *arguments: object, **options: object) -> None:
+        made.append(arguments)
+        start(self, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Viewer, "__init__", watched)
+    run("view", trained / "scene.ply", "--data", dataset, "--port", 18090)
+    scene = load_scene(dataset, DataConfig())
+    _, _, viewpoint, views, _ = made[0]
+    assert len(views) == 9
+    np.testing.assert_array_equal(viewpoint.camera.viewmat, scene.train[0].camera.viewmat)
+
+
+def test_train_with_a_viewer_ends_with_the_same_bits_and_stays_open(
+    trained: Path, dataset: Path, tmp_path: Path, held: list[tuple[str, Gaussians]]
+) -> None:
+    run("train", dataset, "-o", tmp_path / "out", "--viewer", *TRAIN)
+    ((facts, gaussians),) = held
+    assert "20 of 20" in facts and f"{len(gaussians):,}" in facts and "PSNR" in facts
+    assert (tmp_path / "out" / "scene.ply").read_bytes() == (trained / "scene.ply").read_bytes()
+
+
+def test_a_missing_viewer_is_a_sentence(
+    trained: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert "pip install 'clsplat[viewer]'" in fails(capsys, "view", trained / "scene.ply")
