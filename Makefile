@@ -1,6 +1,6 @@
 PYTHON = python
 
-.PHONY: test test-slow stability fuzz lint docs check-races bench bench-stability formats
+.PHONY: test test-slow stability fuzz lint docs check-races bench bench-quality bench-stability formats
 
 # The default tests: a few minutes on two cores.
 test:
@@ -38,6 +38,15 @@ check-races:
 # The figures of docs/benchmarks.md, measured anew: some minutes, on a machine that does nothing else.
 bench:
 	$(PYTHON) -m clsplat bench kernels -o docs/results/kernels.json --scaling docs/results/kernels.svg
+
+# The charts of docs/benchmarks.md, measured anew: make bench-quality DATA=folder of real scenes. Hours on two cores; what
+# is there already is not measured again (make bench-quality ITERATIONS="300" for a look at it).
+QUALITY_SCENES = fox_pinhole:downscale=2 fern:downscale=2 castle_p30:downscale=2 lego:background=white
+METHODS = paper-7k fast
+bench-quality:
+	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods $(METHODS) \
+	  $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/quality
+	cp build/quality/results.jsonl docs/results/quality.jsonl
 
 # The figures of docs/stability.md, measured anew: make bench-stability DATA=folder of real scenes.
 bench-stability:

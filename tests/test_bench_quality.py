@@ -21,6 +21,7 @@ from clsplat.bench.quality import (
     sample_iterations,
 )
 from clsplat.bench.results import append_record, read_records, write_records
+from clsplat.bench.summary import COSTS
 from clsplat.config import AdcConfig, DataConfig, InitConfig, TrainConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
@@ -317,7 +318,9 @@ def test_the_file_of_results(tmp_path):
         read_records(path)
 
 
-def test_the_command(data, tmp_path, capsys):
+def test_the_command(data, tmp_path, capsys, monkeypatch):
+    # A chart takes a second: of one cost is enough.
+    monkeypatch.setattr("clsplat.bench.page.COSTS", {"seconds": COSTS["seconds"]})
     run("bench", "quality", data / "one", "--methods", data / "plain.json", "-o", tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"results.jsonl", "index.html", "time-psnr.png", "time-psnr.svg", "published-ssim.svg"} <= names

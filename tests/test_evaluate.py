@@ -70,6 +70,8 @@ def test_figures_are_those_of_the_files(gaussians, tmp_path):
     assert psnrs[0] > psnrs[2] > psnrs[1]
     assert result["mean"]["psnr"] == pytest.approx(np.mean(psnrs), rel=1e-12)
     assert mean_metrics(gaussians, views) == {key: result["mean"][key] for key in ("psnr", "ssim")}
+    chosen = mean_metrics(gaussians, views, metrics=(metrics.flip, metrics.ssim))
+    assert chosen == {key: result["mean"][key] for key in ("flip", "ssim")}
 
 
 def test_mode_background_and_mask_are_passed_on(gaussians, tmp_path):

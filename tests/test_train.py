@@ -142,6 +142,23 @@ def test_an_interrupted_run_loses_nothing(scene: Scene, device: Device, tmp_path
     assert same(train(scene, CONFIG, device, tmp_path, resume=True), expected)
 
 
+@pytest.mark.parametrize(("after", "expected"), [(None, [20, 40, 60]), ({7, 60}, [7, 60]), ((), [])])
+def test_it_is_evaluated_when_asked(
+    scene: Scene, device: Device, tmp_path: Path, after: set[int] | None, expected: list[int]
+) -> None:
+    seen: list[Gaussians] = []
+
+    def evaluate(gaussians: Gaussians) -> dict[str, float]:
+        seen.append(gaussians)
+        return {"psnr": float(len(seen))}
+
+    config = replace(CONFIG, eval_every=20)
+    train(scene, config, device, tmp_path, evaluate=evaluate, evaluate_after=after)
+    log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [record["iteration"] for record in log if "psnr" in record] == expected
+    assert len(seen) == len(expected)
+
+
 def test_resume_refuses_what_would_not_continue(scene: Scene, device: Device, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"checkpoint\.npz: expected a checkpoint to resume from, found none"):
         train(scene, CONFIG, device, tmp_path, resume=True)

@@ -68,9 +68,11 @@ def quality_chart(finished: list[Run], cost: str, metric: str) -> "Figure":
     columns = panels(finished)
     colors = method_colors(finished)
     scenes = len(scene_names(finished))
-    side = 0 if scenes < 2 else ceil(scenes / 2) if scenes > 2 else 1
-    figure = Figure(figsize=(8.0, 5.2) if not side else (6.4 + 3.7 * side, 6.4), dpi=130, layout="constrained")
-    places = _places(figure, len(columns), side)
+    rows = 0 if scenes < 2 else ceil(scenes / 2)
+    figure = Figure(figsize=(8.6, 4.8 + 3.1 * rows), dpi=130, layout="constrained")
+    grid = figure.add_gridspec(1 + rows, 2, height_ratios=[1.5, *[1] * rows])
+    cells = [grid[0, :], *(grid[1 + k // 2, k % 2] for k in range(2 * rows))]
+    places = [figure.add_subplot(cell) for cell in cells[: len(columns)]]
     labels = {}
     for (name, of_panel), axes in zip(columns.items(), places, strict=True):
         labels[axes] = _panel(axes, of_panel, cost, metric, colors)
@@ -90,14 +92,6 @@ def quality_chart(finished: list[Run], cost: str, metric: str) -> "Figure":
     for axes, texts in labels.items():
         place_labels(axes, texts, 9 if axes is places[0] else 7)
     return figure
-
-
-def _places(figure: "Figure", count: int, side: int) -> list["Axes"]:
-    if not side:
-        return [figure.subplots()]
-    grid = figure.add_gridspec(2, 1 + side, width_ratios=[1.7, *[1] * side])
-    cells = [grid[:, 0], *(grid[row, 1 + column] for row in range(2) for column in range(side))]
-    return [figure.add_subplot(cell) for cell in cells[:count]]
 
 
 def _panel(axes: "Axes", of_panel: list[Run], cost: str, metric: str, colors: dict[str, str]) -> list[Label]:
@@ -202,6 +196,8 @@ def place_labels(axes: "Axes", labels: list[Label], size: float) -> None:
     Each, from the top, takes the best of the places around its point; one that is far gets a line to it. The layout
     of the figure must be final.
     """
+    from matplotlib.text import Text
+
     box = axes.get_window_extent()
     points = axes.transData.transform([(label.x, label.y) for label in labels]) if labels else np.zeros((0, 2))
     lines = np.concatenate([np.zeros((0, 2)), *(_along(axes, line.get_xydata()) for line in axes.lines)])
@@ -222,7 +218,7 @@ def place_labels(axes: "Axes", labels: list[Label], size: float) -> None:
             zorder=5,
             arrowprops={"arrowstyle": "-", "color": labels[i].color, "linewidth": 0.6, "shrinkA": 1, "shrinkB": 3},
         )
-        extent = text.get_window_extent()
+        extent = Text.get_window_extent(text)  # an annotation's would have its line
         width, height = extent.width + 4 * unit, extent.height + 2 * unit
 
         def cost(offset: tuple[float, float]) -> float:
@@ -279,11 +275,11 @@ def published_chart(metric: str) -> "Figure":
     from matplotlib.figure import Figure
 
     data = read_published()
-    figure = Figure(figsize=(12.5, 4.4), dpi=130, layout="constrained")
+    figure = Figure(figsize=(8.6, 9.6), dpi=130, layout="constrained")
     time = Quantity("training time", "s", short)
     labels: dict[Axes, list[Label]] = {}
     for axes, (dataset, methods) in zip(
-        figure.subplots(1, len(data["datasets"])), data["datasets"].items(), strict=True
+        figure.subplots(len(data["datasets"]), 1), data["datasets"].items(), strict=True
     ):
         labels[axes] = []
         for i, (name, row) in enumerate(methods.items()):
@@ -300,7 +296,7 @@ def published_chart(metric: str) -> "Figure":
         _ticks(axes)
         axes.set_title(dataset, fontsize=10, color=INK, loc="left", fontweight="bold")
     figure.suptitle(
-        f"Published: Kerbl et al. 2023, table 1. Other scenes, other hardware ({data['device']}): "
+        f"Published: Kerbl et al. 2023, table 1. Other scenes, other hardware ({data['device']}):\n"
         "compare methods within a panel, not with ours",
         fontsize=10,
         color=SOFT,

@@ -54,7 +54,7 @@ STYLE = """
 :root { --page: #f6f6f4; --card: #fff; --ink: #1d1d1f; --soft: #6a6a70; --line: #e2e2de; --accent: #4a3aa7; }
 * { box-sizing: border-box; margin: 0; }
 body { background: var(--page); color: var(--ink); font: 15px/1.5 system-ui, sans-serif; }
-main { max-width: 1500px; margin: 0 auto; padding: 28px clamp(12px, 2.5vw, 40px) 60px; }
+main { max-width: 1080px; margin: 0 auto; padding: 28px clamp(12px, 2.5vw, 40px) 60px; }
 h1 { font-size: 26px; font-weight: 650; letter-spacing: -.01em; }
 h2 { font-size: 18px; font-weight: 650; }
 .facts { color: var(--soft); font-size: 13px; padding: 6px 0 0 18px; }

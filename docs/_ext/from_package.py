@@ -3,7 +3,9 @@
 ``{constants}`` lists clsplat/constants.py; ``{config} NAME`` a dataclass of clsplat/config.py; ``{command} NAME``
 is what ``clsplat NAME --help`` prints; ``{presets}`` lists what each preset sets; ``{bench_kernels} FILE [WORKLOAD]``
 shows the results that ``clsplat bench kernels -o FILE`` measured, or the stages of one workload of them;
-``{bench_stability} FILE`` the rows and charts that ``clsplat bench stability`` left in the folder of FILE.
+``{bench_stability} FILE`` the rows and charts that ``clsplat bench stability`` left in the folder of FILE;
+``{bench_quality} FILE [COST]`` where and when ``clsplat bench quality`` measured the records in FILE, or charts and
+table of one cost; ``{published_quality}`` chart and table of the original paper.
 """
 
 import ast
@@ -20,11 +22,12 @@ from types import ModuleType
 from typing import Any
 
 from docutils import nodes
+from matplotlib.figure import Figure
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from clsplat import cli, config, constants, presets
-from clsplat.bench import report
+from clsplat.bench import charts, report, results, summary
 from clsplat.bench.knob_report import knobs_text
 from clsplat.bench.stability import EXPERIMENTS
 from clsplat.bench.stability import report as stability
@@ -233,6 +236,60 @@ class BenchStability(SphinxDirective):
         return self.parse_text_to_nodes("\n\n".join(parts))
 
 
+class Charts(SphinxDirective):
+    """Base: pages with charts that are drawn while they are built."""
+
+    def chart(self, figure: Figure, name: str, text: str) -> str:
+        """Markdown of a picture, which is written to docs/generated."""
+        folder = Path(self.env.srcdir) / "generated"
+        folder.mkdir(exist_ok=True)
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+        return f"![{text}](/generated/{name}.svg)"
+
+    def table(self, rows: list[list[str]]) -> str:
+        """Markdown of a table, the first row of which is the header."""
+        head, *body = [_row(*map(_prose, row)) for row in rows]
+        return "\n".join([head, HEADER_RULE * len(rows[0]) + "|", *body])
+
+
+class BenchQuality(Charts):
+    """``{bench_quality} FILE [COST]``; the file lies beside the page."""
+
+    required_arguments = 1
+    optional_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        relative, path = self.env.relfn2path(self.arguments[0])
+        self.env.note_dependency(relative)
+        records = results.read_records(Path(path))
+        finished = summary.runs(records)
+        if len(self.arguments) == 1:
+            parts = [self.list(summary.origins(records))]
+            if failed := summary.failures(records):
+                parts.append(self.table([["failed", "why"], *map(list, failed)]))
+            return self.parse_text_to_nodes("\n\n".join(parts))
+        cost, parts = self.arguments[1], []
+        for metric in summary.measured_metrics(finished):
+            text = f"{summary.METRICS[metric].name} against {summary.COSTS[cost].name}; the figures stand below"
+            figure = charts.quality_chart(finished, cost, metric)
+            parts += [self.chart(figure, f"quality-{cost}-{metric}", text)]
+            parts += [self.list(summary.verdict(finished, cost, metric))]
+        return self.parse_text_to_nodes("\n\n".join([*parts, self.table(summary.table(finished, cost))]))
+
+    def list(self, sentences: list[str]) -> str:
+        return "\n".join(f"* {_prose(sentence)}" for sentence in sentences)
+
+
+class PublishedQuality(Charts):
+    """``{published_quality}``"""
+
+    def run(self) -> list[nodes.Node]:
+        self.env.note_dependency(str(charts.PUBLISHED))
+        text = "PSNR against training time as published in 2023; the figures stand below"
+        picture = self.chart(charts.published_chart("psnr"), "quality-published", text)
+        return self.parse_text_to_nodes(f"{picture}\n\n{self.table(charts.published_table())}")
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("constants", Constants)
     app.add_directive("config", Config)
@@ -241,4 +298,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("bench_kernels", BenchKernels)
     app.add_directive("bench_knobs", BenchKnobs)
     app.add_directive("bench_stability", BenchStability)
+    app.add_directive("bench_quality", BenchQuality)
+    app.add_directive("published_quality", PublishedQuality)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
