@@ -19,37 +19,45 @@
 #endif
 
 // A splat: t = level + a dx^2 + b dx dy + c dy^2. Padded to whole quarters of a cache line of 64 bytes.
-#define SPLAT_REALS ((6 + CHANNELS + 3) / 4 * 4)
+#define SPLAT_REALS ((8 + CHANNELS + 3) / 4 * 4)
 typedef struct {
-    real x, y;    // centre, px
-    real a, b, c; // px^-2
-    real level;   // log2(opacity)
-    real color[SPLAT_REALS - 6];
+    real x, y;                  // centre, px
+    real a, b, c;               // px^-2
+    real level;                 // log2(opacity)
+    real half_height, at_right; // extent along y, and y of the rightmost point from the centre, px
+    real color[SPLAT_REALS - 8];
 } Splat;
+
+// t of the splat at (dx, dy) from its centre.
+static inline REALV splat_exponent(const Splat *s, REALV dx, REALV dy) {
+    return s->level + (dx * (s->a * dx + s->b * dy) + s->c * dy * dy);
+}
 
 static inline MASKV splat_seen(const Splat *s, REALV t) {
     return (t <= (REALV)(s->level + (real)EXPONENT_SLACK)) & (t >= (REALV)LOG2_ALPHA_MIN);
 }
 
-// Composites a splat over a group of pixels. *drawn goes from where it is seen to where it is drawn; alpha = 2^t, not
-// clamped, counts nowhere else. A pixel whose transmittance would fall to `stop` or below is finished: its transmittance
-// stays, and from then on is kept negated. Returns the weight alpha T, 0 where the splat is not drawn.
-static inline REALV splat_over(REALV alpha, real stop, MASKV *drawn, REALV *transmittance) {
-    const REALV before = *transmittance, weight = LESSER(alpha, (REALV)ALPHA_MAX) * before, behind = before - weight;
-    const MASKV seen = *drawn;
-    *drawn = seen & (behind > (REALV)stop);
-    *transmittance = *drawn ? behind : seen ? LESSER(before, -before) : before;
-    return *drawn ? weight : (REALV)0;
+// Composites a splat over a group of pixels; alpha becomes what counts: clamped, and 0 where the splat is not seen. A
+// pixel whose transmittance would fall to `stop` or below is finished: its transmittance stays, and from then on is kept
+// negated. (Elsewhere the transmittance is above `stop`, also where nothing is seen.) Returns the weight alpha T, 0 where
+// the splat is not drawn; *live: the pixels that are not finished.
+static inline REALV splat_over(MASKV seen, real stop, REALV *alpha, MASKV *live, REALV *transmittance) {
+    const REALV clamped = LESSER(*alpha, (REALV)ALPHA_MAX), before = *transmittance;
+    *alpha = seen ? clamped : (REALV)0;
+    const REALV weight = *alpha * before, behind = before - weight;
+    *live = behind > (REALV)stop;
+    *transmittance = *live ? behind : LESSER(before, -before);
+    return *live ? weight : (REALV)0;
 }
 
-// Gradient of sigma; drawn and weight as splat_over gave them, u = colour . v_image. *behind goes from the sum
+// Gradient of sigma; alpha, live and weight as splat_over gave them, u = colour . v_image. *behind goes from the sum
 // of u alpha T over this splat and all behind it, the background included, to that without it:
 //   v_sigma = -alpha v_alpha = behind alpha/(1 - alpha) - u alpha T.
-static inline REALV splat_over_vjp(REALV alpha, MASKV drawn, REALV weight, REALV u, REALV *behind) {
+static inline REALV splat_over_vjp(REALV alpha, MASKV live, REALV weight, REALV u, REALV *behind) {
     const REALV part = weight * u;
     *behind -= part;
     // The clamp of alpha passes no gradient; ALPHA_MAX < 1 bounds the quotient.
-    return (drawn & (alpha < (REALV)ALPHA_MAX)) ? *behind * (alpha / (1 - alpha)) - part : (REALV)0;
+    return (live & (alpha < (REALV)ALPHA_MAX)) ? *behind * (alpha / (1 - alpha)) - part : (REALV)0;
 }
 
 // Sums over pixels of v_sigma, v_sigma dx, ... and of weight v_image: every gradient of a splat follows from these

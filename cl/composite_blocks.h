@@ -1,131 +1,162 @@
-// Pixels of a tile in blocks of 4x4, and the splats that meet them: what kernels share in which a work-item owns a tile.
+// Pixels of a tile in blocks of LANES, and the splats that meet them: what kernels share in which a work-item owns a tile.
 //
-// A block is one vector; a splat visits only the blocks that its ellipse meets. How are these found, and what is left
-// to do in a block?
-//   With the tile's blocks as the lanes of a second vector, one evaluation gives the greatest exponent t (composite.h)
-//   of the splat within each block, and with it a set of bits; another one t and its derivatives at each block's
-//   centre. Around a centre t(u, v) = t_c + tx u + ty v + (a u^2 + b u v + c v^2), whose last part is the same for all
-//   blocks of a splat: a block costs two multiplications and additions until it is at its power of two.
+// A block is one vector, 4 pixels wide and LANES / 4 high; a splat visits only the blocks that its ellipse meets. How are
+// these found? With the tile's rows of blocks as the lanes of a second vector, one evaluation gives the range of x over
+// which the ellipse spans each row (ellipse.h has the reasons), and comparisons with the columns of blocks a set of bits.
+//
+// -DLANES=8|16   vectors that fit the device's registers: of 16 floats where it has 512 bits, of 8 elsewhere
 #ifndef CLSPLAT_COMPOSITE_BLOCKS_H
 #define CLSPLAT_COMPOSITE_BLOCKS_H
 
 #if TILE != 8 && TILE != 16
-#error "-DTILE must be 8 or 16: its blocks of 4x4 pixels are a vector of 4 or 16"
+#error "-DTILE must be 8 or 16: rows of blocks are the lanes of a vector"
 #endif
-#define REALV real16
-#define MASKV mask16
+#if LANES != 8 && LANES != 16
+#error "-DLANES must be 8 or 16, the pixels of a block"
+#endif
+#define REALV CONCATENATE(real, LANES)
+#define MASKV CONCATENATE(mask, LANES)
 #include "composite.h"
 #include "power.h"
 
-// Pixels of a block, in lanes: offsets from its centre, and their products.
-#define U  ((real16)(-1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5))
-#define V  ((real16)(-1.5, -1.5, -1.5, -1.5, -0.5, -0.5, -0.5, -0.5, 0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5))
-#define UU (U * U)
-#define UV (U * V)
-#define VV (V * V)
+#define BLOCK_ROWS (LANES / 4)
+#define COLUMNS    (TILE / 4)
+#define ROWS       (TILE / BLOCK_ROWS)
+#define BLOCKS     (ROWS * COLUMNS)
 
-// Blocks of a tile, in lanes: centres relative to the tile's corner.
-#if TILE == 16
-#define BLOCKS  16
-#define BLOCKV  real16
-#define MASKB   mask16
-#define BLOCK_X ((real16)(2, 6, 10, 14, 2, 6, 10, 14, 2, 6, 10, 14, 2, 6, 10, 14))
-#define BLOCK_Y ((real16)(2, 2, 2, 2, 6, 6, 6, 6, 10, 10, 10, 10, 14, 14, 14, 14))
+// Pixels of a block, in lanes: centres relative to its corner.
+#if LANES == 16
+#define PIXEL_X ((real16)(0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5))
+#define PIXEL_Y ((real16)(0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5))
 #else
-#define BLOCKS  4
-#define BLOCKV  real4
-#define MASKB   mask4
-#define BLOCK_X ((real4)(2, 6, 2, 6))
-#define BLOCK_Y ((real4)(2, 2, 6, 6))
+#define PIXEL_X ((real8)(0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5))
+#define PIXEL_Y ((real8)(0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5))
 #endif
-#define BLOCKS_IN_ROW (TILE / 4)
 
-static inline real4 quarters(real16 v) {
+// Rows of blocks, in lanes: their numbers, and the bit of each one's first block (none where the tile has no such row).
+#if ROWS == 8
+#define ROWV      real8
+#define MASKR     mask8
+#define OF_ROWS   OF8
+#define ROW       ((real8)(0, 1, 2, 3, 4, 5, 6, 7))
+#define FIRST_BIT ((mask8)(1, 1 << 4, 1 << 8, 1 << 12, 1 << 16, 1 << 20, 1 << 24, 1 << 28))
+#else
+#define ROWV    real4
+#define MASKR   mask4
+#define OF_ROWS OF4
+#define ROW     ((real4)(0, 1, 2, 3))
+#if TILE == 16
+#define FIRST_BIT ((mask4)(1, 1 << 4, 1 << 8, 1 << 12))
+#elif ROWS == 4
+#define FIRST_BIT ((mask4)(1, 1 << 2, 1 << 4, 1 << 6))
+#else
+#define FIRST_BIT ((mask4)(1, 1 << 2, 0, 0))
+#endif
+#endif
+
+static inline real4 quarters(REALV v) {
+#if LANES == 16
     const real8 half_sums = v.lo + v.hi;
     return half_sums.lo + half_sums.hi;
+#else
+    return v.lo + v.hi;
+#endif
 }
 
-static inline real sum_lanes(real16 v) {
+static inline real sum_lanes(REALV v) {
     const real4 a = quarters(v);
     const real2 b = a.lo + a.hi;
     return b.x + b.y;
 }
 
-static inline real4 sum_lanes4(real16 v0, real16 v1, real16 v2, real16 v3) {
+static inline real4 sum_lanes4(REALV v0, REALV v1, REALV v2, REALV v3) {
     const real4 a = quarters(v0), b = quarters(v1), c = quarters(v2), d = quarters(v3);
     return (real4)(a.x, b.x, c.x, d.x) + (real4)(a.y, b.y, c.y, d.y) + (real4)(a.z, b.z, c.z, d.z) +
            (real4)(a.w, b.w, c.w, d.w);
 }
 
-// The lanes of a mask as bits.
-static inline uint bits_of(MASKB mask) {
-#if TILE == 16
-    const mask16 bits = mask & (mask16)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768);
-    const mask8 b8 = bits.lo | bits.hi;
-    const mask4 b4 = b8.lo | b8.hi;
+static inline uint bits_of(MASKR bits) {
+#if ROWS == 8
+    const mask4 b4 = bits.lo | bits.hi;
 #else
-    const mask4 b4 = mask & (mask4)(1, 2, 4, 8);
+    const mask4 b4 = bits;
 #endif
     return b4.x | b4.y | b4.z | b4.w;
 }
 
-static inline bool any_lane(mask16 mask) {
+static inline bool any_lane(MASKV mask) {
+#if LANES == 16
     const mask8 m8 = mask.lo | mask.hi;
     const mask4 m4 = m8.lo | m8.hi;
+#else
+    const mask4 m4 = mask.lo | mask.hi;
+#endif
     return m4.x | m4.y | m4.z | m4.w;
 }
 
 // Lane i of a vector that lies in memory.
 #define LANE(vector, i) (((const real *)&(vector))[i])
 
-// A splat over the blocks of a tile.
+// Where pixel (x, y) of a tile is: its block and its lane there.
+static inline int block_of(int x, int y) {
+    return y / BLOCK_ROWS * COLUMNS + x / 4;
+}
+
+static inline int lane_of(int x, int y) {
+    return y % BLOCK_ROWS * 4 + x % 4;
+}
+
+// Pixel centres in each column and in each row of blocks, relative to the tile's corner.
 typedef struct {
-    Splat splat;
-    BLOCKV x, y;      // of each block's centre, from the splat's
-    BLOCKV t, tx, ty; // t there and its derivatives
-    uint blocks;      // those that the splat's ellipse meets, as bits
-} Over;
+    REALV x[COLUMNS], y[ROWS];
+} Grid;
 
-static inline BLOCKV t_at(const Splat *s, BLOCKV x, BLOCKV y) {
-    return x * (s->a * x + s->b * y) + (s->c * y * y + s->level);
+static inline Grid pixel_grid(void) {
+    Grid grid;
+    for (int i = 0; i < COLUMNS; ++i)
+        grid.x[i] = PIXEL_X + 4 * i;
+    for (int i = 0; i < ROWS; ++i)
+        grid.y[i] = PIXEL_Y + BLOCK_ROWS * i;
+    return grid;
 }
 
-// Within a block t is greatest at its point nearest to the centre along x or along y: on the nearest column at
-// y = -(b/2c) x, on the nearest row at x = -(b/2a) y, as far as the block reaches.
-static inline void splat_over_tile(int x0, int y0, Over *over) {
-    const Splat *s = &over->splat;
-    const BLOCKV x = BLOCK_X + (x0 - s->x), y = BLOCK_Y + (y0 - s->y);
-    const BLOCKV tx = 2 * s->a * x + s->b * y, ty = s->b * x + 2 * s->c * y;
-    over->x = x;
-    over->y = y;
-    over->tx = tx;
-    over->ty = ty;
-    over->t = (real)0.5 * (tx * x + ty * y) + s->level;
-    const BLOCKV x_lo = x - (real)1.5, x_hi = x + (real)1.5, y_lo = y - (real)1.5, y_hi = y + (real)1.5;
-    const BLOCKV x_near = CLAMP((BLOCKV)0, x_lo, x_hi), y_near = CLAMP((BLOCKV)0, y_lo, y_hi);
-    const BLOCKV y_best = (real)-0.5 * s->b / s->c * x_near, x_best = (real)-0.5 * s->b / s->a * y_near;
-    const BLOCKV on_column = t_at(s, x_near, CLAMP(y_best, y_lo, y_hi));
-    const BLOCKV on_row = t_at(s, CLAMP(x_best, x_lo, x_hi), y_near);
-    over->blocks = bits_of(GREATER(on_column, on_row) >= (BLOCKV)(LOG2_ALPHA_MIN - LOG2_E * EXTENT_SLACK));
+// The blocks of the tile with corner (x0, y0) whose pixel centres the splat's ellipse meets, as bits.
+static inline uint blocks_met(const Splat *s, int x0, int y0) {
+    const real inv_a = 1 / s->a, inv_half_height = 1 / s->half_height, slope = (real)-0.5 * s->b * inv_a;
+    const real half_sq = ((real)(LOG2_ALPHA_MIN - LOG2_E * EXTENT_SLACK) - s->level) * inv_a;
+    const ROWV top = BLOCK_ROWS * ROW + (y0 + (real)0.5 - s->y), bottom = top + (BLOCK_ROWS - 1), zero = 0;
+    const ROWV at_left = CLAMP((ROWV)-s->at_right, top, bottom), at_right = CLAMP((ROWV)s->at_right, top, bottom);
+    const ROWV t_left = at_left * inv_half_height, t_right = at_right * inv_half_height;
+    const ROWV rest_left = 1 - t_left * t_left, rest_right = 1 - t_right * t_right;
+    const ROWV sq_left = half_sq * GREATER(rest_left, zero), sq_right = half_sq * GREATER(rest_right, zero);
+    const ROWV x_min = s->x - x0 + slope * at_left - OF_ROWS(sqrt, sq_left);
+    const ROWV x_max = s->x - x0 + slope * at_right + OF_ROWS(sqrt, sq_right);
+    const MASKR met = (top <= (ROWV)s->half_height) & (bottom >= (ROWV)-s->half_height) & (x_min <= x_max);
+    MASKR bits = 0;
+    _Pragma("unroll") for (int i = 0; i < COLUMNS; ++i) bits |=
+        (x_min <= (ROWV)(4 * i + (real)3.5)) & (x_max >= (ROWV)(4 * i + (real)0.5)) & (FIRST_BIT << i);
+    return bits_of(bits & met);
 }
 
+#if LANES == 16
 DEFINE_POWER(16)
+#define POWERV power16
+#else
+DEFINE_POWER(8)
+#define POWERV power8
+#endif
 
-// t of the splat in block b; `curved` is the part that all blocks share.
-static inline REALV block_exponent(const Over *over, int b, REALV curved) {
-    return LANE(over->t, b) + (LANE(over->tx, b) * U + (LANE(over->ty, b) * V + curved));
-}
-
-static inline REALV curvature(const Splat *s) {
-    return s->a * UU + s->b * UV + s->c * VV;
-}
-
-// Takes the next of a set of blocks.
-static inline int take_block(uint *blocks) {
-    const uint lowest = *blocks & -*blocks;
-    *blocks ^= lowest;
-    // Its number: the exponent of that power of two.
-    return (as_int((float)lowest) >> 23) - 127;
+// Takes the next of a set of blocks. Counting zeros in one instruction makes compositing a tenth faster; no function of
+// OpenCL C 1.2 does it, and Oclgrind 21.10, which is built upon Clang, cannot run it (-DWITHOUT_CTZ).
+static inline uint take_block(uint *blocks) {
+#if defined(__clang__) && !defined(WITHOUT_CTZ)
+    const uint next = __builtin_ctz(*blocks);
+#else
+    // The exponent of the lowest power of two in it.
+    const uint next = (as_uint((float)(*blocks & -*blocks)) >> 23) - 127;
+#endif
+    *blocks &= *blocks - 1;
+    return next;
 }
 
 // Bit b is set while block b has an unfinished pixel.
@@ -135,6 +166,12 @@ static inline uint unfinished_blocks(const REALV *transmittance) {
         blocks |= any_lane(transmittance[b] > 0) ? 1u << b : 0;
     return blocks;
 }
+
+// A splat and the blocks of the tile that it meets.
+typedef struct {
+    Splat splat;
+    uint blocks;
+} Over;
 
 // Splats whose blocks are found before any of them is composited: a loop over blocks ends where the processor cannot
 // foresee it, and with the bits at hand it learns of that early. Between batches finished blocks are looked for, at
@@ -149,20 +186,21 @@ static inline uint load_batch(const __global Splat *splats, const __global uint 
     for (uint j = 0; j < count; ++j)
         batch[j].splat = splats[gauss_ids[first + j]];
     for (uint j = 0; j < count; ++j)
-        splat_over_tile(x0, y0, &batch[j]);
+        batch[j].blocks = blocks_met(&batch[j].splat, x0, y0);
     return count;
 }
 
 // Transmittance 1 inside the image; what lies outside counts as finished.
-static inline REALV transmittance_at_first(int b, int rows, int columns) {
-    const REALV x = U + (real)1.5 + 4 * (b % BLOCKS_IN_ROW), y = V + (real)1.5 + 4 * (b / BLOCKS_IN_ROW);
-    return ((x < (REALV)columns) & (y < (REALV)rows)) ? (REALV)1 : (REALV)-1;
+static inline REALV transmittance_at_first(const Grid *grid, int b, int rows, int columns) {
+    const MASKV inside = (grid->x[b % COLUMNS] < (REALV)columns) & (grid->y[b / COLUMNS] < (REALV)rows);
+    return inside ? (REALV)1 : (REALV)-1;
 }
 
 // Composites the entries [begin, end) of a tile's list over its blocks, whose pixels are finished where the transmittance
 // would fall to `stop` or below; adds the colours to sums.
-static inline void composite_tile(const __global Splat *splats, const __global uint *gauss_ids, uint begin, uint end,
-                                  int x0, int y0, real stop, REALV *transmittance, REALV (*sums)[CHANNELS]) {
+static inline void composite_tile(const Grid *grid, const __global Splat *splats, const __global uint *gauss_ids,
+                                  uint begin, uint end, int x0, int y0, real stop, REALV *transmittance,
+                                  REALV (*sums)[CHANNELS]) {
     Over batch[BATCH];
     for (uint first = begin; first < end; first += BATCH) {
         const uint unfinished = unfinished_blocks(transmittance);
@@ -170,14 +208,15 @@ static inline void composite_tile(const __global Splat *splats, const __global u
             break;
         const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
         for (uint j = 0; j < count; ++j) {
-            const Over *over = &batch[j];
-            const REALV curved = curvature(&over->splat);
-            for (uint blocks = unfinished & over->blocks; blocks;) {
-                const int b = take_block(&blocks);
-                const REALV t = block_exponent(over, b, curved), alpha = power16(t);
-                MASKV drawn = splat_seen(&over->splat, t);
-                const REALV weight = splat_over(alpha, stop, &drawn, &transmittance[b]);
-                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) sums[b][k] += weight * over->splat.color[k];
+            const Splat *s = &batch[j].splat;
+            const real to_x = x0 - s->x, to_y = y0 - s->y;
+            for (uint blocks = unfinished & batch[j].blocks; blocks;) {
+                const uint b = take_block(&blocks);
+                const REALV t = splat_exponent(s, grid->x[b % COLUMNS] + to_x, grid->y[b / COLUMNS] + to_y);
+                REALV alpha = POWERV(t);
+                MASKV live;
+                const REALV weight = splat_over(splat_seen(s, t), stop, &alpha, &live, &transmittance[b]);
+                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) sums[b][k] += weight * s->color[k];
             }
         }
     }

@@ -6,7 +6,7 @@
 // the twin.
 //
 // Mapping: one work-item per tile, which keeps the tile's pixels in private memory (they stay in the L1 cache) and
-// takes its splats in depth order, visiting the blocks of 4x4 pixels that each meets (composite_blocks.h).
+// takes its splats in depth order, visiting the blocks of 4x4 or 4x2 pixels that each meets (composite_blocks.h).
 //
 // How does the backward pass work? It replays the forward pass front to back. With u_i = colour_i . v_image
 // and S the part of sum_i u_i alpha_i T_i + T_end (background . v_image - v_alpha) that lies behind splat i,
@@ -23,6 +23,7 @@
 //        v_colors[N,C]
 // -DTILE=8|16   edge of a tile, px
 // -DCHANNELS    colour channels, 1 or more
+// -DLANES=8|16  pixels of a block
 #include "common.h"
 #include "composite_blocks.h"
 
@@ -34,19 +35,20 @@ __kernel void composite_fwd(const int width, const int height, const __global Sp
     const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
     const int rows = LESSER(TILE, height - y0), columns = LESSER(TILE, width - x0);
 
+    const Grid grid = pixel_grid();
     REALV transmittance[BLOCKS], sums[BLOCKS][CHANNELS];
     for (int b = 0; b < BLOCKS; ++b) {
-        transmittance[b] = transmittance_at_first(b, rows, columns);
+        transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
         _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) sums[b][k] = 0;
     }
 
-    composite_tile(splats, gauss_ids, tile_ranges[2 * t], tile_ranges[2 * t + 1], x0, y0, TRANSMITTANCE_MIN,
+    composite_tile(&grid, splats, gauss_ids, tile_ranges[2 * t], tile_ranges[2 * t + 1], x0, y0, TRANSMITTANCE_MIN,
                    transmittance, sums);
 
     for (int r = 0; r < rows; ++r) {
         const size_t first = (size_t)(y0 + r) * width + x0;
         for (int x = 0; x < columns; ++x) {
-            const int b = r / 4 * BLOCKS_IN_ROW + x / 4, lane = r % 4 * 4 + x % 4;
+            const int b = block_of(x, r), lane = lane_of(x, r);
             const real left = ABSOLUTE(LANE(transmittance[b], lane));
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) image[CHANNELS * (first + x) + k] =
                 LANE(sums[b][k], lane) + left * background[k];
@@ -65,16 +67,17 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
     const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
     const int rows = LESSER(TILE, height - y0), columns = LESSER(TILE, width - x0);
 
+    const Grid grid = pixel_grid();
     REALV transmittance[BLOCKS], behind[BLOCKS], v_pixels[BLOCKS][CHANNELS];
     for (int b = 0; b < BLOCKS; ++b) {
-        transmittance[b] = transmittance_at_first(b, rows, columns);
+        transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
         behind[b] = 0;
         _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) v_pixels[b][k] = 0;
     }
     for (int r = 0; r < rows; ++r) {
         const size_t first = (size_t)(y0 + r) * width + x0;
         for (int x = 0; x < columns; ++x) {
-            const int b = r / 4 * BLOCKS_IN_ROW + x / 4, lane = r % 4 * 4 + x % 4;
+            const int b = block_of(x, r), lane = lane_of(x, r);
             real sum = (alpha_image[first + x] - 1) * v_alpha_image[first + x];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
                 const real v = v_image[CHANNELS * (first + x) + k];
@@ -94,42 +97,40 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
             break;
         const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
         for (uint j = 0; j < count; ++j) {
-            const Over *over = &batch[j];
-            const Splat *s = &over->splat;
-            const REALV curved = curvature(s);
+            const Splat *s = &batch[j].splat;
+            const real to_x = x0 - s->x, to_y = y0 - s->y;
             REALV m = 0, mx = 0, my = 0, mxx = 0, mxy = 0, myy = 0, v_colors[CHANNELS];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) v_colors[k] = 0;
-            for (uint blocks = unfinished & over->blocks; blocks;) {
-                const int b = take_block(&blocks);
-                const REALV t = block_exponent(over, b, curved), alpha = power16(t);
-                MASKV drawn = splat_seen(s, t);
-                const REALV weight = splat_over(alpha, TRANSMITTANCE_MIN, &drawn, &transmittance[b]);
+            for (uint blocks = unfinished & batch[j].blocks; blocks;) {
+                const uint b = take_block(&blocks);
+                const REALV dx = grid.x[b % COLUMNS] + to_x, dy = grid.y[b / COLUMNS] + to_y;
+                const REALV t = splat_exponent(s, dx, dy);
+                REALV alpha = POWERV(t);
+                MASKV live;
+                const REALV weight =
+                    splat_over(splat_seen(s, t), TRANSMITTANCE_MIN, &alpha, &live, &transmittance[b]);
                 REALV u = 0;
                 _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
                     u += s->color[k] * v_pixels[b][k];
                     v_colors[k] += weight * v_pixels[b][k];
                 }
-                // Moments around the splat, of each block as if its pixels lay in its centre.
-                const REALV v_sigma = splat_over_vjp(alpha, drawn, weight, u, &behind[b]);
-                const REALV x_sigma = LANE(over->x, b) * v_sigma, y_sigma = LANE(over->y, b) * v_sigma;
+                const REALV v_sigma = splat_over_vjp(alpha, live, weight, u, &behind[b]);
+                const REALV x_sigma = dx * v_sigma, y_sigma = dy * v_sigma;
                 m += v_sigma;
                 mx += x_sigma;
                 my += y_sigma;
-                mxx += LANE(over->x, b) * x_sigma;
-                mxy += LANE(over->x, b) * y_sigma;
-                myy += LANE(over->y, b) * y_sigma;
+                mxx += dx * x_sigma;
+                mxy += dx * y_sigma;
+                myy += dy * y_sigma;
             }
-            // And with their offsets (U, V) from it.
-            const REALV sx = mx + U * m, sy = my + V * m;
-            const REALV sxx = mxx + U * (mx + sx), sxy = mxy + V * mx + U * sy, syy = myy + V * (my + sy);
             __global real *record = records + (size_t)RECORD * slots[first + j];
-            store4(record, 0, sum_lanes4(m, sx, sy, sxx));
+            store4(record, 0, sum_lanes4(m, mx, my, mxx));
 #if CHANNELS == 3
-            store4(record + 4, 0, sum_lanes4(sxy, syy, v_colors[0], v_colors[1]));
+            store4(record + 4, 0, sum_lanes4(mxy, myy, v_colors[0], v_colors[1]));
             record[8] = sum_lanes(v_colors[2]);
 #else
-            record[4] = sum_lanes(sxy);
-            record[5] = sum_lanes(syy);
+            record[4] = sum_lanes(mxy);
+            record[5] = sum_lanes(myy);
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[6 + k] = sum_lanes(v_colors[k]);
 #endif
         }

@@ -21,13 +21,18 @@
 // A batch takes TILE*TILE + BATCH - 1 steps. The work-item of its last splat sees each pixel as the batch leaves it:
 // its vote stops the group where no pixel is left, and the records behind are zeros.
 //
+// Where the device has subgroups, BATCH is the size of one: a step then ends with a barrier of the subgroup, which costs
+// a GPU next to nothing, and a batch has the fewest steps in which some work-items have no pixel. What is computed, and so
+// every bit, is the same.
+//
 // Buffers: as in composite_cpu.cl.
-// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (9 + CHANNELS), backward TILE^2
-// (2 + CHANNELS). At TILE 16, BATCH 64 and CHANNELS 4 that is 2.5 KiB and 6 KiB (double: 5 KiB and 12 KiB) of the
-// 32 KiB which OpenCL 1.2 guarantees.
+// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (11 + CHANNELS), backward TILE^2
+// (2 + CHANNELS). At TILE 16, BATCH 64 and CHANNELS 4 that is 4 KiB and 6 KiB (double: 8 KiB and 12 KiB) of the 32 KiB
+// which OpenCL 1.2 guarantees.
 // -DTILE=8|16   edge of a tile, px; the forward work-group has TILE*TILE work-items
 // -DCHANNELS    colour channels, 1 or more
 // -DBATCH       splats per batch, 1 or more; the backward work-group has BATCH work-items
+// -DSUBGROUPS=0|1   1: the device has the functions of subgroups, by cl_khr_subgroups or OpenCL 2.1 and later
 #include "common.h"
 
 #if TILE != 8 && TILE != 16
@@ -36,17 +41,18 @@
 #if !defined(BATCH) || BATCH < 1
 #error "-DBATCH must give the number of splats per batch, 1 or more"
 #endif
+#if !defined(SUBGROUPS) || SUBGROUPS & ~1
+#error "-DSUBGROUPS must be 0 or 1"
+#endif
+#ifdef cl_khr_subgroups
+#pragma OPENCL EXTENSION cl_khr_subgroups : enable
+#endif
 #define REALV real
 #define MASKV int
 #include "composite.h"
 #include "power.h"
 
 #define PIXELS (TILE * TILE)
-
-// t of the splat at (dx, dy) from its centre.
-static inline real exponent_at(const Splat *s, real dx, real dy) {
-    return s->level + (dx * (s->a * dx + s->b * dy) + s->c * dy * dy);
-}
 
 // Where pixel p of the tile with origin (x0, y0) lies.
 static inline int2 pixel_of(int x0, int y0, uint p) {
@@ -83,9 +89,10 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
         const int was_live = transmittance > 0;
         for (uint j = 0; j < count && transmittance > 0; ++j) {
             const Splat s = staged[j];
-            const real t = exponent_at(&s, pixel.x + (real)0.5 - s.x, pixel.y + (real)0.5 - s.y);
-            int drawn = splat_seen(&s, t);
-            const real weight = splat_over(exp2(t), TRANSMITTANCE_MIN, &drawn, &transmittance);
+            const real t = splat_exponent(&s, pixel.x + (real)0.5 - s.x, pixel.y + (real)0.5 - s.y);
+            real alpha = exp2(t);
+            int live;
+            const real weight = splat_over(splat_seen(&s, t), TRANSMITTANCE_MIN, &alpha, &live, &transmittance);
             for (int k = 0; k < CHANNELS; ++k)
                 sums[k] += weight * s.color[k];
         }
@@ -99,6 +106,17 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
             image[CHANNELS * p + k] = sums[k] + fabs(transmittance) * background[k];
         alpha_image[p] = 1 - fabs(transmittance);
     }
+}
+
+// Ends a step of the backward pass.
+static inline void hand_on(void) {
+#if SUBGROUPS
+    if (get_num_sub_groups() == 1) {
+        sub_group_barrier(CLK_LOCAL_MEM_FENCE);
+        return;
+    }
+#endif
+    barrier(CLK_LOCAL_MEM_FENCE);
 }
 
 __kernel __attribute__((reqd_work_group_size(BATCH, 1, 1))) void
@@ -149,20 +167,20 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
             if (lane < count && p < PIXELS && transmittance[p] > 0) {
                 const int2 pixel = pixel_of(x0, y0, p);
                 const real dx = pixel.x + (real)0.5 - s.x, dy = pixel.y + (real)0.5 - s.y;
-                const real t = exponent_at(&s, dx, dy), alpha = exp2(t);
-                real after = transmittance[p];
-                int drawn = splat_seen(&s, t);
-                const real weight = splat_over(alpha, TRANSMITTANCE_MIN, &drawn, &after);
-                any_live |= after > 0;
+                const real t = splat_exponent(&s, dx, dy);
+                real alpha = exp2(t), after = transmittance[p];
+                int live;
+                const real weight = splat_over(splat_seen(&s, t), TRANSMITTANCE_MIN, &alpha, &live, &after);
+                any_live |= live;
                 transmittance[p] = after;
-                if (drawn) {
+                if (weight > 0) {
                     real u = 0;
                     for (int k = 0; k < CHANNELS; ++k) {
                         u += s.color[k] * v_pixels[k][p];
                         sums[6 + k] += weight * v_pixels[k][p];
                     }
                     real part = behind[p];
-                    const real v_sigma = splat_over_vjp(alpha, drawn, weight, u, &part);
+                    const real v_sigma = splat_over_vjp(alpha, live, weight, u, &part);
                     behind[p] = part;
                     sums[0] += v_sigma;
                     sums[1] += dx * v_sigma;
@@ -172,7 +190,7 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
                     sums[5] += dy * dy * v_sigma;
                 }
             }
-            barrier(CLK_LOCAL_MEM_FENCE);
+            hand_on();
         }
 
         for (int k = 0; lane < count && k < RECORD; ++k)
@@ -186,5 +204,4 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
             records[(size_t)RECORD * slots[begin + j] + k] = 0;
     }
 }
-
 #include "composite_splats.h"

@@ -12,7 +12,7 @@
 // behind all of a block's windows costs no more than to find that out.
 //
 // Mapping: one work-item per tile, its pixels in blocks (composite_blocks.h). This variant serves all devices. At
-// one place of a block's windows are up to 16 different splats: their colours are gathered, and in the backward pass
+// one place of a block's windows are up to LANES different splats: their colours are gathered, and in the backward pass
 // their sums scattered, lane by lane. A work-item alone writes the records of its tile, in a fixed order: no atomics,
 // the same bits each run.
 //
@@ -20,6 +20,7 @@
 //   in   disparities[N,3], as in project.cl
 // -DTILE=8|16   edge of a tile, px
 // -DCHANNELS    colour channels, 1 or more
+// -DLANES=8|16  pixels of a block
 // -DWINDOW      entries of a pixel's window, 1 or more
 #include "common.h"
 #include "composite_blocks.h"
@@ -73,6 +74,7 @@ typedef struct {
     const __global uint *gauss_ids, *slots;
     __global real *records; // 0: forward
     int x0, y0;
+    const Grid *grid;
 } Tile;
 
 // The pixels of a tile; `sums` is the colour in the forward pass, v_image in the backward one.
@@ -85,7 +87,7 @@ typedef struct {
 } Pixels;
 
 static inline void composite_forward(const Tile *tile, Pixels *pixels, int b, const Entry *e, REALV weight) {
-    for (int lane = 0; lane < 16; ++lane) {
+    for (int lane = 0; lane < LANES; ++lane) {
         const real w = LANE(weight, lane);
         if (!(w > 0))
             continue;
@@ -95,10 +97,10 @@ static inline void composite_forward(const Tile *tile, Pixels *pixels, int b, co
     }
 }
 
-static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, const Entry *e, MASKV drawn,
+static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, const Entry *e, MASKV live,
                                       REALV weight) {
     REALV u = 0;
-    for (int lane = 0; lane < 16; ++lane) {
+    for (int lane = 0; lane < LANES; ++lane) {
         if (!(LANE(weight, lane) > 0))
             continue;
         const __global Splat *s = &tile->splats[tile->gauss_ids[ENTRY_LANE(e->entry, lane)]];
@@ -107,10 +109,9 @@ static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, c
             sum += s->color[k] * LANE(pixels->sums[b][k], lane);
         ((real *)&u)[lane] = sum;
     }
-    const REALV v_sigma = splat_over_vjp(e->alpha, drawn, weight, u, &pixels->behind[b]);
-    const REALV x = U + (real)(2 + b % BLOCKS_IN_ROW * 4 + tile->x0),
-                y = V + (real)(2 + b / BLOCKS_IN_ROW * 4 + tile->y0);
-    for (int lane = 0; lane < 16; ++lane) {
+    const REALV v_sigma = splat_over_vjp(e->alpha, live, weight, u, &pixels->behind[b]);
+    const REALV x = tile->grid->x[b % COLUMNS] + (real)tile->x0, y = tile->grid->y[b / COLUMNS] + (real)tile->y0;
+    for (int lane = 0; lane < LANES; ++lane) {
         const real w = LANE(weight, lane), v = LANE(v_sigma, lane);
         if (!(w > 0))
             continue;
@@ -130,17 +131,19 @@ static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, c
 }
 
 // Takes a splat to the window of block b if a pixel there has not composited it yet and sees it among the nearest.
-static inline void gather_splat(const Over *over, real3 disparity, uint entry, Pixels *pixels, int b) {
-    const REALV t = block_exponent(over, b, curvature(&over->splat));
-    const REALV x = LANE(over->x, b) + U, y = LANE(over->y, b) + V;
+static inline void gather_splat(const Tile *tile, const Splat *s, real3 disparity, uint entry, Pixels *pixels,
+                                int b) {
+    const REALV x = tile->grid->x[b % COLUMNS] + (tile->x0 - s->x),
+                y = tile->grid->y[b / COLUMNS] + (tile->y0 - s->y);
+    const REALV t = splat_exponent(s, x, y);
     const REALV here = disparity.x + (x * disparity.y + y * disparity.z), last = pixels->last_disparity[b];
     const MASKV beyond = (here < last) | ((here == last) & ((MASKV)entry > pixels->last_entry[b]));
-    const MASKV wanted = splat_seen(&over->splat, t) & beyond;
+    const MASKV wanted = splat_seen(s, t) & beyond;
     Entry e;
     e.disparity = wanted ? here : NOWHERE;
     if (!any_lane(e.disparity > pixels->windows[b][WINDOW - 1].disparity))
         return;
-    e.alpha = power16(t);
+    e.alpha = POWERV(t);
     e.entry = (MASKV)entry;
     window_insert(pixels->windows[b], pixels->counts[b], e);
     pixels->counts[b] += pixels->counts[b] < WINDOW;
@@ -153,14 +156,15 @@ static inline void composite_window(const Tile *tile, Pixels *pixels, int b) {
     pixels->last_disparity[b] = window[WINDOW - 1].disparity;
     pixels->last_entry[b] = window[WINDOW - 1].entry;
     for (int j = 0; j < WINDOW; ++j) {
-        const Entry e = window[j];
-        MASKV drawn = e.disparity > NOWHERE;
-        if (!any_lane(drawn))
+        Entry e = window[j];
+        const MASKV seen = e.disparity > NOWHERE;
+        if (!any_lane(seen))
             break;
         window[j].disparity = NOWHERE;
-        const REALV weight = splat_over(e.alpha, TRANSMITTANCE_MIN, &drawn, &pixels->transmittance[b]);
+        MASKV live;
+        const REALV weight = splat_over(seen, TRANSMITTANCE_MIN, &e.alpha, &live, &pixels->transmittance[b]);
         if (tile->records)
-            composite_backward(tile, pixels, b, &e, drawn, weight);
+            composite_backward(tile, pixels, b, &e, live, weight);
         else
             composite_forward(tile, pixels, b, &e, weight);
     }
@@ -185,8 +189,8 @@ static inline void composite_list(const Tile *tile, uint begin, uint end, Pixels
                 const int b = take_block(&blocks);
                 for (uint j = 0; j < count; ++j) {
                     if (batch[j].blocks >> b & 1)
-                        gather_splat(&batch[j], load3(tile->disparities, tile->gauss_ids[first + j]), first + j,
-                                     pixels, b);
+                        gather_splat(tile, &batch[j].splat, load3(tile->disparities, tile->gauss_ids[first + j]),
+                                     first + j, pixels, b);
                 }
             }
         }
@@ -211,11 +215,12 @@ __kernel void composite_fwd(const int width, const int height, const __global Sp
                             const __global real *disparities) {
     const uint t = get_global_id(0);
     const int4 box = tile_box(t, width, height);
-    const Tile tile = {splats, disparities, gauss_ids, 0, 0, box.x, box.y};
+    const Grid grid = pixel_grid();
+    const Tile tile = {splats, disparities, gauss_ids, 0, 0, box.x, box.y, &grid};
 
     Pixels pixels;
     for (int b = 0; b < BLOCKS; ++b) {
-        pixels.transmittance[b] = transmittance_at_first(b, box.w, box.z);
+        pixels.transmittance[b] = transmittance_at_first(&grid, b, box.w, box.z);
         for (int k = 0; k < CHANNELS; ++k)
             pixels.sums[b][k] = 0;
     }
@@ -224,7 +229,7 @@ __kernel void composite_fwd(const int width, const int height, const __global Sp
     for (int r = 0; r < box.w; ++r) {
         const size_t first = (size_t)(box.y + r) * width + box.x;
         for (int x = 0; x < box.z; ++x) {
-            const int b = r / 4 * BLOCKS_IN_ROW + x / 4, lane = r % 4 * 4 + x % 4;
+            const int b = block_of(x, r), lane = lane_of(x, r);
             const real left = ABSOLUTE(LANE(pixels.transmittance[b], lane));
             for (int k = 0; k < CHANNELS; ++k)
                 image[CHANNELS * (first + x) + k] = LANE(pixels.sums[b][k], lane) + left * background[k];
@@ -240,11 +245,12 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
                             const __global real *disparities) {
     const uint t = get_global_id(0);
     const int4 box = tile_box(t, width, height);
-    const Tile tile = {splats, disparities, gauss_ids, slots, records, box.x, box.y};
+    const Grid grid = pixel_grid();
+    const Tile tile = {splats, disparities, gauss_ids, slots, records, box.x, box.y, &grid};
 
     Pixels pixels;
     for (int b = 0; b < BLOCKS; ++b) {
-        pixels.transmittance[b] = transmittance_at_first(b, box.w, box.z);
+        pixels.transmittance[b] = transmittance_at_first(&grid, b, box.w, box.z);
         pixels.behind[b] = 0;
         for (int k = 0; k < CHANNELS; ++k)
             pixels.sums[b][k] = 0;
@@ -252,7 +258,7 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
     for (int r = 0; r < box.w; ++r) {
         const size_t first = (size_t)(box.y + r) * width + box.x;
         for (int x = 0; x < box.z; ++x) {
-            const int b = r / 4 * BLOCKS_IN_ROW + x / 4, lane = r % 4 * 4 + x % 4;
+            const int b = block_of(x, r), lane = lane_of(x, r);
             real sum = (alpha_image[first + x] - 1) * v_alpha_image[first + x];
             for (int k = 0; k < CHANNELS; ++k) {
                 const real v = v_image[CHANNELS * (first + x) + k];

@@ -23,6 +23,8 @@ __kernel void composite_pack(const uint n, const __global real *means2d, const _
     s.b = (real)-LOG2_E * conic.y;
     s.c = (real)(-0.5 * LOG2_E) * conic.z;
     s.level = logarithm(opacities[i]);
+    s.half_height = extents[2 * i + 1];
+    s.at_right = -conic.y / conic.z * extents[2 * i];
     for (int k = 0; k < CHANNELS; ++k)
         s.color[k] = colors[CHANNELS * i + k];
     splats[i] = s;

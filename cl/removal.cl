@@ -21,6 +21,7 @@
 //   out  records[M,4+C]; sums[N,4+C]: change of the squared error, sums of |D|^2, of w, of w^2, of w r
 // -DTILE=8|16   edge of a tile, px
 // -DCHANNELS    colour channels, 1 or more
+// -DLANES=8|16  pixels of a block
 #include "common.h"
 #include "composite_blocks.h"
 
@@ -38,16 +39,17 @@ __kernel void removal(const int width, const int height, const __global Splat *s
     const int rows = LESSER(TILE, height - y0), columns = LESSER(TILE, width - x0);
 
     // `counts` is 1 in pixels that count and 0 elsewhere.
+    const Grid grid = pixel_grid();
     REALV transmittance[BLOCKS], behind[BLOCKS][CHANNELS], residual[BLOCKS][CHANNELS], counts[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) {
-        transmittance[b] = transmittance_at_first(b, rows, columns);
+        transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
         counts[b] = 0;
         _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) behind[b][k] = residual[b][k] = 0;
     }
     for (int r = 0; r < rows; ++r) {
         const size_t first = (size_t)(y0 + r) * width + x0;
         for (int x = 0; x < columns; ++x) {
-            const int b = r / 4 * BLOCKS_IN_ROW + x / 4, lane = r % 4 * 4 + x % 4;
+            const int b = block_of(x, r), lane = lane_of(x, r);
             if (!mask[first + x])
                 continue;
             ((real *)&counts[b])[lane] = 1;
@@ -57,11 +59,11 @@ __kernel void removal(const int width, const int height, const __global Splat *s
     }
 
     const uint begin = tile_ranges[2 * t], end = tile_ranges[2 * t + 1];
-    composite_tile(splats, gauss_ids, begin, end, x0, y0, STOP, transmittance, behind);
+    composite_tile(&grid, splats, gauss_ids, begin, end, x0, y0, STOP, transmittance, behind);
     for (int b = 0; b < BLOCKS; ++b) {
         _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) behind[b][k] +=
             ABSOLUTE(transmittance[b]) * background[k];
-        transmittance[b] = transmittance_at_first(b, rows, columns);
+        transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
     }
 
     Over batch[BATCH];
@@ -72,19 +74,20 @@ __kernel void removal(const int width, const int height, const __global Splat *s
             break;
         const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
         for (uint j = 0; j < count; ++j) {
-            const Over *over = &batch[j];
-            const REALV curved = curvature(&over->splat);
+            const Splat *s = &batch[j].splat;
+            const real to_x = x0 - s->x, to_y = y0 - s->y;
             REALV difference = 0, agreement = 0, weights = 0, squares = 0, pulls[CHANNELS];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pulls[k] = 0;
-            for (uint blocks = unfinished & over->blocks; blocks;) {
-                const int b = take_block(&blocks);
-                const REALV exponent = block_exponent(over, b, curved), alpha = power16(exponent);
-                MASKV drawn = splat_seen(&over->splat, exponent);
-                const REALV weight = splat_over(alpha, STOP, &drawn, &transmittance[b]);
-                const REALV clamped = LESSER(alpha, (REALV)ALPHA_MAX);
-                const REALV ratio = drawn ? clamped / (1 - clamped) : (REALV)0;
+            for (uint blocks = unfinished & batch[j].blocks; blocks;) {
+                const uint b = take_block(&blocks);
+                const REALV dx = grid.x[b % COLUMNS] + to_x, dy = grid.y[b / COLUMNS] + to_y;
+                const REALV exponent = splat_exponent(s, dx, dy);
+                REALV alpha = POWERV(exponent);
+                MASKV live;
+                const REALV weight = splat_over(splat_seen(s, exponent), STOP, &alpha, &live, &transmittance[b]);
+                const REALV ratio = live ? alpha / (1 - alpha) : (REALV)0;
                 _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
-                    const REALV part = weight * over->splat.color[k];
+                    const REALV part = weight * s->color[k];
                     behind[b][k] -= part;
                     const REALV less = part - ratio * behind[b][k];
                     difference += counts[b] * less * less;

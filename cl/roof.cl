@@ -11,14 +11,15 @@
 // Without the order to unroll PoCL keeps the values in memory, at a quarter of the speed.
 //
 // Buffers: out[items,WIDTH]; a, b, y[items count,WIDTH]
-// -DWIDTH=1|4|8|16   width of the vectors
+// -DWIDTH=1|4|16   width of the vectors
+// -DHALVES=0|1     1: vectors of 16 go through exp and exp2 in halves
 #include "common.h"
 
 #if WIDTH == 1
 #define REALV          real
 #define LOAD(i, p)     ((p)[i])
 #define STORE(v, i, p) ((p)[i] = (v))
-#elif WIDTH == 4 || WIDTH == 8
+#elif WIDTH == 4
 #define REALV CONCATENATE(real, WIDTH)
 #define LOAD  CONCATENATE(vload, WIDTH)
 #define STORE CONCATENATE(vstore, WIDTH)
@@ -27,7 +28,15 @@
 #define LOAD(i, p)     load16((p) + 16 * (i))
 #define STORE(v, i, p) store16((p) + 16 * (i), v)
 #else
-#error "-DWIDTH must be 1, 4, 8 or 16"
+#error "-DWIDTH must be 1, 4 or 16"
+#endif
+
+#if !defined(HALVES) || HALVES & ~1
+#error "-DHALVES must be 0 or 1"
+#elif HALVES
+#define FUNCTION(f, x) OF16(f, x)
+#else
+#define FUNCTION(f, x) f(x)
 #endif
 
 // Two multiply-adds a cycle that take four cycles each need eight at least; PoCL's exp gains up to 12.
@@ -61,7 +70,7 @@ __kernel void roof_exp(const uint rounds, __global real *out) {
     for (uint i = 0; i < rounds; ++i)
 #pragma unroll
         for (int k = 0; k < CHAINS; ++k)
-            x[k] = exp(-x[k]);
+            x[k] = FUNCTION(exp, -x[k]);
     finish(x, out);
 }
 
@@ -71,7 +80,7 @@ __kernel void roof_exp2(const uint rounds, __global real *out) {
     for (uint i = 0; i < rounds; ++i)
 #pragma unroll
         for (int k = 0; k < CHAINS; ++k)
-            x[k] = exp2(-x[k]);
+            x[k] = FUNCTION(exp2, -x[k]);
     finish(x, out);
 }
 

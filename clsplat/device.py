@@ -182,14 +182,29 @@ class Device:
         return bool(self.cl_device.type & cl.device_type.CPU)
 
     @cached_property
-    def function_width(self) -> int:
-        """Widest vector of floats that the driver's own functions can be called with: 16, or 8 where that crashes it.
+    def subgroup_size(self) -> int:
+        """Work-items of a subgroup, as the driver forms them in most kernels; 0 where there are no subgroups.
 
-        PoCL 3.0 (LLVM 14) takes AMD's Zen 4, which has AVX-512, for a Zen 3 without, but calls functions built for
-        AVX-512 (cl/common.h, OF16). No Zen that LLVM knows under an earlier name has vectors of 16.
+        They are an extension, or a feature of OpenCL 2.1 and later.
         """
-        mismatched = "znver" in self.cl_device.version and self.cl_device.native_vector_width_float == 16
-        return 8 if mismatched else 16
+        major, minor = self.cl_device.version.split()[1].split(".")  # "OpenCL 3.0 ..."
+        feature = (int(major), int(minor)) >= (2, 1) and self.cl_device.max_num_sub_groups > 0
+        if not feature and "cl_khr_subgroups" not in self.cl_device.extensions.split():
+            return 0
+        kernel = cl.Program(self.context, "__kernel void nothing(void) {}").build().all_kernels()[0]
+        group = (min(256, self.cl_device.max_work_group_size),)
+        question = cl.kernel_sub_group_info.MAX_SUB_GROUP_SIZE_FOR_NDRANGE
+        return int(kernel.get_sub_group_info(self.cl_device, question, group))
+
+    @cached_property
+    def vector_width(self) -> int:
+        """Floats in the vectors of kernels for CPUs: 16 where the compiler has registers for them, else 8.
+
+        PoCL 3.0 (LLVM 14) compiles for AMD's Zen 4, which has AVX-512, as for a Zen 3 without; no Zen that LLVM knows
+        under an earlier name has vectors of 16.
+        """
+        mismatched = "znver" in self.cl_device.version
+        return 16 if self.cl_device.native_vector_width_float >= 16 and not mismatched else 8
 
     def _check_size(self, what: str, nbytes: int) -> None:
         limit = self.cl_device.max_mem_alloc_size

@@ -65,7 +65,7 @@ class TestRoof:
     )
     def test_recurrences_reach_their_fixpoint(self, device, width, kernel, scalars, fixpoint):
         out = device.upload("out", np.zeros(6 * width))
-        device.launch("roof", kernel, (6,), [80, *scalars, out], defines={"WIDTH": width}, group=(1,))
+        device.launch("roof", kernel, (6,), [80, *scalars, out], defines=roof.defines(device, width), group=(1,))
         np.testing.assert_allclose(out.get(), roof.CHAINS * fixpoint, rtol=1e-5)
 
     @pytest.mark.parametrize("step", [1, 6])
@@ -73,7 +73,7 @@ class TestRoof:
     def test_every_number_is_moved(self, device, step, width):
         a = np.arange(6 * 5 * width, dtype=np.float32)
         arrays = [device.upload("a", a), device.upload("b", 2 * a), device.upload("y", 0 * a)]
-        defines = {"WIDTH": width}
+        defines = roof.defines(device, width)
         device.launch("roof", "roof_triad", (6,), [5, step, 0.5, *arrays], defines=defines, group=(1,))
         np.testing.assert_array_equal(arrays[2].get(), 2 * a)
         device.launch("roof", "roof_copy", (6,), [5, step, *arrays[1:]], defines=defines, group=(1,))

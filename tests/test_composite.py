@@ -6,6 +6,7 @@ from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, EXTENT_SLACK, TRANSMITTANCE_MIN
+from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.stages import Bins, Image, SplatGrads, Splats
 from clsplat.testing import ambiguous_pixels, assert_matches, gradcheck, synthetic_scene
@@ -117,6 +118,24 @@ def test_double_matches_twin(device64, compositor, tile_size, channels):
     v_image = random_grads(expected)
     v_expected = reference.composite_bwd(splats, bins, expected, v_image)
     v = backward(device64, compositor, splats, bins, expected, v_image)
+    for name, array in v_expected._asdict().items():
+        assert_matches(f"v_{name}", getattr(v, name), array, DOUBLE)
+
+
+@TILE_SIZES
+@pytest.mark.parametrize("lanes", [8, 16])
+def test_blocks_of_both_widths_match_twin(lanes, tile_size):
+    """The device's registers choose one; each must be right on all."""
+    device = Device(real=np.float64)
+    device.vector_width = lanes  # shadows the cached property
+    splats, width, height = make_splats(300, 2, channels=3)
+    bins = reference.bin_splats(splats, width, height, tile_size)
+    expected = reference.composite_fwd(splats, bins, BACKGROUND[:3])
+    image = forward(device, "cpu", splats, bins, BACKGROUND[:3])
+    assert_matches("image", image.image, expected.image, DOUBLE)
+    v_image = random_grads(expected)
+    v_expected = reference.composite_bwd(splats, bins, expected, v_image)
+    v = backward(device, "cpu", splats, bins, expected, v_image)
     for name, array in v_expected._asdict().items():
         assert_matches(f"v_{name}", getattr(v, name), array, DOUBLE)
 

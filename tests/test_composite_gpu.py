@@ -9,12 +9,13 @@ from tolerances import DOUBLE
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MIN, EXTENT_SLACK
+from clsplat.device import Device
 from clsplat.ops import composite
 from clsplat.stages import Image, SplatGrads, Splats
 from clsplat.testing import assert_matches
 
 TILE_SIZES = pytest.mark.parametrize("tile_size", [8, 16])
-BATCH = composite.GPU_BATCH
+BATCH = composite.GPU_BATCH  # where there are subgroups, smaller batches divide it
 # Nothing, one splat, both sides of the end of one batch and of two, and thousands.
 LENGTHS = [0, 1, BATCH - 1, BATCH, BATCH + 1, 2 * BATCH, 2 * BATCH + 1, 2000]
 TILES_X = 4
@@ -130,7 +131,24 @@ def test_the_batch_changes_no_bit(device64, monkeypatch, batch):
     """Also where a batch exceeds the 64 pixels of a tile, or is a single splat."""
     splats, bins = listed_scene(8, 3)
     expected = composite_gpu(device64, splats, bins)
-    monkeypatch.setattr(composite, "GPU_BATCH", batch)
+    monkeypatch.setattr(composite, "gpu_batch", lambda device: batch)
     found = composite_gpu(device64, splats, bins)
     for name in expected:
         np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@TILE_SIZES
+def test_subgroups_change_no_bit(real, tile_size):
+    """With them and without; also where a batch is more than one subgroup, whose barrier is then the group's."""
+    device = Device(real=real)
+    if not device.subgroup_size:
+        pytest.skip(f"{device.label} has no subgroups")
+    splats, bins = listed_scene(tile_size, 3)
+    found = composite_gpu(device, splats, bins)
+    for size in (0, 4 * device.subgroup_size):
+        other = Device(real=real)
+        other.subgroup_size = size  # shadows the cached property
+        expected = composite_gpu(other, splats, bins)
+        for name in expected:
+            np.testing.assert_array_equal(found[name], expected[name], err_msg=name)

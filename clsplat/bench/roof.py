@@ -36,15 +36,22 @@ def _best(device: Device, run: Callable[[], None], runs: int) -> float:
     return min(seconds[1:])
 
 
-def _arithmetic(device: Device, kernel: str, *scalars: float, width: int = 16) -> float:
-    """Results per second, on a CPU by vectors of `width`."""
+def defines(device: Device, width: int) -> dict[str, int]:
+    """Those of cl/roof.cl for vectors of a width."""
+    return {"WIDTH": width, "HALVES": int(device.vector_width < width)}
+
+
+def _arithmetic(device: Device, kernel: str, *scalars: float) -> float:
+    """Results per second."""
     # A CPU's core wants wide vectors, a GPU scalar work-items in great number.
-    width, group = (width, 1) if device.is_cpu else (1, 256)
+    width, group = (16, 1) if device.is_cpu else (1, 256)
     items = (4 if device.is_cpu else 2048) * device.cl_device.max_compute_units
     out = device.empty("roof", items * width)
 
     def run() -> None:
-        device.launch("roof", kernel, (items,), [rounds, *scalars, out], defines={"WIDTH": width}, group=(group,))
+        device.launch(
+            "roof", kernel, (items,), [rounds, *scalars, out], defines=defines(device, width), group=(group,)
+        )
 
     rounds = 64
     while _best(device, run, 1) < SECONDS:
@@ -64,7 +71,7 @@ def _bandwidth(device: Device, kernel: str, buffers: int, *scalars: float) -> tu
     arguments = [count, 1 if device.is_cpu else items, *scalars, *arrays]
 
     def run() -> None:
-        device.launch("roof", kernel, (items,), arguments, defines={"WIDTH": width}, group=(group,))
+        device.launch("roof", kernel, (items,), arguments, defines=defines(device, width), group=(group,))
 
     return buffers * arrays[0].nbytes / _best(device, run, RUNS), arrays[0].nbytes
 
@@ -82,7 +89,7 @@ def measure_roof(device: Device) -> dict[str, float]:
     out = device.empty("roof", 64)
 
     def launch() -> None:
-        device.launch("roof", "roof_empty", (1,), [out], defines={"WIDTH": 1}, group=(1,))
+        device.launch("roof", "roof_empty", (1,), [out], defines=defines(device, 1), group=(1,))
 
     def queued() -> None:
         for _ in range(LAUNCHES):
@@ -98,8 +105,8 @@ def measure_roof(device: Device) -> dict[str, float]:
     return {
         # x -> 0.999 x + 0.001 converges to 1.
         "fma_gflops": 2e-9 * _arithmetic(device, "roof_fma", 0.999, 0.001),
-        "exp_gops": 1e-9 * _arithmetic(device, "roof_exp", width=device.function_width),
-        "exp2_gops": 1e-9 * _arithmetic(device, "roof_exp2", width=device.function_width),
+        "exp_gops": 1e-9 * _arithmetic(device, "roof_exp"),
+        "exp2_gops": 1e-9 * _arithmetic(device, "roof_exp2"),
         "copy_gbs": 1e-9 * copy,
         "triad_gbs": 1e-9 * triad,
         "buffer_mib": size / 2**20,

@@ -6,13 +6,18 @@ from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.stages import Bins, Image, SplatGrads, Splats
 
-# Work-items of the GPU variant's backward kernel, one splat each: two or four subgroups on the GPUs known.
+# Splats per batch of the GPU variant without subgroups, each a work-item of the backward kernel: two or four times
+# what the GPUs known run in lockstep.
 GPU_BATCH = 64
-
 
 # Splats that a pixel composites in one round where pixels are sorted; changes speed, not the image. 16 took a quarter
 # longer, 48 was no faster (100 000 Gaussians at 640x480 with 62 drawn pairs per pixel).
 WINDOW = 32
+
+
+def gpu_batch(device: Device) -> int:
+    """Splats per batch of the GPU variant: a subgroup's work-items, where there are subgroups."""
+    return device.subgroup_size or GPU_BATCH
 
 
 def variant(device: Device, compositor: str = "auto", disparities: Any = None) -> str:
@@ -24,17 +29,23 @@ def variant(device: Device, compositor: str = "auto", disparities: Any = None) -
     return f"composite_{compositor}"
 
 
-def _defines(bins: Bins, channels: int, stage: str) -> dict[str, Any]:
-    own: dict[str, dict[str, int]] = {"composite_gpu": {"BATCH": GPU_BATCH}, "composite_sorted": {"WINDOW": WINDOW}}
-    return {"TILE": bins.tile_size, "CHANNELS": channels} | own.get(stage, {})
+def _defines(device: Device, bins: Bins, channels: int, stage: str) -> dict[str, Any]:
+    own: dict[str, dict[str, int]] = {
+        "composite_cpu": {"LANES": device.vector_width},
+        "composite_gpu": {"BATCH": gpu_batch(device), "SUBGROUPS": int(device.subgroup_size > 0)},
+        "composite_sorted": {"LANES": device.vector_width, "WINDOW": WINDOW},
+    }
+    return {"TILE": bins.tile_size, "CHANNELS": channels} | own[stage]
 
 
 def packed(device: Device, splats: Splats, bins: Bins, stage: str) -> Any:
     """The splats as the kernels read them: SPLAT_REALS each (cl/composite.h)."""
     n, channels = splats.colors.shape
-    result = device.empty("packed splats", (n, -(-(6 + channels) // 4) * 4))
+    result = device.empty("packed splats", (n, -(-(8 + channels) // 4) * 4))
     geometry = [splats.means2d, splats.conics, splats.extents, splats.opacities, splats.colors]
-    device.launch(stage, "composite_pack", (n,), [n, *geometry, result], defines=_defines(bins, channels, stage))
+    device.launch(
+        stage, "composite_pack", (n,), [n, *geometry, result], defines=_defines(device, bins, channels, stage)
+    )
     return result
 
 
@@ -42,9 +53,11 @@ def _launch(device: Device, stage: str, kernel: str, bins: Bins, channels: int, 
     tiles = bins.tile_ranges.shape[0]
     group = 1
     if stage == "composite_gpu":
-        group = bins.tile_size**2 if kernel == "composite_fwd" else GPU_BATCH
+        group = bins.tile_size**2 if kernel == "composite_fwd" else gpu_batch(device)
     arguments = [bins.width, bins.height, arguments[0], bins.gauss_ids, bins.tile_ranges, *arguments[1:]]
-    device.launch(stage, kernel, (tiles * group,), arguments, defines=_defines(bins, channels, stage), group=(group,))
+    device.launch(
+        stage, kernel, (tiles * group,), arguments, defines=_defines(device, bins, channels, stage), group=(group,)
+    )
 
 
 def composite_fwd(
@@ -125,5 +138,5 @@ def composite_bwd(
         device.empty("v_colors", (n, channels)),
     )
     arguments = [n, bins.order, bins.first_slots, splats.conics, splats.opacities, records, *v]
-    device.launch(stage, "composite_sum", (n,), arguments, defines=_defines(bins, channels, stage))
+    device.launch(stage, "composite_sum", (n,), arguments, defines=_defines(device, bins, channels, stage))
     return v

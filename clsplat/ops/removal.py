@@ -50,7 +50,7 @@ def removal(
     ]
     lists = [packed(device, splats, bins, variant(device)), bins.gauss_ids, bins.tile_ranges, bins.slots]
     arguments = [bins.width, bins.height, *lists, device.constant("background", background), *pixels, records]
-    defines = {"TILE": bins.tile_size, "CHANNELS": channels}
+    defines = {"TILE": bins.tile_size, "CHANNELS": channels, "LANES": device.vector_width}
     device.launch("removal", "removal", (tiles,), arguments, defines=defines, group=(1,))
     arguments = [n, bins.order, bins.first_slots, records, sums]
     device.launch("removal", "removal_sum", (n,), arguments, defines=defines)
