@@ -312,7 +312,13 @@ static inline GaussianGrad gaussian_vjp(size_t i, const Camera *camera, int sh_s
     v.geometry.view.row0 += v_translation.x * position;
     v.geometry.view.row1 += v_translation.y * position;
     v.geometry.view.row2 += v_translation.z * position;
-    return v;
+
+    // What overflows would make Adam's moments NaN for good: such a Gaussian gets no gradient from this view.
+    const real3 sum = v.geometry.mean + v.geometry.log_scales + v.geometry.p + v.geometry.quat.xyz + v.color +
+                      v.geometry.view.row0 + v.geometry.view.row1 + v.geometry.view.row2;
+    const real any = sum.x + sum.y + sum.z + v.geometry.quat.w + v.logit_opacity;
+    const GaussianGrad none = {0};
+    return 0 * any == 0 ? v : none;
 }
 
 #if VIEWMAT_GRAD

@@ -13,7 +13,7 @@ from clsplat.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN, NEAR
 from clsplat.gaussians import Gaussians, logit
 from clsplat.optim import adam_settings
 from clsplat.reference.project import rotations as reference_rotations
-from clsplat.render import download, upload
+from clsplat.render import download, render, upload
 from clsplat.stages import SplatGrads, Splats
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene, threshold_distances
 
@@ -420,3 +420,17 @@ def test_twin_in_numbers():
     inverse = np.linalg.inv([[xx, xy], [xy, yy]])
     np.testing.assert_allclose(splats.conics[0], inverse[[0, 0, 1], [0, 1, 1]], rtol=1e-12)
     np.testing.assert_allclose(splats.colors[0], np.maximum(0.5 + 0.28209479177387814 * gaussians.sh[0, 0], 0))
+
+
+def test_gradients_that_overflow_are_zero(device):
+    """A colour of 3e38, seen from afar: Adam's moments would be NaN for good (found by fuzzing)."""
+    gaussians, camera = synthetic_scene(20, sh_degree=0)
+    scene = gaussians.astype(np.float32)
+    scene.sh[3] = 3e38
+    rendering = render(scene, camera, device=device)
+    gradients = rendering.backward(np.ones_like(rendering.rgb), viewmat_grad=True)
+    for name, array in gradients.gaussians.arrays().items():
+        assert np.isfinite(array).all(), name
+        assert not array[3].any(), name
+    assert np.abs(gradients.gaussians.means).max() > 0
+    assert np.isfinite(gradients.viewmat).all()
