@@ -5,7 +5,7 @@ import pytest
 
 from clsplat.camera import Camera, focus_point
 from clsplat.errors import InputError
-from clsplat.orbit import STATIONS, orbit, surround
+from clsplat.orbit import STATIONS, first_photo, orbit, overview, surround
 from clsplat.testing import synthetic_scene
 
 TARGET = np.array([1.0, -2.0, 3.0])
@@ -177,3 +177,36 @@ def test_surround_stands_around_what_is_there():
 def test_surround_of_a_single_gaussian():
     for cameras in surround(synthetic_scene(1)[0], 5, 64, 48):
         assert all(np.isfinite(camera.viewmat).all() for camera in cameras)
+
+
+def test_overview_has_the_scene_in_the_middle_upright_from_above():
+    rng = np.random.default_rng(2)
+    gaussians, _ = synthetic_scene(400, seed=1)
+    gaussians.means[:] = rng.normal([3, -1, 7], 0.5, (400, 3))
+    gaussians.means[:40] = rng.normal(0, 500, (40, 3))  # a background far away moves nothing
+    camera, focus, up = overview(gaussians)
+    np.testing.assert_allclose(focus, [3, -1, 7], atol=0.15)
+    np.testing.assert_array_equal(up, [0, -1, 0])
+    assert camera.position[1] < focus[1]
+    x, y, z = camera.viewmat[:3, :3] @ gaussians.means[40:].T + camera.viewmat[:3, 3:]
+    for pixels, size in (
+        (camera.fx * x / z + camera.cx, camera.width),
+        (camera.fy * y / z + camera.cy, camera.height),
+    ):
+        assert (np.abs(pixels / size - 0.5) < 0.5).mean() > 0.95
+    assert camera.viewmat[1, 1] > 0.9, "y down is down in the image"
+
+
+def test_first_photo_is_the_first_and_up_is_what_the_photos_agree_on():
+    up = np.array([0.2, -1.0, 0.1])
+    cameras = [
+        Camera.look_at(
+            [4 * np.sin(a), -1, 4 * np.cos(a)], [0, 0, 0], up + 0.3 * np.array([np.sin(a), 0, 0]), 50, 40, 30
+        )
+        for a in np.arange(8) * np.pi / 4
+    ]
+    camera, focus, found = first_photo(cameras)
+    assert camera is cameras[0]
+    np.testing.assert_allclose(focus, 0, atol=1e-9)
+    assert np.linalg.norm(found) == pytest.approx(1)
+    assert found @ up / np.linalg.norm(up) > 0.98

@@ -112,60 +112,76 @@ def viewer(device):
     result.close()
 
 
+class Clock:
+    """The viewer's time: a millisecond for each look at it, and what a test adds."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def perf_counter(self):
+        self.now += 1e-3
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    result = Clock()
+    monkeypatch.setattr("clsplat.viewer.time", result)
+    return result
+
+
 class FakeClient:
     """A browser that records the frames it is sent."""
 
-    def __init__(self, viewer, camera):
+    def __init__(self, viewer, camera, moved=0.0):
         from clsplat.viewer import _Client
 
         self.frames = []
         scene = SimpleNamespace(set_background_image=lambda frame, **_: self.frames.append(frame))
-        self.state = viewer._clients[0] = _Client(SimpleNamespace(scene=scene), camera, time.perf_counter())
+        self.state = viewer._clients[0] = _Client(SimpleNamespace(scene=scene), camera, moved)
 
 
 class TestResolution:
-    def test_first_coarse_then_whole_when_still(self, viewer, device):
+    def test_first_coarse_then_whole_when_still(self, viewer, device, clock):
         gaussians, cams = cameras()
         client = FakeClient(viewer, cams[1])
         assert viewer.draw(gaussians)
         assert client.frames[0].shape[1] == SIZE[0] / 4
         assert not viewer.draw(gaussians), "nothing is due while the camera may move on"
-        client.state.moved -= STILL_AFTER
+        clock.now += STILL_AFTER
         while viewer.draw(gaussians):
             pass
         assert [f.shape[1] for f in client.frames] == sorted({f.shape[1] for f in client.frames})
         np.testing.assert_array_equal(client.frames[-1], to_uint8(render(gaussians, cams[1], device=device).rgb))
         assert not viewer.draw(gaussians), "and nothing more"
 
-    def test_a_movement_is_drawn_at_once_and_in_time(self, viewer, monkeypatch):
+    def test_a_movement_is_drawn_at_once_and_in_time(self, viewer, monkeypatch, clock):
         """Frames whose time goes with their pixels come to take FRAME_TIME."""
         gaussians, cams = cameras()
-        clock = [0.0]
-        monkeypatch.setattr("clsplat.viewer.time", SimpleNamespace(perf_counter=lambda: clock[0]))
 
         def slow(device, gaussians, camera, *_):
-            clock[0] += 2.5 * camera.width * camera.height / (SIZE[0] * SIZE[1])
+            clock.now += 2.5 * camera.width * camera.height / (SIZE[0] * SIZE[1])
             return np.zeros((camera.height, camera.width, 3), np.uint8), ""
 
         monkeypatch.setattr("clsplat.viewer.picture", slow)
         client = FakeClient(viewer, cams[0])
         for i in range(12):
-            client.state.camera, client.state.moved = cams[i % 5], clock[0]
-            before = clock[0]
+            client.state.camera, client.state.moved = cams[i % 5], clock.now
+            before = clock.now
             assert viewer.draw(gaussians)
-        assert clock[0] - before == pytest.approx(FRAME_TIME, rel=0.1)
+        assert clock.now - before == pytest.approx(FRAME_TIME, rel=0.1)
 
-    def test_training_is_shown_anew_but_not_all_the_time(self, viewer, monkeypatch):
+    def test_training_is_shown_anew_but_not_all_the_time(self, viewer, clock):
         gaussians, cams = cameras()
         client = FakeClient(viewer, cams[0])
-        client.state.moved -= STILL_AFTER
+        clock.now += STILL_AFTER
         while viewer.draw(gaussians):
             pass
-        shown = client.state.shown
-        client.state.shown = shown._replace(seconds=1.0, at=time.perf_counter())
+        client.state.shown = shown = client.state.shown._replace(seconds=1.0)
+        clock.now = shown.at + 9  # a frame of a second may come every ten
         viewer.follow(gaussians, lambda: False)
-        assert client.state.shown.at != shown.at and client.state.shown.seconds == 1.0, "it is too soon"
-        client.state.shown = shown._replace(seconds=1.0, at=time.perf_counter() - 11)
+        assert client.state.shown is shown
+        clock.now = shown.at + 10
         viewer.follow(gaussians, lambda: False)
         assert client.state.shown.version == viewer._version
 
@@ -198,7 +214,7 @@ def test_training_has_the_same_bits_with_a_viewer(viewer, device, tmp_path, opti
 
     def watched(record):
         viewer._mode = MODES[record["iteration"] % 4]
-        client.state.camera, client.state.moved = cams[record["iteration"] % 5], time.perf_counter()
+        client.state.camera = cams[record["iteration"] % 5]
         viewer.follow(record["gaussians"], lambda: False)
 
     beside = small_training(device, tmp_path / "beside", watched, optimizer=optimizer)
@@ -233,6 +249,19 @@ def test_a_pause_holds_the_training_until_it_is_resumed_or_interrupted(viewer, d
     viewer.follow(cameras()[0], lambda: True)  # would wait for ever, were it not interrupted
 
 
+# What the panel has: a field with the mode, and the last box that can be ticked.
+CLICK_CAMERAS = "[...document.querySelectorAll('input[type=checkbox]')].at(-1).click()"
+MODE_BOX = """(() => {
+    const box = [...document.querySelectorAll('input')].find(i => i.value == 'render').getBoundingClientRect();
+    return [box.x + box.width / 2, box.y + box.height / 2];
+})()"""
+CHOOSE_ALPHA = """(() => {
+    const option = [...document.querySelectorAll('[role=option]')].find(o => o.innerText == 'alpha');
+    option?.click();
+    return Boolean(option);
+})()"""
+
+
 def test_a_browser_shows_our_render_and_jumps_to_a_clicked_camera(viewer, device, tmp_path):
     gaussians, cams = cameras()
     stop = threading.Event()
@@ -264,6 +293,14 @@ def test_a_browser_shows_our_render_and_jumps_to_a_clicked_camera(viewer, device
                     return seen(page) == there
 
                 wait_for(arrived, f"the frame of camera {there}, clicked at {where}")
+            page.evaluate(CLICK_CAMERAS)
+            wait_for(lambda: not viewer._server.scene.get_handle_by_name("/cameras").visible, "hidden cameras")
+            page.click(*page.evaluate(MODE_BOX))
+            wait_for(lambda: page.evaluate(CHOOSE_ALPHA), "the list of modes")
+            wait_for(lambda: client.shown.mode == "alpha" and client.shown.share == 1, "a frame of another mode")
+            alpha = picture(device, upload(device, gaussians), whole[1], RenderConfig(), (0.0, 0.0, 0.0), "alpha")[0]
+            # 25 dB: a JPEG; without the frusta, that hide nothing any more.
+            wait_for(lambda: psnr(page.screenshot()[200:], alpha[200:]) > 25, "alpha")
     finally:
         stop.set()
         owner.join()
