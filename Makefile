@@ -42,7 +42,7 @@ bench:
 # The charts of docs/benchmarks.md, measured anew: make bench-quality DATA=folder of real scenes. Hours on two cores; what
 # is there already is not measured again (make bench-quality ITERATIONS="300" for a look at it).
 QUALITY_SCENES = fox_pinhole:downscale=2 fern:downscale=2 castle_p30:downscale=2 lego:background=white
-METHODS = paper-7k fast
+METHODS = fast paper-7k auto mcmc
 bench-quality:
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods $(METHODS) \
 	  $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/quality

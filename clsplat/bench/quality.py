@@ -259,7 +259,7 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
                 f"{last['num_gaussians']:,} Gaussians, {last['fps']:.1f} frames/s"
             )
         except Exception as error:  # whatever it is, it is this cell's result
-            reason = str(error) if isinstance(error, ClsplatError) else f"{type(error).__name__}: {error}"
+            reason = _reason(error, cell.source.path)
             record({"failed": reason})
             say(f"    failed: {reason}")
 
@@ -271,6 +271,12 @@ def _load(source: Source) -> Scene | ClsplatError:
     except ClsplatError as error:
         return error
     return scene if scene.test else InputError(f"{source.path}: expected held-out photos to measure on, found none")
+
+
+def _reason(error: Exception, path: Path) -> str:
+    """Why a cell failed, in words that hold on another machine, too: without the folders that the dataset is in."""
+    text = str(error) if isinstance(error, ClsplatError) else f"{type(error).__name__}: {error}"
+    return text.replace(str(path.resolve()), path.name).replace(str(path), path.name)
 
 
 def _finished(cell: Cell, records: list[Record], device: str) -> bool:
