@@ -5,7 +5,7 @@
 // harmonics is a run that ends with the trained bands and starts with degree 0; any other array is cut into runs of 16.
 // project.cl has the same update fused with the gradients, for training. The penalties of the loss by the sums of all
 // opacities and scales add o (1 - o) and the scale itself to the gradients of their logits and logarithms; each is 0
-// for the other fields.
+// for the other fields; so is the third, by the effective ranks (adam.h), for which runs of ln(scales) are rows.
 //
 // Buffers, `total` values each: in gradients; in and out parameters, first (m), second (v).
 #include "common.h"
@@ -13,8 +13,8 @@
 
 __kernel void adam_step(const uint total, const uint stride, const uint width, const uint split,
                         const real split_rate, const real rate, const real opacity_penalty, const real scale_penalty,
-                        const Adam adam, const __global real *gradients, __global real *parameters,
-                        __global real *first, __global real *second) {
+                        const real erank_penalty, const Adam adam, const __global real *gradients,
+                        __global real *parameters, __global real *first, __global real *second) {
     const size_t begin = get_global_id(0) * stride;
     if (begin >= total)
         return;
@@ -34,6 +34,13 @@ __kernel void adam_step(const uint total, const uint stride, const uint width, c
             // o (1 - o) for the logit p of o, even in p
             const real16 below = -ABSOLUTE(p), e = OF16(exp, below);
             g += opacity_penalty * e / ((1 + e) * (1 + e)) + (scale_penalty != 0 ? scale_penalty * OF16(exp, p) : 0);
+        }
+        // Runs are of whole rows then.
+        for (int k = 0; erank_penalty != 0 && k + 3 <= count; k += 3) {
+            const real3 v = erank_penalty * erank_vjp(load3(parameters + i, k / 3), adam.erank_slack);
+            ((real *)&g)[k] += v.x;
+            ((real *)&g)[k + 1] += v.y;
+            ((real *)&g)[k + 2] += v.z;
         }
         adam_update_some(&adam, rates, count, g, parameters + i, first + i, second + i);
     }

@@ -14,6 +14,7 @@
 // -DGATE_OPACITY  at which the gate is one half
 #include "common.h"
 #include "linalg.h"
+#include "philox.h"
 #include "power.h"
 
 #if !defined(GATE_SLOPE) || !defined(GATE_OPACITY)
@@ -21,16 +22,6 @@
 #endif
 
 DEFINE_POWER(4)
-
-static inline uint4 philox(uint4 counter, uint2 key) {
-    for (int round = 0; round < 10; ++round) {
-        const ulong first = (ulong)0xD2511F53u * counter.x, second = (ulong)0xCD9E8D57u * counter.z;
-        counter = (uint4)((uint)(second >> 32) ^ counter.y ^ key.x, (uint)second,
-                          (uint)(first >> 32) ^ counter.w ^ key.y, (uint)first);
-        key += (uint2)(0x9E3779B9u, 0xBB67AE85u);
-    }
-    return counter;
-}
 
 // Three independent standard normal numbers (Box and Muller 1958).
 static inline real3 normals(uint4 bits) {

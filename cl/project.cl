@@ -410,6 +410,8 @@ __kernel void project_bwd_adam(const uint n, const Camera camera, const int sh_s
         v.logit_opacity += adam.opacity_penalty * activated.w * (1 - activated.w);
         v.geometry.log_scales += adam.scale_penalty * activated.xyz;
     }
+    if (adam.erank_penalty != 0)
+        v.geometry.log_scales += adam.erank_penalty * erank_vjp(load3(log_scales, i), adam.erank_slack);
 
     const real16 rates =
         (real16)((real3)adam.means, (real3)adam.log_scales, (real4)adam.quats, adam.logit_opacities, (real4)0, 0);

@@ -17,7 +17,8 @@ typedef struct {
     real keep1, take1, keep2, take2;                              // beta1, beta2
     real inv_correction2;                                         // 1/(1 - beta2^t)
     real eps;
-    real opacity_penalty, scale_penalty; // weights in the loss of the sums of all opacities and scales
+    real opacity_penalty, scale_penalty; // weights in the loss of the sums of all opacities and scales,
+    real erank_penalty, erank_slack;     // and of the sum of what the effective ranks are short of 2
 } Adam;
 
 #endif

@@ -105,6 +105,8 @@ class OptimConfig:
     """lambda of the loss (1 - lambda) L1 + lambda (1 - SSIM) (paper, equation 7)."""
     sh_degree_every: int = 1000
     """Iterations after which one more band of spherical harmonics is trained; fewer in short runs."""
+    erank_penalty: float = 0.0
+    """Weight in the loss of the mean over Gaussians of max(-ln(effective rank - 1), 0): against needles."""
     exposure_lr: float = 1e-2
     """Of the photos' exposures, at the start (that of the original's code)."""
     exposure_lr_final: float = 1e-3
@@ -204,6 +206,20 @@ class ErrorConfig:
 
 
 @dataclass(frozen=True)
+class FewViewsConfig:
+    """Training on few photos (clsplat.few_views has the reasons, docs/stability.md what each brings)."""
+
+    below: int = 9
+    """With fewer training photos than this, the other settings hold (0: never)."""
+    dropout: float = 0.2
+    """Share of the splats left out of each image at the end (DropGaussian)."""
+    sh_degree: Literal[0, 1, 2, 3] = 1
+    """Highest degree of the spherical harmonics."""
+    growth: float = 2.0
+    """The most Gaussians, as a multiple of the scene's points."""
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """A whole training run; saved as ``config.json``, from which it can be repeated."""
 
@@ -224,6 +240,8 @@ class TrainConfig:
     max_gaussians: int | None = None
     """Hard cap, under every strategy: in no iteration are there more Gaussians. A start of more is thinned to it.
     mcmc and error grow to it, and need it."""
+    dropout: float = 0.0
+    """Share of the splats left out of each image at the end; it rises from 0 over the training."""
     exposure: bool = False
     """Learn an affine map of colours for each training photo, for photos of changing exposure or white balance."""
     poses: bool = False
@@ -245,6 +263,7 @@ class TrainConfig:
     adc: AdcConfig = field(default_factory=AdcConfig)
     mcmc: McmcConfig = field(default_factory=McmcConfig)
     error: ErrorConfig = field(default_factory=ErrorConfig)
+    few: FewViewsConfig = field(default_factory=FewViewsConfig)
     render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
 
     def shortened(self, interval: int) -> int:

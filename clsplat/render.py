@@ -14,7 +14,7 @@ from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.stages import Bins, Image, SplatGrads, Splats
+from clsplat.stages import Bins, Dropout, Image, SplatGrads, Splats
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -59,6 +59,7 @@ class Pass:
     bins: Bins
     image: Image
     disparities: Any = None
+    dropout: Dropout | None = None
 
 
 def forward(
@@ -70,6 +71,7 @@ def forward(
     sh_degree: int,
     *,
     gradients: bool = True,
+    dropout: Dropout | None = None,
 ) -> Pass:
     """Run the stages from Gaussians to an image.
 
@@ -82,10 +84,14 @@ def forward(
         Its length is the number of channels: 3 for RGB, 4 to composite the depth too.
     gradients : bool
         Whether `backward` will follow: its lists of intersections are left out otherwise.
+    dropout : Dropout, optional
+        Which splats are left out while training.
     """
     stage = stage_functions(device)
     antialiased = config.mode == "antialiased"
     splats = stage.project_fwd(gaussians, camera, sh_degree, antialiased=antialiased, channels=len(background))
+    if dropout:
+        stage.dropout_fwd(splats, dropout)
     # The twins work splat by splat and gain nothing from tiles.
     tile_size = max(camera.width, camera.height) if device is None else config.tile_size
     by_pixel = config.sort == "pixel"
@@ -93,7 +99,7 @@ def forward(
     bins = stage.bin_splats(splats, camera.width, camera.height, tile_size, gradients=gradients, scheme=scheme)
     disparities = stage.project_disparities(gaussians, camera, splats) if by_pixel else None
     image = stage.composite_fwd(splats, bins, background, compositor=config.compositor, disparities=disparities)
-    return Pass(gaussians, camera, config, sh_degree, splats, bins, image, disparities)
+    return Pass(gaussians, camera, config, sh_degree, splats, bins, image, disparities, dropout)
 
 
 def backward_to_splats(device: "Device | None", run: Pass, v_image: Image) -> SplatGrads:
@@ -102,6 +108,8 @@ def backward_to_splats(device: "Device | None", run: Pass, v_image: Image) -> Sp
     v_splats: SplatGrads = stage.composite_bwd(
         run.splats, run.bins, run.image, v_image, compositor=run.config.compositor, disparities=run.disparities
     )
+    if run.dropout:
+        stage.dropout_bwd(v_splats, run.dropout)
     return v_splats
 
 

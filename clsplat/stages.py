@@ -6,6 +6,9 @@ N Gaussians, M intersections of a splat with a tile, T tiles, C colour channels,
 
 from typing import Any, NamedTuple
 
+ERANK_SLACK = 1e-5
+"""Bounds the penalty of needles: at an effective rank of 1 it is 11.5 (Hyung et al. 2024)."""
+
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
 """Noise on the means fades out where the opacity rises above 0.005, over some hundredths (original code of Kheradmand
 et al. 2024)."""
@@ -34,6 +37,24 @@ class SplatGrads(NamedTuple):
     conics: Any
     opacities: Any
     colors: Any
+
+
+class Dropout(NamedTuple):
+    """Which splats are left out of an image: `rate` of them, in [0, 1), drawn anew for each seed and iteration."""
+
+    rate: float
+    seed: int
+    iteration: int
+
+    @property
+    def gain(self) -> float:
+        """Factor on the opacity of the others."""
+        return 1 / (1 - self.rate)
+
+    @property
+    def threshold(self) -> int:
+        """Of 32-bit draws: those below it are dropped."""
+        return round(self.rate * 2**32)
 
 
 class Bins(NamedTuple):
@@ -82,8 +103,9 @@ class AdamStep(NamedTuple):
     """One step of the optimiser: its number, counted from 1, and its constants.
 
     rates: learning rate by field of `clsplat.gaussians.Gaussians`, with sh0 and sh_rest in the place of sh.
-    sh_degree: bands above it have had no gradient yet, and are left alone. penalties: weights of the sum of all
-    opacities and of the sum of all scales in the loss, whose gradients are added to those given.
+    sh_degree: bands above it have had no gradient yet, and are left alone. penalties: weights in the loss of the sum
+    of all opacities, of that of all scales, and of that of max(-ln(erank - 1 + ERANK_SLACK), 0), whose gradients
+    are added to those given; erank is a Gaussian's effective rank: 1 for a needle, 2 for a disc, 3 for a ball.
     """
 
     iteration: int
@@ -92,4 +114,4 @@ class AdamStep(NamedTuple):
     beta2: float
     eps: float
     sh_degree: int
-    penalties: tuple[float, float] = (0.0, 0.0)
+    penalties: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.stages import AdamStep
+from clsplat.stages import ERANK_SLACK, AdamStep
 
-PENALTIES = ("opacity_penalty", "scale_penalty")
+PENALTIES = ("opacity_penalty", "scale_penalty", "erank_penalty")
 RATES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "sh_rest")
 
 
@@ -36,6 +36,6 @@ def adam_struct(step: AdamStep, real: Any) -> np.ndarray:
     correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
     rates = [step.rates[name] / correction1 for name in RATES]
     betas = [step.beta1, 1 - step.beta1, step.beta2, 1 - step.beta2]
-    names = (*RATES, "keep1", "take1", "keep2", "take2", "inv_correction2", "eps", *PENALTIES)
-    values = (*rates, *betas, 1 / correction2, step.eps, *step.penalties)
+    names = (*RATES, "keep1", "take1", "keep2", "take2", "inv_correction2", "eps", *PENALTIES, "erank_slack")
+    values = (*rates, *betas, 1 / correction2, step.eps, *step.penalties, ERANK_SLACK)
     return np.array(values, dtype=[(name, real) for name in names])

@@ -22,7 +22,7 @@ from clsplat.optim import Moments, adam_settings, sh_degree_at
 from clsplat.randomness import stream
 from clsplat.render import backward_to_splats, download, fetch, forward, stage_functions, upload
 from clsplat.scene import Scene, View
-from clsplat.stages import Image
+from clsplat.stages import Dropout, Image
 from clsplat.survey import contributions
 
 if TYPE_CHECKING:
@@ -173,14 +173,16 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
     optimizer = device if config.optimizer == "device" else None
     gaussians = state.gaussians if optimizer else upload(device, state.gaussians)
 
-    run = forward(device, gaussians, camera, config.render, BACKGROUNDS[config.data.background], sh_degree)
+    progress = size.progress(iteration, config, state.search)
+    dropout = Dropout(config.dropout * progress, config.seed, iteration) if config.dropout else None
+    background = BACKGROUNDS[config.data.background]
+    run = forward(device, gaussians, camera, config.render, background, sh_degree, dropout=dropout)
     state.intersections = max(state.intersections, run.bins.gauss_ids.shape[0] / len(gaussians))
     stage, image = stage_functions(device), run.image.image
     if state.exposures:
         affine = state.exposures.of(view.name)
         image = stage.exposure_fwd(image, affine)
     loss, v_image = stage.l1_ssim(image, photo, config.optim.ssim_weight, mask)
-    progress = size.progress(iteration, config, state.search)
     if state.exposures:
         v_affine = stage.exposure_bwd(run.image.image, affine, v_image)
         exposure.update(state.exposures, view.name, v_affine, progress, config.optim)
@@ -194,7 +196,8 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
             extents, v_means2d = download(extents), download(v_means2d)
         state.strategy.observe(stage_functions(optimizer), extents, v_means2d, camera.width, camera.height)
     settings = adam_settings(iteration, progress, state.extent, config.optim, sh_degree)
-    settings = settings._replace(penalties=state.strategy.penalties(len(gaussians)))
+    erank = config.optim.erank_penalty / len(gaussians)
+    settings = settings._replace(penalties=(*state.strategy.penalties(len(gaussians)), erank))
     moments = state.moments.first, state.moments.second
     options = {"antialiased": config.render.mode == "antialiased", "viewmat_grad": state.poses is not None}
     if optimizer:

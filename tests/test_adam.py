@@ -11,6 +11,7 @@ from clsplat.gaussians import SHAPES, Gaussians, sigmoid
 from clsplat.optim import Moments, adam_settings
 from clsplat.reference.adam import BLOCK
 from clsplat.render import fetch, upload
+from clsplat.stages import ERANK_SLACK
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene
 
 CONFIG = OptimConfig()
@@ -146,12 +147,18 @@ def test_rates_act_where_they_should(any_device):
 
 def test_penalties_are_gradients_of_sums(any_device):
     """What the first moments take in, by finite differences of the penalty itself; opacities near 0 and 1 too."""
-    weights = 0.3, 0.7
+    weights = 0.3, 0.7, 0.5
     gaussians, zeros, second = start_of(23)
     gaussians.logit_opacities[:3] = -30, 30, 0
+    gaussians.log_scales[:6] = [(0, -4, -5), (-3, 0, 0), (0, 0, 0), (-9, -3, -4), (-1, -8, -1.5), (-2, -2, -12)]
 
     def penalty(log_scales, logit_opacities):
-        return weights[0] * sigmoid(logit_opacities).sum() + weights[1] * np.exp(log_scales).sum()
+        q = np.exp(2 * log_scales) / np.exp(2 * log_scales).sum(axis=1, keepdims=True)
+        erank = np.exp(-(q * np.log(q)).sum(axis=1))
+        needles = np.maximum(-np.log(erank - 1 + ERANK_SLACK), 0).sum()
+        return (
+            weights[0] * sigmoid(logit_opacities).sum() + weights[1] * np.exp(log_scales).sum() + weights[2] * needles
+        )
 
     def moments(add):
         step = settings(1)._replace(penalties=weights)

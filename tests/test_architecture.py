@@ -27,7 +27,7 @@ LAYERS = """
     sfm
     scene structs device reference perphoto metrics raytrace orbit
     ops io testing still_life memory pyramid
-    page render optim densify initialize exposure report demo
+    page render optim densify initialize exposure few_views report demo
     prune rasterization survey poses
     size
     checkpoint
@@ -139,6 +139,7 @@ def test_no_path_of_a_machine():
 # What each file's header documents, with values it allows.
 DEFINES = {
     "adam": {},
+    "dropout": {},
     "exposure": {},
     "noise": {"GATE_SLOPE": 100.0, "GATE_OPACITY": 0.005},
     "observe": {},

@@ -118,7 +118,7 @@ def test_penalties_weigh_means() -> None:
         return float(0.3 * g.opacities.mean() + 0.7 * (g.scales / extent).mean())
 
     zeros = [Gaussians(**{k: np.zeros_like(a) for k, a in gaussians.arrays().items()}) for _ in range(3)]
-    step = adam_settings(1, 0.0, extent, OptimConfig(), 0)._replace(penalties=strategy.penalties(N))
+    step = adam_settings(1, 0.0, extent, OptimConfig(), 0)._replace(penalties=(*strategy.penalties(N), 0.0))
     adam_step(gaussians.astype(np.float64), *zeros, step)
     for name, row in (("log_scales", (7, 1)), ("logit_opacities", (9,))):
         values = []

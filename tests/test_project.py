@@ -102,7 +102,7 @@ def random_moments(gaussians, rng):
 
 
 @MODES
-@pytest.mark.parametrize("penalties", [(0.0, 0.0), (0.3, 0.2)])
+@pytest.mark.parametrize("penalties", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.4)])
 @pytest.mark.parametrize(("stored", "degree"), [(0, 0), (1, 0), (1, 1), (2, 1), (2, 2), (3, 0), (3, 2), (3, 3)])
 def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degree, penalties):
     """The gradients in registers are those that project_bwd writes, and each meets its own moments, rate and penalty;

@@ -52,6 +52,7 @@ class Train:
 
     def run(self) -> None:
         """Run the command."""
+        from clsplat import few_views
         from clsplat.initialize import start_size
         from clsplat.io import load_scene, save_gaussians, suffix_of
         from clsplat.memory import Footprint, parse_size
@@ -69,6 +70,13 @@ class Train:
         device = open_device(config.device, limit)
         scene = load_scene(self.data, config.data)
         say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
+        adapted = few_views.adapted(config, scene)
+        if adapted != config:
+            config = adapted
+            say(
+                f"few views: with fewer than {config.few.below} photos Gaussians are fewer and simpler, and some are "
+                "left out of each image (--few.below 0 trains as with many)"
+            )
         need = Footprint.of(scene, config, device)
         start = start_size(scene, config.init, config.max_gaussians)
         say(need.describe(start, config.max_gaussians, device.memory_limit))

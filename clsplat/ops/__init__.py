@@ -4,6 +4,7 @@ from clsplat.ops.adam import adam_step
 from clsplat.ops.bin import bin_splats
 from clsplat.ops.composite import composite_bwd, composite_fwd
 from clsplat.ops.count import count_pairs
+from clsplat.ops.dropout import dropout_bwd, dropout_fwd
 from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.noise import add_noise
@@ -22,6 +23,8 @@ __all__ = [
     "composite_bwd",
     "composite_fwd",
     "count_pairs",
+    "dropout_bwd",
+    "dropout_fwd",
     "exclusive_scan",
     "exposure_bwd",
     "exposure_fwd",

@@ -35,8 +35,11 @@ def adam_step(
             stride, width, split = 3 * gaussians.sh.shape[1], 3 * (step.sh_degree + 1) ** 2, 3
             rates = [struct["sh0"], struct["sh_rest"]]
         else:
-            stride, width, split = RUN, RUN, 0
+            # Whole rows: the effective rank is of all three scales.
+            run = RUN if name != "log_scales" else 3 * (RUN // 3)
+            stride, width, split = run, run, 0
             rates = [struct[name]] * 2
-        penalties = [float(step.penalties[k]) * (name == f) for k, f in enumerate(("logit_opacities", "log_scales"))]
+        fields = ("logit_opacities", "log_scales", "log_scales")
+        penalties = [float(weight) * (name == field) for weight, field in zip(step.penalties, fields, strict=True)]
         scalars: list[Any] = [total, stride, width, split, *rates, *penalties, struct]
         device.launch("adam", "adam_step", (-(-total // stride),), [*scalars, *arrays])

@@ -4,6 +4,7 @@ from clsplat.reference.adam import adam_step
 from clsplat.reference.bin import bin_splats
 from clsplat.reference.composite import composite_bwd, composite_fwd
 from clsplat.reference.count import count_pairs
+from clsplat.reference.dropout import dropout_bwd, dropout_fwd
 from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.noise import add_noise
@@ -22,6 +23,8 @@ __all__ = [
     "composite_bwd",
     "composite_fwd",
     "count_pairs",
+    "dropout_bwd",
+    "dropout_fwd",
     "exclusive_scan",
     "exposure_bwd",
     "exposure_fwd",

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.gaussians import SHAPES, Gaussians, sigmoid
-from clsplat.stages import AdamStep
+from clsplat.stages import ERANK_SLACK, AdamStep
 
 Array = NDArray[Any]
 
@@ -38,12 +38,25 @@ def adam_step(
 
 def _penalised(name: str, p: Array, g: Array, step: AdamStep) -> Array:
     """Gradients with those of the penalties: d exp(p)/dp = exp(p), and o (1 - o) for o = sigmoid(p)."""
-    opacity, scale = step.penalties
+    opacity, scale, erank = step.penalties
     if name == "log_scales" and scale:
-        return g + scale * np.exp(p)
+        g = g + scale * np.exp(p)
+    if name == "log_scales" and erank:
+        g = g + erank * erank_gradient(p)
     if name == "logit_opacities" and opacity:
         return g + opacity * sigmoid(p) * sigmoid(-p)
     return g
+
+
+def erank_gradient(log_scales: Array) -> Array:
+    """Gradient (N, 3) of max(-ln(erank - 1 + ERANK_SLACK), 0) of each Gaussian by ln(scales) (N, 3), where erank is
+    exp(entropy of s^2 / sum of s^2) (Hyung et al. 2024, equations 5 and 8)."""
+    log_q = 2 * (log_scales - log_scales.max(axis=1, keepdims=True))
+    log_q = log_q - np.log(np.exp(log_q).sum(axis=1, keepdims=True))
+    q = np.exp(log_q)
+    entropy = -(q * log_q).sum(axis=1, keepdims=True)
+    excess = np.expm1(entropy) + ERANK_SLACK
+    return np.where(excess < 1, 2 * np.exp(entropy) / excess * q * (log_q + entropy), 0)
 
 
 def _update(p: Array, g: Array, m: Array, v: Array, rate: Any, correction2: float, step: AdamStep) -> None:

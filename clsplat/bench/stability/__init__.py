@@ -1,6 +1,6 @@
 """How much the method's known failures cost without their remedies and with them: `clsplat bench stability`."""
 
-from clsplat.bench.stability import coordinates, order, popping
+from clsplat.bench.stability import coordinates, order, photos, popping
 from clsplat.bench.stability.experiment import Experiment
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -8,5 +8,8 @@ EXPERIMENTS: dict[str, Experiment] = {
     "equal-depths": order.EQUAL_DEPTHS,
     "repeated-runs": order.REPEATED_RUNS,
     "popping": popping.POPPING,
+    "exposure": photos.EXPOSURE,
+    "poses": photos.POSES,
+    "few-views": photos.FEW_VIEWS,
 }
 """In the order of docs/stability.md; a line enrols an experiment in the command, the page and the tests."""

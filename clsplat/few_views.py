@@ -1,0 +1,25 @@
+"""What changes in a training on few photos, which many arrangements of Gaussians explain alike.
+
+Left to themselves, Gaussians fit each photo by itself: ever more of them, with colours that depend on
+direction. Fewer and simpler ones, of which no single one is needed, show more of the truth between the photos (Park
+et al. 2025, "DropGaussian").
+"""
+
+from dataclasses import replace
+
+from clsplat.config import TrainConfig
+from clsplat.scene import Scene
+
+
+def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
+    """The configuration for the scene's training photos: where they are fewer than `config.few.below`, of a lower
+    degree, with dropout, and with fewer Gaussians; otherwise as it is."""
+    few = config.few
+    if len(scene.train) >= few.below:
+        return config
+    cap = config.max_gaussians
+    if len(scene.points):
+        most = round(few.growth * len(scene.points))
+        cap = most if cap is None else min(cap, most)
+    init = replace(config.init, sh_degree=min(config.init.sh_degree, few.sh_degree))
+    return replace(config, init=init, max_gaussians=cap, dropout=max(config.dropout, few.dropout))

@@ -1,0 +1,28 @@
+"""Launch of the stage dropout (cl/dropout.cl)."""
+
+import numpy as np
+
+from clsplat.device import Device
+from clsplat.stages import Dropout, SplatGrads, Splats
+
+
+def dropout_fwd(device: Device, splats: Splats, dropout: Dropout) -> None:
+    """Leave splats out at random and make the others more opaque, in place.
+
+    Parameters
+    ----------
+    splats : Splats of N >= 1 rows
+        Dropped ones become invisible: extents and opacity 0.
+    dropout : Dropout
+    """
+    n = len(splats.opacities)
+    key = np.array([dropout.seed & 0xFFFFFFFF, dropout.seed >> 32], np.uint32)
+    scalars = [n, key, np.uint32(dropout.iteration), np.uint32(dropout.threshold), dropout.gain]
+    device.launch("dropout", "dropout_fwd", (n,), [*scalars, splats.extents, splats.opacities])
+
+
+def dropout_bwd(device: Device, v_splats: SplatGrads, dropout: Dropout) -> None:
+    """Turn gradients with respect to the splats after `dropout_fwd` into those before it, in place; dropped splats
+    have none."""
+    n = len(v_splats.opacities)
+    device.launch("dropout", "dropout_bwd", (n,), [n, dropout.gain, v_splats.opacities])

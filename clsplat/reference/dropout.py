@@ -1,0 +1,27 @@
+"""Twin of the stage dropout."""
+
+import numpy as np
+
+from clsplat.constants import ALPHA_MIN, EXTENT_SLACK
+from clsplat.reference.noise import philox
+from clsplat.stages import Dropout, SplatGrads, Splats
+
+
+def dropout_fwd(splats: Splats, dropout: Dropout) -> None:
+    """Leave splats out at random; arguments as of `clsplat.ops.dropout_fwd`."""
+    n = len(splats.opacities)
+    counters = np.zeros((n, 4), np.uint32)
+    counters[:, 0], counters[:, 1], counters[:, 2] = np.arange(n), dropout.iteration, 1
+    kept = philox(counters, (dropout.seed & 0xFFFFFFFF, dropout.seed >> 32))[:, 0] >= dropout.threshold
+    shown = splats.extents[:, 0] > 0
+    before = splats.opacities[shown]
+    after = np.where(kept[shown], dropout.gain * before, 0)
+    with np.errstate(divide="ignore"):
+        squares = (np.log(after / ALPHA_MIN) + EXTENT_SLACK) / (np.log(before / ALPHA_MIN) + EXTENT_SLACK)
+    splats.extents[shown] *= np.sqrt(np.maximum(squares, 0))[:, None]
+    splats.opacities[shown] = after
+
+
+def dropout_bwd(v_splats: SplatGrads, dropout: Dropout) -> None:
+    """Gradients before `dropout_fwd`; arguments as of `clsplat.ops.dropout_bwd`."""
+    v_splats.opacities[:] *= dropout.gain

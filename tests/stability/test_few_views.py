@@ -1,0 +1,66 @@
+"""Few photos, which many arrangements of Gaussians explain alike (Park et al. 2025, "DropGaussian")."""
+
+import importlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small import CONFIG, small_scene, with_train
+
+from clsplat import few_views
+from clsplat.evaluate import mean_metrics
+from clsplat.train import train
+
+
+def noisy(view, rng):
+    noise = rng.normal(0, 25, view.image.shape)
+    return replace(view, image=np.clip(view.image + noise, 0, 255).astype(np.uint8))
+
+
+@pytest.fixture(scope="module")
+def scene(device):
+    """A third of the circle in three photos whose noise no two share, and points that are not where the scene is."""
+    scene, rng = with_train(small_scene(device), noisy), np.random.default_rng(1)
+    points = rng.uniform(-0.8, 0.8, (150, 3))
+    colors = rng.integers(0, 256, points.shape, dtype=np.uint8)
+    return replace(scene, train=scene.train[:5:2], test=scene.test[:1], points=points, colors=colors)
+
+
+def test_three_photos_are_not_learned_by_heart(scene, device, tmp_path):
+    """Without the measures Gaussians are added until they show the noise of each photo."""
+    psnr = {}
+    plain = replace(CONFIG, iterations=400, max_gaussians=1000)
+    for config in (plain, few_views.adapted(plain, scene)):
+        psnr[config != plain] = mean_metrics(train(scene, config, device, tmp_path), scene.test, device=device)[
+            "psnr"
+        ]
+    # Measured: 20.5 dB and 26.2 dB.
+    assert psnr[True] > psnr[False] + 3
+
+
+def test_what_changes_where_photos_are_few(scene):
+    config = replace(CONFIG, max_gaussians=None)
+    few = few_views.adapted(config, scene)
+    assert (few.init.sh_degree, few.max_gaussians, few.dropout) == (1, 2 * len(scene.points), 0.2)
+    assert few_views.adapted(few, scene) == few, "a resumed run, and one from its config.json, continue"
+    assert few_views.adapted(replace(config, max_gaussians=7), scene).max_gaussians == 7
+    # A random start grows as it is told.
+    assert few_views.adapted(config, replace(scene, points=scene.points[:0])).max_gaussians is None
+    assert few_views.adapted(config, replace(scene, train=scene.train * 3)) == config
+
+
+def test_dropout_is_part_of_the_training_and_rises(scene, device, tmp_path, monkeypatch):
+    module = importlib.import_module("clsplat.train")  # the package has a function of this name
+    rates, forward = [], module.forward
+
+    def watched(*args, **options):
+        rates.append(options["dropout"].rate)
+        return forward(*args, **options)
+
+    config = replace(CONFIG, iterations=21, dropout=0.2)
+    monkeypatch.setattr(module, "forward", watched)
+    found = train(scene, config, device, tmp_path)
+    np.testing.assert_allclose(rates, np.linspace(0, 0.2, 21))
+    monkeypatch.undo()
+    without = train(scene, replace(config, dropout=0.0), device, tmp_path)
+    assert (found.means != without.means).any()

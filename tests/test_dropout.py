@@ -1,0 +1,111 @@
+"""Stage dropout: shares and means of the draws, the kernel against the twin, and gradients through an image."""
+
+import numpy as np
+import pytest
+from tolerances import DOUBLE, FLOAT
+
+from clsplat import ops, reference
+from clsplat.config import RenderConfig
+from clsplat.render import backward, fetch, forward, upload
+from clsplat.stages import Dropout, Image, SplatGrads, Splats
+from clsplat.testing import assert_matches, gradcheck, synthetic_scene
+
+
+def splats_of(n, seed=0):
+    gaussians, camera = synthetic_scene(n, seed, width=160, height=120)
+    gaussians.logit_opacities[::7] = -5.4  # just above ALPHA_MIN
+    return reference.project_fwd(gaussians, camera, 3)
+
+
+def by_kernel(device, splats, dropout):
+    on_device = Splats(*(device.upload("splats", a) for a in splats))
+    ops.dropout_fwd(device, on_device, dropout)
+    return Splats(*(a.get() for a in on_device))
+
+
+def by_twin(splats, dropout):
+    result = Splats(*(a.copy() for a in splats))
+    reference.dropout_fwd(result, dropout)
+    return result
+
+
+@pytest.mark.parametrize("n", [1, 65, 2000])
+def test_matches_twin(any_device, n):
+    splats, dropout = splats_of(n), Dropout(0.3, 2**40 + 7, 1234)
+    found, expected = by_kernel(any_device, splats, dropout), by_twin(splats, dropout)
+    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    for name in Splats._fields:
+        assert_matches(name, getattr(found, name), getattr(expected, name), tolerances)
+    assert ((found.opacities > 0) == (expected.opacities > 0)).all()
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.1, 0.5])
+def test_the_share_that_is_dropped_and_the_mean_of_the_others(rate):
+    splats = splats_of(2000)
+    shown = splats.extents[:, 0] > 0
+    sums = np.zeros(len(shown))
+    for iteration in range(200):
+        after = by_twin(splats, Dropout(rate, 0, iteration))
+        kept = after.extents[:, 0] > 0
+        assert not (kept & ~shown).any()
+        sums += after.opacities
+        # Five standard deviations of a share of 1600 draws.
+        assert abs(1 - kept.sum() / shown.sum() - rate) <= 5 * np.sqrt(rate * (1 - rate) / shown.sum())
+    np.testing.assert_allclose(sums.mean() / 200, splats.opacities.mean(), rtol=0.01)
+
+
+def test_boxes_are_those_of_the_new_opacity():
+    """As if the Gaussians themselves had it."""
+    gaussians, camera = synthetic_scene(500, width=160, height=120)
+    dropout = Dropout(0.2, 0, 1)
+    found = by_twin(reference.project_fwd(gaussians, camera, 3), dropout)
+    kept = found.extents[:, 0] > 0
+    opaque = gaussians.opacities * dropout.gain
+    possible = kept & (opaque < 1)
+    gaussians.logit_opacities[possible] = np.log(opaque[possible] / (1 - opaque[possible]))
+    expected = reference.project_fwd(gaussians, camera, 3)
+    assert possible.sum() > 100
+    np.testing.assert_allclose(found.extents[possible], expected.extents[possible], rtol=1e-9)
+
+
+def test_each_iteration_and_seed_draws_anew(device):
+    splats = splats_of(2000)
+    draws = [by_kernel(device, splats, Dropout(0.5, *use)).opacities > 0 for use in ((0, 1), (0, 2), (1, 1), (0, 1))]
+    for other in draws[1:3]:
+        assert 0.3 < (draws[0] != other)[splats.opacities > 0].mean() < 0.7
+    assert (draws[0] == draws[3]).all()
+
+
+def test_gradients_through_the_image(device64):
+    gaussians, camera = synthetic_scene(12, seed=2, margin=3e-2)
+    gaussians.logit_opacities -= 1  # the others' opacities stay below ALPHA_MAX
+    dropout, background = Dropout(0.3, 0, 5), (0.1, 0.5, 0.9)
+    weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))
+
+    def run(logit_opacities, means):
+        arrays = {**gaussians.arrays(), "logit_opacities": logit_opacities, "means": means}
+        changed = upload(device64, type(gaussians)(**arrays))
+        return forward(device64, changed, camera, RenderConfig(), background, 3, dropout=dropout)
+
+    first = run(gaussians.logit_opacities, gaussians.means)
+    dropped = first.splats.opacities.get() == 0
+    assert 0 < dropped.sum() < 12
+    v = Image(device64.upload("v", weights), device64.upload("v", np.zeros(weights.shape[:2])))
+    gradients = fetch(backward(device64, first, v).gaussians)
+    assert (gradients.logit_opacities[dropped] == 0).all() and (gradients.logit_opacities[~dropped] != 0).any()
+    gradcheck(
+        lambda **inputs: float((run(**inputs).image.image.get() * weights).sum()),
+        {"logit_opacities": gaussians.logit_opacities, "means": gaussians.means},
+        {"logit_opacities": gradients.logit_opacities, "means": gradients.means},
+    )
+
+
+def test_backward_matches_twin(any_device):
+    v = np.random.default_rng(0).normal(size=70)
+    dropout = Dropout(0.25, 0, 1)
+    arrays = SplatGrads(None, None, any_device.upload("v", v), None)
+    ops.dropout_bwd(any_device, arrays, dropout)
+    expected = SplatGrads(None, None, v.copy(), None)
+    reference.dropout_bwd(expected, dropout)
+    np.testing.assert_allclose(arrays.opacities.get(), expected.opacities, rtol=1e-6)
+    np.testing.assert_allclose(expected.opacities, v / 0.75)
