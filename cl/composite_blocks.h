@@ -178,6 +178,16 @@ typedef struct {
 // about the cost of one splat.
 #define BATCH 32
 
+// Asks for memory, to read or to write, that will be needed: splats and records lie at random, and a fetch from beyond the
+// nearest caches lasts as long as a block. Only for kernels that run on the host's processor, whose addresses are plain.
+#if defined(__clang__) && (defined(__x86_64__) || defined(__aarch64__))
+#define FETCH_TO_READ(p)  __builtin_prefetch((const void *)(size_t)(p))
+#define FETCH_TO_WRITE(p) __builtin_prefetch((const void *)(size_t)(p), 1)
+#else
+#define FETCH_TO_READ(p)
+#define FETCH_TO_WRITE(p)
+#endif
+
 // Loads up to BATCH splats from the list's entry `first` on; returns their number.
 static inline uint load_batch(const __global Splat *splats, const __global uint *gauss_ids, uint first, uint end,
                               int x0, int y0, Over *batch) {
@@ -185,6 +195,11 @@ static inline uint load_batch(const __global Splat *splats, const __global uint 
     // First all loads, so that the caches' misses overlap.
     for (uint j = 0; j < count; ++j)
         batch[j].splat = splats[gauss_ids[first + j]];
+    for (uint j = first + BATCH; j < LESSER(end, first + 2 * BATCH); ++j) {
+        // Most lie across two lines of the cache.
+        FETCH_TO_READ(&splats[gauss_ids[j]].x);
+        FETCH_TO_READ(&splats[gauss_ids[j]].color[CHANNELS - 1]);
+    }
     for (uint j = 0; j < count; ++j)
         batch[j].blocks = blocks_met(&batch[j].splat, x0, y0);
     return count;

@@ -96,6 +96,8 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
         if (!unfinished)
             break;
         const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
+        for (uint j = 0; j < count; ++j)
+            FETCH_TO_WRITE(&records[(size_t)RECORD * slots[first + j]]);
         for (uint j = 0; j < count; ++j) {
             const Splat *s = &batch[j].splat;
             const real to_x = x0 - s->x, to_y = y0 - s->y;
