@@ -32,7 +32,7 @@ class State:
 
     intersections: the most tiles that a Gaussian has met in a view, on the mean over all Gaussians; it bounds their
     growth where memory does. search: for the scene's size; None where that is fixed. exposures, poses: what is
-    learned about each photo, if it is.
+    learned about each photo, if it is. pixels: their sizes, of the 3D filter; None without it, or to be found anew.
     """
 
     iteration: int
@@ -45,6 +45,7 @@ class State:
     search: Search | None = None
     exposures: PerPhoto | None = None
     poses: PerPhoto | None = None
+    pixels: Any = None
 
 
 def save_state(path: Path, state: State, config: TrainConfig) -> None:
@@ -56,6 +57,8 @@ def save_state(path: Path, state: State, config: TrainConfig) -> None:
     for part, gaussians in parts.items():
         arrays |= {f"{part}.{name}": array for name, array in fetch(gaussians).arrays().items()}
     arrays |= {f"statistics.{name}": download(array) for name, array in state.strategy.statistics.items()}
+    if state.pixels is not None:
+        arrays["pixels"] = download(state.pixels)
     for part, learned in (("exposures", state.exposures), ("poses", state.poses)):
         if learned:
             arrays |= {f"{part}.{name}": array for name, array in learned.arrays().items()}
@@ -140,6 +143,7 @@ def _to_state(arrays: dict[str, NDArray[Any]], extent: float, config: TrainConfi
         if "best.means" in arrays:
             search.best = kept("best", "best.")
     state = State(*numbers, now.gaussians, now.moments, strategy, float(arrays["intersections"]), search)
+    state.pixels = arrays.get("pixels")
     for name in ("exposures", "poses"):
         learned = {k.removeprefix(f"{name}."): a for k, a in arrays.items() if k.startswith(f"{name}.")}
         if learned:

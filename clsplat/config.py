@@ -244,6 +244,10 @@ class TrainConfig:
     """Share of the splats left out of each image at the end; it rises from 0 over the training."""
     exposure: bool = False
     """Learn an affine map of colours for each training photo, for photos of changing exposure or white balance."""
+    filter_3d: bool = False
+    """No Gaussian gets thinner than the photos resolve (Mip-Splatting's 3D filter): for scenes that will be seen from
+    nearer, or at a larger size, than they were photographed; with --mode antialiased also from farther. Saved scenes
+    contain it: other viewers need nothing."""
     poses: bool = False
     """Refine the training photos' poses: where they were not made by structure from motion, or badly. Held-out photos
     are then evaluated twice: as posed, and with each camera aligned with the scene."""

@@ -30,6 +30,9 @@ BLUR = 0.3
 COMPENSATION_MIN = 0.005
 """Floor of the opacity compensation of the antialiased mode, so that its gradient stays bounded (gsplat)."""
 
+FILTER_VARIANCE = 0.2
+"""Of the 3D filter, in squared sizes of a pixel in the photo that samples a Gaussian most finely (Mip-Splatting)."""
+
 NEAR = 0.01
 """Depth in world units at which Gaussians are culled (gsplat; the original's 0.2 cuts small scenes)."""
 

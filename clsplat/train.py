@@ -13,9 +13,10 @@ import numpy as np
 from clsplat import exposure, poses, pyramid, size
 from clsplat.checkpoint import State, load_state, log_file, save_state, write_photos
 from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.constants import ALPHA_MIN
 from clsplat.densify import STRATEGIES, Contributions, Edit
 from clsplat.errors import ClsplatError, DeviceError, InputError
-from clsplat.gaussians import Gaussians
+from clsplat.gaussians import Gaussians, logit
 from clsplat.initialize import initialize
 from clsplat.memory import INTERSECTIONS, Footprint, Photos
 from clsplat.optim import Moments, adam_settings, sh_degree_at
@@ -27,6 +28,9 @@ from clsplat.survey import contributions
 
 if TYPE_CHECKING:
     from clsplat.device import Device
+
+# Iterations between two looks at what the cameras resolve (Mip-Splatting's code); also after every edit.
+FILTER_EVERY = 100
 
 # Iterations per line of the log: its loss is their mean, since the loss of single photos says little.
 LOG_EVERY = 10
@@ -91,6 +95,8 @@ def train(
     """
     if config.strategy not in STRATEGIES:
         raise InputError(f"--strategy: expected one of {', '.join(STRATEGIES)}, found {config.strategy!r}")
+    if config.filter_3d and config.size == "auto":
+        raise InputError("--filter-3d: expected --size fixed, found auto: its search does not know the filter")
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
     state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
@@ -101,6 +107,8 @@ def train(
     photos, need = Photos(device), Footprint.of(scene, config, device)
     if config.optimizer == "device":
         move(state, device)
+    if state.pixels is not None:
+        state.pixels = device.upload("pixel sizes", state.pixels)
     losses: list[float] = []
     training, factor = scene.train, 1
     with log_file(out / "log.jsonl", state.iteration) as log:
@@ -120,11 +128,15 @@ def train(
                 elif len(state.gaussians) >= fitting:
                     warnings.warn(f"no more than {fitting} Gaussians fit the memory: growth stops", stacklevel=2)
             try:
+                if config.filter_3d and state.pixels is None:
+                    measure_pixels(state, scene, device)
                 loss = step(state, iteration, view_at(iteration, views, config.seed), photos, config, device)
                 if state.search and not state.search.settled:
                     seek_size(state, scene.train, config, device)
                 if state.strategy.due(iteration):
                     densify(state, views, config, device)
+                if config.filter_3d and (state.pixels is None or iteration % FILTER_EVERY == 0):
+                    measure_pixels(state, scene, device)
             except DeviceError as error:
                 raise DeviceError(
                     f"iteration {iteration}: {error}; the last checkpoint in {out}, if there is one, is intact: "
@@ -142,7 +154,7 @@ def train(
                 record = {"loss": float(np.mean(losses))}
                 losses.clear()
             if evaluate and iteration in evaluate_after:
-                record |= evaluate(fetch(state.gaussians))
+                record |= evaluate(fetch(filtered(state, device)))
                 started = time.perf_counter() - state.seconds
             if record:
                 at = {"iteration": iteration, "num_gaussians": len(state.gaussians), "seconds": state.seconds}
@@ -152,7 +164,8 @@ def train(
             left = time.perf_counter()
             about = {"iteration": iteration, "loss": loss, "num_gaussians": len(state.gaussians)}
             try:
-                progress(about | {"gaussians": state.gaussians})
+                shown = state.gaussians if state.pixels is None else filtered(state, device)
+                progress(about | {"gaussians": shown})
             except KeyboardInterrupt:
                 save_state(out / "checkpoint.npz", state, config)
                 raise
@@ -160,7 +173,7 @@ def train(
     if state.exposures or state.poses:
         write_photos(out / "photos.json", state, scene)
     if not state.search:
-        return fetch(state.gaussians)
+        return fetch(filtered(state, device))
     size.write_report(out / "size.json", state.search, config)
     return size.without_useless_bands(fetch(state.gaussians), as_seen(scene.train, state), config, device)
 
@@ -171,7 +184,7 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
     sh_degree = sh_degree_at(iteration, config.shortened(config.optim.sh_degree_every), state.gaussians.sh_degree)
     photo, mask = photos(view)
     optimizer = device if config.optimizer == "device" else None
-    gaussians = state.gaussians if optimizer else upload(device, state.gaussians)
+    gaussians = filtered(state, device)
 
     progress = size.progress(iteration, config, state.search)
     dropout = Dropout(config.dropout * progress, config.seed, iteration) if config.dropout else None
@@ -200,17 +213,40 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
     settings = settings._replace(penalties=(*state.strategy.penalties(len(gaussians)), erank))
     moments = state.moments.first, state.moments.second
     options = {"antialiased": config.render.mode == "antialiased", "viewmat_grad": state.poses is not None}
-    if optimizer:
+    if optimizer and state.pixels is None:
         v_viewmat = stage.project_bwd_adam(gaussians, moments, camera, run.splats, v_splats, settings, **options)
     else:
         v_gaussians, v_viewmat = stage.project_bwd(gaussians, camera, sh_degree, run.splats, v_splats, **options)
-        stage_functions(None).adam_step(state.gaussians, fetch(v_gaussians), *moments, settings)
+        if state.pixels is not None:
+            v_gaussians = stage.filter_bwd(on_device(state.gaussians, device), state.pixels, v_gaussians)
+        v_gaussians = v_gaussians if optimizer else fetch(v_gaussians)
+        stage_functions(optimizer).adam_step(state.gaussians, v_gaussians, *moments, settings)
     if state.poses:
         rate = poses.rate_at(progress, config.optim)
         poses.update(state.poses, view.name, camera, v_viewmat, rate, state.extent, config.optim)
     state.strategy.perturb(stage_functions(optimizer), state.gaussians, iteration, settings.rates["means"])
     state.iteration = iteration
     return loss
+
+
+def on_device(gaussians: Gaussians, device: "Device") -> Gaussians:
+    """The Gaussians on the device, where they are with its optimiser."""
+    return upload(device, gaussians) if isinstance(gaussians.means, np.ndarray) else gaussians
+
+
+def measure_pixels(state: State, scene: Scene, device: "Device") -> None:
+    """What the training cameras resolve at each Gaussian. Changes `state`."""
+    cameras = [view.camera for view in scene.train]
+    state.pixels = stage_functions(device).pixel_sizes(on_device(state.gaussians, device), cameras)
+
+
+def filtered(state: State, device: "Device") -> Gaussians:
+    """The Gaussians on the device as they are shown and saved: under the 3D filter, if there is one."""
+    gaussians = on_device(state.gaussians, device)
+    if state.pixels is None:
+        return gaussians
+    shown: Gaussians = stage_functions(device).filter_fwd(gaussians, state.pixels)
+    return shown
 
 
 def as_seen(views: list[View], state: State) -> list[View]:
@@ -233,16 +269,25 @@ def densify(state: State, views: list[View], config: TrainConfig, device: "Devic
 
 
 def _edit(state: State, views: list[View], config: TrainConfig, device: "Device") -> Edit:
-    gaussians = state.gaussians
+    gaussians = shown = state.gaussians
+    if state.pixels is not None:
+        shown = fetch(filtered(state, device))
     sh_degree = sh_degree_at(state.iteration, config.shortened(config.optim.sh_degree_every), gaussians.sh_degree)
 
     def survey(count: int) -> Contributions:
         order = stream(config.seed, "surveyed views", state.iteration).permutation(len(views))
         chosen = as_seen([views[i] for i in order[:count]], state)
-        return contributions(device, gaussians, chosen, config.render, BACKGROUNDS[config.data.background], sh_degree)
+        return contributions(device, shown, chosen, config.render, BACKGROUNDS[config.data.background], sh_degree)
 
     move(state, None)
-    return state.strategy.edit(state.iteration, state.gaussians, survey)
+    edit = state.strategy.edit(state.iteration, state.gaussians, survey)
+    if edit.reset_opacities and state.pixels is not None:
+        # What is shown is lowered to the value of the reset: less, and it might be invisible for good.
+        before = state.gaussians.opacities[edit.rows]
+        raised = edit.gaussians.opacities * before / np.maximum(shown.opacities[edit.rows], ALPHA_MIN)
+        most = np.minimum(before, 1 - 1e-6)  # whose logit is finite
+        edit.gaussians.logit_opacities[:] = logit(np.clip(raised, edit.gaussians.opacities, most))
+    return edit
 
 
 def seek_size(state: State, views: list[View], config: TrainConfig, device: "Device") -> None:
@@ -276,6 +321,7 @@ def seek_size(state: State, views: list[View], config: TrainConfig, device: "Dev
 
 def _apply(edit: Edit, state: State) -> None:
     state.gaussians, state.moments = edit.gaussians, state.moments.take(edit.rows, edit.fresh)
+    state.pixels = None  # of other rows
     if edit.reset_opacities:
         state.moments.first.logit_opacities[:] = 0
         state.moments.second.logit_opacities[:] = 0

@@ -6,6 +6,7 @@ from clsplat.ops.composite import composite_bwd, composite_fwd
 from clsplat.ops.count import count_pairs
 from clsplat.ops.dropout import dropout_bwd, dropout_fwd
 from clsplat.ops.exposure import exposure_bwd, exposure_fwd
+from clsplat.ops.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
@@ -28,8 +29,11 @@ __all__ = [
     "exclusive_scan",
     "exposure_bwd",
     "exposure_fwd",
+    "filter_bwd",
+    "filter_fwd",
     "l1_ssim",
     "observe",
+    "pixel_sizes",
     "project_bwd",
     "project_bwd_adam",
     "project_disparities",

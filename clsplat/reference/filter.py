@@ -1,0 +1,59 @@
+"""Twin of the stage filter: Mip-Splatting's 3D smoothing filter (Yu et al. 2024, equations 6 to 9)."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.constants import FILTER_VARIANCE, FRUSTUM_MARGIN, NEAR
+from clsplat.gaussians import Gaussians, sigmoid
+
+Array = NDArray[np.float64]
+
+
+def pixel_sizes(gaussians: Gaussians, cameras: Iterable[Camera]) -> Array:
+    """Smallest sizes of a pixel; arguments and result as `clsplat.ops.pixel_sizes`."""
+    sizes = np.full(len(gaussians), np.inf)
+    for camera in cameras:
+        x, y, z = camera.viewmat[:3, :3] @ gaussians.means.T.astype(np.float64) + camera.viewmat[:3, 3:]
+        with np.errstate(all="ignore"):
+            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+            inside = np.abs(u / camera.width - 0.5) <= 0.5 + 0.5 * FRUSTUM_MARGIN
+            inside &= np.abs(v / camera.height - 0.5) <= 0.5 + 0.5 * FRUSTUM_MARGIN
+            seen = inside & (z > NEAR)
+        sizes[seen] = np.minimum(sizes, z / max(camera.fx, camera.fy))[seen]
+    seen = np.isfinite(sizes)
+    sizes[~seen] = sizes[seen].max(initial=0)
+    return sizes
+
+
+def filter_fwd(gaussians: Gaussians, pixels: Array) -> Gaussians:
+    """Filtered Gaussians; arguments and result as `clsplat.ops.filter_fwd`.
+
+    The odds 1/opacity - 1 become ((1 + odds) - factor)/factor.
+    """
+    g = gaussians.astype(np.float64)
+    with np.errstate(all="ignore"):
+        variances = np.exp(2 * g.log_scales)
+        wider = variances + FILTER_VARIANCE * np.asarray(pixels, np.float64)[:, None] ** 2
+        factor = np.sqrt(np.prod(variances / wider, axis=1))
+        logits = np.log(factor) - np.log(np.exp(-g.logit_opacities) + (1 - factor))
+    alone = np.asarray(pixels) == 0
+    return replace(
+        g,
+        log_scales=np.where(alone[:, None], g.log_scales, 0.5 * np.log(wider)),
+        logit_opacities=np.where(alone, g.logit_opacities, logits),
+    )
+
+
+def filter_bwd(gaussians: Gaussians, pixels: Array, v: Gaussians) -> Gaussians:
+    """Gradients of `filter_fwd`; arguments and result as `clsplat.ops.filter_bwd`."""
+    after, g = filter_fwd(gaussians, pixels), gaussians.astype(np.float64)
+    kept = np.exp(2 * (g.log_scales - after.log_scales))
+    rest = sigmoid(-after.logit_opacities)  # 1 - opacity
+    v_factor = (v.logit_opacities / rest)[:, None]
+    v.log_scales[:] = v.log_scales * kept + v_factor * (1 - kept)
+    v.logit_opacities[:] = v.logit_opacities * sigmoid(-g.logit_opacities) / rest
+    return v
