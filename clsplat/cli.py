@@ -14,7 +14,7 @@ from clsplat.commands.files import Devices, Export, Sfm
 from clsplat.commands.pictures import Eval, Render
 from clsplat.commands.training import Demo, Train
 from clsplat.commands.viewing import View
-from clsplat.errors import ClsplatError
+from clsplat.errors import ClsplatError, driver_errors
 
 BENCHMARKS = (
     Annotated[Kernels, tyro.conf.subcommand("kernels")]
@@ -47,7 +47,8 @@ def main(arguments: list[str] | None = None) -> None:
         COMMANDS, prog="clsplat", args=arguments, description="3D Gaussian Splatting on any OpenCL device."
     )
     try:
-        command.run()
+        with driver_errors():
+            command.run()
     except ClsplatError as error:
         say(f"clsplat: {error}")
         sys.exit(2)

@@ -15,7 +15,7 @@ from clsplat.checkpoint import State, load_state, log_file, save_state, write_ph
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.constants import ALPHA_MIN
 from clsplat.densify import STRATEGIES, Contributions, Edit
-from clsplat.errors import ClsplatError, DeviceError, InputError
+from clsplat.errors import ClsplatError, DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians, logit
 from clsplat.initialize import initialize
 from clsplat.memory import INTERSECTIONS, Footprint, Photos
@@ -128,19 +128,20 @@ def train(
                 elif len(state.gaussians) >= fitting:
                     warnings.warn(f"no more than {fitting} Gaussians fit the memory: growth stops", stacklevel=2)
             try:
-                if config.filter_3d and state.pixels is None:
-                    measure_pixels(state, scene, device)
-                loss = step(state, iteration, view_at(iteration, views, config.seed), photos, config, device)
-                if state.search and not state.search.settled:
-                    seek_size(state, scene.train, config, device)
-                if state.strategy.due(iteration):
-                    densify(state, views, config, device)
-                if config.filter_3d and (state.pixels is None or iteration % FILTER_EVERY == 0):
-                    measure_pixels(state, scene, device)
+                with driver_errors():
+                    if config.filter_3d and state.pixels is None:
+                        measure_pixels(state, scene, device)
+                    loss = step(state, iteration, view_at(iteration, views, config.seed), photos, config, device)
+                    if state.search and not state.search.settled:
+                        seek_size(state, scene.train, config, device)
+                    if state.strategy.due(iteration):
+                        densify(state, views, config, device)
+                    if config.filter_3d and (state.pixels is None or iteration % FILTER_EVERY == 0):
+                        measure_pixels(state, scene, device)
             except DeviceError as error:
                 raise DeviceError(
                     f"iteration {iteration}: {error}; the last checkpoint in {out}, if there is one, is intact: "
-                    "--resume with a lower --memory-limit stops growth earlier"
+                    "--resume goes on from there, and a lower --memory-limit stops growth earlier"
                 ) from error
             if not np.isfinite(loss):
                 raise ClsplatError(
