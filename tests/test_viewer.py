@@ -16,8 +16,9 @@ from clsplat.camera import Camera
 from clsplat.config import OptimConfig, RenderConfig, TrainConfig
 from clsplat.errors import DeviceError, InputError
 from clsplat.metrics import psnr, to_uint8
+from clsplat.ops import count_pairs
 from clsplat.orbit import first_photo
-from clsplat.render import render, upload
+from clsplat.render import forward, render, upload
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
 from clsplat.train import train
@@ -85,7 +86,12 @@ class TestPicture:
         assert np.corrcoef(brightness, ours.depth[solid])[0, 1] < -0.8, "near must be bright"
         near, far = np.percentile(ours.depth[solid], [2, 98])
         assert f"bright {near:.3g}, dark {far:.3g}" in shown["depth"][1]
-        assert (shown["count"][0].sum(axis=2) > 0).any() and "Gaussians per pixel" in shown["count"][1]
+        run = forward(device, upload(device, gaussians), camera, RenderConfig(), np.zeros(3), 0, gradients=False)
+        count = count_pairs(device, run.splats, run.bins)[1].get()
+        assert f"bright {count.max()} Gaussians per pixel; mean {count.mean():.1f}" in shown["count"][1]
+        order = np.argsort(count, axis=None)[[0, -1]]
+        darkest, brightest = shown["count"][0].sum(axis=2).ravel()[order]
+        assert darkest < brightest == shown["count"][0].sum(axis=2).max()
 
     def test_an_empty_view_has_no_depth(self, device):
         gaussians, (camera, *_) = cameras()
@@ -183,7 +189,7 @@ class TestResolution:
         assert client.state.shown is shown
         clock.now = shown.at + 10
         viewer.follow(gaussians, lambda: False)
-        assert client.state.shown.version == viewer._version
+        assert client.state.shown is not shown and client.state.shown.share == 1
 
     def test_memory_that_is_short_does_not_end_the_training(self, viewer, monkeypatch):
         gaussians, cams = cameras()
