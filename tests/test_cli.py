@@ -381,7 +381,7 @@ def test_view_opens_every_format(
 
 
 def test_view_goes_to_the_photos(
-    trained: Path, dataset: Path, held: list[tuple[str, Gaussians]], monkeypatch: pytest.MonkeyPatch
+    trained: Path, dataset: Path, tmp_path: Path, held: list[tuple[str, Gaussians]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from clsplat.viewer import Viewer
 
@@ -393,11 +393,14 @@ def test_view_goes_to_the_photos(
         start(self, *arguments, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Viewer, "__init__", watched)
-    run("view", trained / "scene.ply", "--data", dataset, "--port", 18090)
+    gaussians = load_gaussians(trained / "scene.ply")[0]
+    save_gaussians(tmp_path / "scene.ply", gaussians, offset=(10.0, 0.0, 0.0))  # the dataset's is 0
+    run("view", tmp_path / "scene.ply", "--data", dataset, "--port", 18090)
     scene = load_scene(dataset, DataConfig())
     _, _, viewpoint, views, _ = made[0]
     assert len(views) == 9
     np.testing.assert_array_equal(viewpoint.camera.viewmat, scene.train[0].camera.viewmat)
+    np.testing.assert_allclose(held[0][1].means, gaussians.means + np.float32([10, 0, 0]), rtol=1e-6)
 
 
 def test_train_with_a_viewer_ends_with_the_same_bits_and_stays_open(
