@@ -1,6 +1,6 @@
 PYTHON = python
 
-.PHONY: test test-slow stability fuzz lint docs check-races bench bench-quality bench-stability formats
+.PHONY: test test-slow stability fuzz lint docs check-races bench bench-knobs bench-quality bench-stability formats
 
 # The default tests: a few minutes on two cores.
 test:
@@ -47,6 +47,10 @@ bench-quality:
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods $(METHODS) \
 	  $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/quality
 	cp build/quality/results.jsonl docs/results/quality.jsonl
+
+# The knobs of docs/benchmarks.md, measured anew: make bench-knobs WORKLOAD=10k-320x240 (default: 100k-640x480).
+bench-knobs:
+	$(PYTHON) -m clsplat bench knobs $(if $(WORKLOAD),--workload $(WORKLOAD)) -o docs/results/knobs.json --chart docs/results/knobs.svg
 
 # The figures of docs/stability.md, measured anew: make bench-stability DATA=folder of real scenes.
 bench-stability:

@@ -82,7 +82,8 @@ def train(
     Raises
     ------
     InputError
-        If the scene has no photos to train on, or the checkpoint is of another configuration.
+        If the scene has no photos to train on, the checkpoint is of another configuration, or small photos are
+        asked for while the size is sought.
     DeviceError
         If the device's memory, or its limit, is exceeded in spite of all.
     ClsplatError
@@ -99,6 +100,10 @@ def train(
         raise InputError("--filter-3d: expected --size fixed, found auto: its search does not know the filter")
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
+    if config.coarse.factor > 1 and config.size == "auto":
+        raise InputError(
+            f"--coarse.factor: expected 1 with --size auto, which validates full photos, found {config.coarse.factor}"
+        )
     state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
     if evaluate_after is None:
         evaluate_after = (

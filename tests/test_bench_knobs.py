@@ -1,6 +1,7 @@
 """`clsplat bench knobs`: each setting turns one knob, errors are against the float64 twin, and every figure shown is
 the one measured. Nothing here depends on how fast anything is."""
 
+import itertools
 import json
 from dataclasses import asdict, replace
 from typing import get_args, get_type_hints
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 from clsplat.bench import knobs
 from clsplat.bench.knob_report import FLOOR, knobs_chart, knobs_text
 from clsplat.bench.knobs import Setting, bench_knobs, error, settings
+from clsplat.bench.report import chart_title
 from clsplat.bench.workloads import synthetic
 from clsplat.camera import Camera
 from clsplat.cli import main
@@ -179,6 +181,9 @@ class TestReport:
             names = {f"{r['knob']} {r['value']}".rstrip() for r in shown}
             assert {t.get_text() for t in axes.texts} == names
             at = {t.get_text(): t.xy for t in axes.texts}
+            # Labels are in the order of the errors, from below.
+            errors = [at[t.get_text()][1] for t in sorted(axes.texts, key=lambda t: t.xyann[1])]
+            assert all(below <= above * 1.1 for below, above in itertools.pairwise(errors))
             for r in shown:
                 expected = r[job]["ratio"], max(r["error"]["rms"], FLOOR)
                 assert at[f"{r['knob']} {r['value']}".rstrip()] == pytest.approx(expected)
@@ -208,3 +213,23 @@ class TestCommand:
                 main(["bench", "knobs", *arguments])
             assert exit_.value.code == 2
             assert message in capsys.readouterr().err
+
+
+class TestPage:
+    """docs/benchmarks.md shows what the files beside it hold: the table is made from them while the page is built."""
+
+    def test_table_and_chart_are_of_these_results(self, project, results):
+        page = (project / "docs" / "benchmarks.md").read_text()
+        assert "```{bench_knobs} results/knobs.json" in page
+        assert "](results/knobs.svg)" in page
+        measured = json.loads((project / "docs" / "results" / "knobs.json").read_text())
+        assert set(measured) == set(results)
+        assert {r["knob"] for r in measured["workloads"][0]["results"]} >= {"ALPHA_MIN", "SH degree", "optimizer"}
+        assert measured["software"]["commit"], "figures without a commit cannot be repeated"
+        chart = (project / "docs" / "results" / "knobs.svg").read_text()
+        assert f"<dc:title>{chart_title(measured)}</dc:title>" in chart
+
+    def test_make_writes_these_files(self, project):
+        recipe = (project / "Makefile").read_text().split("\nbench-knobs:\n")[1].splitlines()[0]
+        assert recipe.startswith("\t$(PYTHON) -m clsplat bench knobs ")
+        assert recipe.endswith(" -o docs/results/knobs.json --chart docs/results/knobs.svg")

@@ -266,6 +266,12 @@ def test_training_goes_from_small_photos_to_whole_ones(
     assert widths == 15 * [20] + 12 * [40]
 
 
+def test_small_photos_while_the_size_is_sought_are_refused(scene: Scene, device: Device, tmp_path: Path) -> None:
+    config = replace(CONFIG, size="auto", coarse=CoarseConfig(factor=2))
+    with pytest.raises(InputError, match=r"--coarse\.factor: expected 1 with --size auto, .* found 2"):
+        train(scene, config, device, tmp_path)
+
+
 def test_each_round_surveys_photos_of_its_own(
     scene: Scene, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

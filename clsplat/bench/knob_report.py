@@ -63,7 +63,7 @@ def knobs_chart(workload: Results, figure: Any) -> None:
             axes.loglog(x, max(rms, FLOOR), color=color, marker="o" if rms > FLOOR else "v", markersize=5)
             points.append((max(rms, FLOOR), x, f"{r['knob']} {r['value']}".rstrip(), color))
         # Of equal errors the slowest is the lowest: lines to the labels do not cross.
-        for i, (y, x, name, color) in enumerate(sorted(points, key=lambda p: (f"{p[0]:.1e}", -p[1]))):
+        for i, (y, x, name, color) in enumerate(sorted(points, key=lambda p: (float(f"{p[0]:.1e}"), -p[1]))):
             line = {"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.5, "relpos": (0, 0.5)}
             at = (1.06, (i + 0.5) / len(points))
             text = {"fontsize": 8, "color": color, "va": "center"}

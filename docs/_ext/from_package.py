@@ -3,7 +3,8 @@
 ``{constants}`` lists clsplat/constants.py; ``{config} NAME`` a dataclass of clsplat/config.py; ``{command} NAME``
 is what ``clsplat NAME --help`` prints; ``{presets}`` lists what each preset sets; ``{bench_kernels} FILE [WORKLOAD]``
 shows the results that ``clsplat bench kernels -o FILE`` measured, or the stages of one workload of them;
-``{bench_stability} FILE`` the rows and charts that ``clsplat bench stability`` left in the folder of FILE;
+``{bench_knobs} FILE`` the table of ``clsplat bench knobs -o FILE``; ``{bench_stability} FILE`` the rows and charts
+that ``clsplat bench stability`` left in the folder of FILE;
 ``{bench_quality} FILE [COST]`` where and when ``clsplat bench quality`` measured the records in FILE, or charts and
 table of one cost; ``{published_quality}`` chart and table of the original paper.
 """
