@@ -63,6 +63,9 @@ class DataConfig:
     """Every n-th photo by name is held out (0: none); ignored where the dataset brings its own split."""
     background: Background = "black"
     """Behind the scene, and behind transparent photos."""
+    random_background: bool = False
+    """Train each iteration before another colour: dark areas then stay opaque, which could as well let a black
+    background through. Evaluation keeps `background`."""
     masks: str | None = None
     """Folder of masks named as the photos (NAME.png or NAME.jpg.png): white pixels train, black ones do not."""
     sfm: SfmConfig = field(default_factory=SfmConfig)

@@ -14,6 +14,10 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Endings, in lower case, of the files that count as photos."""
 
 
+TRANSPARENT = ("RGBA", "RGBa", "LA", "La", "PA")
+"""Pillow's modes with an alpha channel."""
+
+
 def photo_folder(path: Path) -> Path:
     """Where the photos of the dataset `path` are: its folder ``images``, or `path` itself where there is none."""
     return path / "images" if (path / "images").is_dir() else path
@@ -86,6 +90,18 @@ def is_plain(path: Path) -> bool:
     return plain and not transparent and orientation(path) == 1
 
 
+def is_transparent(path: Path) -> bool:
+    """Whether a photo has an alpha channel or a transparent colour.
+
+    Raises
+    ------
+    InputError
+        If the file is no image.
+    """
+    with _opened(path) as image:
+        return image.mode in TRANSPARENT or "transparency" in image.info
+
+
 def write_upright_png(source: Path, target: Path) -> None:
     """Write the photo `source` as an upright 8-bit RGB PNG, whatever the ending of `target`.
 
@@ -154,7 +170,7 @@ def _rgb(image: Image.Image, background: tuple[float, float, float], path: Path)
                 f"{path}: expected 8 or 16 bits per channel, found 32 (mode {image.mode}); convert the photo"
             )
         return np.repeat((grey.astype(np.uint16) >> 8).astype(np.uint8)[..., None], 3, axis=2)
-    if image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info:
+    if image.mode in TRANSPARENT or "transparency" in image.info:
         rgba = np.asarray(image.convert("RGBA"), dtype=np.float32)
         alpha = rgba[..., 3:] / 255
         blended = rgba[..., :3] * alpha + 255 * np.asarray(background, dtype=np.float32) * (1 - alpha)

@@ -34,4 +34,6 @@ def shrunk(view: View, factor: int) -> View:
         return np.asarray(Image.fromarray(array).resize((width, height), Image.Resampling.BOX))
 
     mask = None if view.mask is None else boxes(np.where(view.mask, 255, 0).astype(np.uint8)) == 255
-    return replace(view, camera=view.camera.resized(width, height), image=boxes(view.image), mask=mask)
+    clear = None if view.clear is None else boxes(view.clear)
+    camera = view.camera.resized(width, height)
+    return replace(view, camera=camera, image=boxes(view.image), mask=mask, clear=clear)

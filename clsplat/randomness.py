@@ -13,6 +13,7 @@ PURPOSES = (
     "sources of relocated Gaussians",
     "sources of new Gaussians",
     "surveyed views",
+    "backgrounds",
 )
 
 

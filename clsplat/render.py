@@ -14,13 +14,13 @@ from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.scene import Color
 from clsplat.stages import Bins, Dropout, Image, SplatGrads, Splats
 
 if TYPE_CHECKING:
     from clsplat.device import Device
 
 Array = NDArray[Any]
-Color = tuple[float, float, float]
 
 
 class Gradients(NamedTuple):

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from clsplat import display
 from clsplat.camera import Camera
 
+Color = tuple[float, float, float]
+
 THUMBNAILS = 8
 """Photos of a scene that a notebook shows."""
 
@@ -26,12 +28,22 @@ class View:
         The photo: undistorted, upright, composited on the background where it was transparent.
     mask : (H, W) bool, optional
         True where pixels count.
+    clear : (H, W) uint8, optional
+        What shows of the background, of 255, where the photo is transparent and trains on random backgrounds.
     """
 
     name: str
     camera: Camera
     image: NDArray[np.uint8]
     mask: NDArray[np.bool_] | None = None
+    clear: NDArray[np.uint8] | None = None
+
+    def on(self, background: Color, loaded_on: Color) -> NDArray[np.uint8]:
+        """The photo (H, W, 3) on another background than the one it was loaded on, RGB in [0, 1]."""
+        if self.clear is None:
+            return self.image
+        change = self.clear[:, :, None] * (np.array(background) - np.array(loaded_on))
+        return np.rint(np.clip(self.image + change, 0, 255)).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

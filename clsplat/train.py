@@ -189,12 +189,17 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
     camera = poses.refined(view.camera, state.poses.of(view.name)) if state.poses else view.camera
     sh_degree = sh_degree_at(iteration, config.shortened(config.optim.sh_degree_every), state.gaussians.sh_degree)
     photo, mask = photos(view)
+    background = BACKGROUNDS[config.data.background]
+    if config.data.random_background:
+        drawn = tuple(stream(config.seed, "backgrounds", iteration).random(3).tolist())
+        if view.clear is not None:
+            photo = device.upload("photo", view.on(drawn, background), np.uint8)
+        background = drawn
     optimizer = device if config.optimizer == "device" else None
     gaussians = filtered(state, device)
 
     progress = size.progress(iteration, config, state.search)
     dropout = Dropout(config.dropout * progress, config.seed, iteration) if config.dropout else None
-    background = BACKGROUNDS[config.data.background]
     run = forward(device, gaussians, camera, config.render, background, sh_degree, dropout=dropout)
     state.intersections = max(state.intersections, run.bins.gauss_ids.shape[0] / len(gaussians))
     stage, image = stage_functions(device), run.image.image

@@ -1,5 +1,6 @@
 """From a folder to a `Scene`: what kind of dataset it is, which photos are held out, where the origin lies."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,6 @@ def _near_origin(scene: Scene) -> Scene:
         return scene
 
     def moved(part: list[View]) -> list[View]:
-        return [View(view.name, view.camera.translated(centre), view.image, view.mask) for view in part]
+        return [replace(view, camera=view.camera.translated(centre)) for view in part]
 
     return Scene(moved(scene.train), moved(scene.test), scene.points - centre, scene.colors, centre)

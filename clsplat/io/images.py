@@ -17,7 +17,7 @@ from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, DataConfig
 from clsplat.errors import InputError
 from clsplat.lenses import Intrinsics, is_pinhole, project, undistorted
-from clsplat.photos import SUFFIXES, orientation, photo_size, read_mask, read_photo
+from clsplat.photos import SUFFIXES, is_transparent, orientation, photo_size, read_mask, read_photo
 from clsplat.scene import View
 
 SIZE_MAX = 1 << 20
@@ -242,7 +242,7 @@ def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         plans = list(pool.map(lambda photo: _plan(photo, dataset), dataset.photos))
-        views = pool.map(lambda plan: _view(plan, dataset.reduce, BACKGROUNDS[config.background]), plans)
+        views = pool.map(lambda plan: _view(plan, dataset.reduce, config), plans)
         return list(tqdm(views, "photos", len(plans), unit="photo", dynamic_ncols=True, leave=False))
 
 
@@ -281,7 +281,21 @@ def _fits(size: tuple[int, int], declared: Intrinsics) -> bool:
     return abs(sx - sy) <= max(ASPECT_TOLERANCE * max(sx, sy), 1 / min(declared.width, declared.height))
 
 
-def _view(plan: _Plan, reduce: int, background: tuple[float, float, float]) -> View:
+def _view(plan: _Plan, reduce: int, config: DataConfig) -> View:
+    photo, camera = plan.photo, plan.camera
+    image, mask = _pixels(plan, reduce, BACKGROUNDS[config.background])
+    clear = None
+    if config.random_background and is_transparent(photo.path):
+        # What shows of the background is what changes with it.
+        white, black = (_pixels(plan, reduce, BACKGROUNDS[name])[0].astype(float) for name in ("white", "black"))
+        clear = np.rint((white - black).mean(axis=2)).astype(np.uint8)
+    return View(photo.name, camera, np.ascontiguousarray(image), mask, clear)
+
+
+def _pixels(
+    plan: _Plan, reduce: int, background: tuple[float, float, float]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """Photo and mask: decoded, undistorted, reduced."""
     photo, camera = plan.photo, plan.camera
     image = read_photo(photo.path, background, plan.upright)
     mask = None if photo.mask is None else _fitted_mask(photo.mask, image.shape[1], image.shape[0])
@@ -297,7 +311,7 @@ def _view(plan: _Plan, reduce: int, background: tuple[float, float, float]) -> V
         image = np.rint(total / reduce**2).astype(np.uint8)
         # A pixel that is averaged from a masked one does not count either.
         mask = None if mask is None else np.asarray(_squares(mask, camera, reduce).all(axis=(1, 3)))
-    return View(photo.name, camera, np.ascontiguousarray(image), mask)
+    return image, mask
 
 
 def _squares(pixels: NDArray[Any], camera: Camera, edge: int) -> NDArray[Any]:

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small import CONFIG, small_scene, with_train
 
 from clsplat import poses
+from clsplat.bench.stability.small import CONFIG, small_scene, with_train
 from clsplat.checkpoint import load_state
 from clsplat.evaluate import mean_metrics
 from clsplat.train import train

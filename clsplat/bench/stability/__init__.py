@@ -11,5 +11,6 @@ EXPERIMENTS: dict[str, Experiment] = {
     "exposure": photos.EXPOSURE,
     "poses": photos.POSES,
     "few-views": photos.FEW_VIEWS,
+    "dark-areas": photos.DARK_AREAS,
 }
 """In the order of docs/stability.md; a line enrols an experiment in the command, the page and the tests."""

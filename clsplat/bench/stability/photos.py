@@ -7,14 +7,19 @@ import numpy as np
 
 from clsplat import few_views, poses
 from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
+from clsplat.bench.stability.small import CONFIG, small_scene, soot
 from clsplat.bench.stability.trained import held_out, load, spread, trained
-from clsplat.config import BACKGROUNDS
+from clsplat.config import BACKGROUNDS, DataConfig
 from clsplat.device import Device
+from clsplat.render import render
 from clsplat.scene import Scene, View
 
 GAINS = (0.0, 0.1, 0.2, 0.4)
 NOISES = (0.0, 0.2, 0.5, 1.0)
 COUNTS = (3, 6, 12)
+SOLID = 25
+"""Of 255: where less shows of the background, an object counts as solid."""
+
 FEW_ITERATIONS = 2000
 """Few photos are learned by heart after some hundred iterations: a short training does not show it."""
 
@@ -98,12 +103,25 @@ def _few_views(device: Device, data: Path | None) -> Found:
     for count in COUNTS:
         few = spread(scene, count)
         for label, settings in variants.items():
-            asked = few_views.adapted(replace(config, few=settings), few)
-            series[label].append((count, held_out(trained(few, asked, device), few, asked, device)))
+            if count == COUNTS[0] or settings.dropout:
+                asked = few_views.adapted(replace(config, few=settings), few)
+                series[label].append((count, held_out(trained(few, asked, device), few, asked, device)))
     return Found(
         [Figure(label, dict(points)[3] or 0.0, "dB") for label, points in series.items()],
         Plot("training photos", "PSNR of held-out photos, dB", series),
     )
+
+
+def _dark_areas(device: Device, data: Path | None) -> Found:
+    scene, figures = soot(small_scene(device), device), []
+    for label, random in (("black background", False), ("--random-background", True)):
+        gaussians = trained(scene, replace(CONFIG, data=DataConfig(random_background=random)), device)
+        alphas = []
+        for view in scene.test:
+            assert view.clear is not None
+            alphas.append(float(render(gaussians, view.camera, device=device).alpha[view.clear < SOLID].mean()))
+        figures.append(Figure(label, float(np.mean(alphas))))
+    return Found(figures)
 
 
 EXPOSURE = Experiment(
@@ -134,4 +152,13 @@ FEW_VIEWS = Experiment(
     measure=_few_views,
     figure=f"PSNR of held-out photos of fern, 120x90, from 3 photos, {FEW_ITERATIONS} iterations",
     needs_data=True,
+)
+
+DARK_AREAS = Experiment(
+    failure="dark areas turning transparent",
+    source="Brush #250",
+    remedy="each iteration before another colour, transparent photos too (`--random-background`)",
+    test="tests/stability/test_dark_areas.py::test_black_objects_stay_opaque",
+    measure=_dark_areas,
+    figure="mean alpha inside a black object, held-out views",
 )
