@@ -44,6 +44,7 @@ bench:
 QUALITY_SCENES = fox_pinhole:downscale=2 fern:downscale=2 castle_p30:downscale=2 lego:background=white
 METHODS = fast paper-7k auto mcmc
 bench-quality:
+	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-quality DATA=..."; exit 2; }
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods $(METHODS) \
 	  $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/quality
 	cp build/quality/results.jsonl docs/results/quality.jsonl
