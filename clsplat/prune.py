@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config import RenderConfig
+from clsplat.constants import ALPHA_MIN
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.reference.sh import sh_basis
@@ -151,6 +152,13 @@ def removal_order(
             return np.concatenate([kept, *reversed(gone)])
         gone.append(kept[left:])
         kept = np.sort(kept[:left])
+
+
+def without_invisible(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians without those of an opacity below ALPHA_MIN, which no pixel of any view shows; at least one."""
+    shown = gaussians.opacities >= ALPHA_MIN
+    shown[np.argmax(gaussians.logit_opacities)] = True
+    return gaussians.take(shown)
 
 
 def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -117,6 +117,7 @@ def train_and_report(
     from clsplat.evaluate import evaluate, mean_metrics
     from clsplat.io import save_gaussians
     from clsplat.poses import aligned
+    from clsplat.prune import without_invisible
     from clsplat.report import training_curve
     from clsplat.size import can_search, size_chart, split
     from clsplat.train import train
@@ -155,6 +156,7 @@ def train_and_report(
             scene, config, device, out, resume=resume, evaluate=held_out if scene.test else None, progress=progress
         )
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    gaussians = without_invisible(gaussians)
     save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
     say(f"{out / 'scene.ply'}: {len(gaussians)} Gaussians")
     training_curve(out / "log.jsonl", out / "training_curve.png")

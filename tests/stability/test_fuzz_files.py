@@ -16,7 +16,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from test_io_colmap import write_bin, write_photos, write_txt
@@ -377,3 +377,49 @@ def test_damaged_checkpoints(folder, cases):
             assert {len(found.moments.first.validate()), len(found.moments.second.validate())} == {n} and n > 0
 
     check()
+
+
+def each_flaw(content):
+    """Every cut and every flipped bit of a file, or as many of them, evenly spread, as the profile has cases for."""
+    total = 9 * len(content)
+    for at in range(0, total, max(1, total // (10 * settings.default.max_examples))):
+        place, bit = divmod(at, 9)
+        yield damaged(content, [("cut", place) if bit == 8 else ("flip", place, bit)])
+
+
+@pytest.mark.parametrize("kind", [*FORMATS, "ascii"])
+def test_every_cut_and_every_bit_of_files_of_gaussians(folder, originals, cases, kind):
+    for content in each_flaw(originals[kind]):
+        check_gaussians(folder / ("each.ply" if kind == "ascii" else f"each{kind}"), content, cases)
+
+
+@pytest.mark.parametrize("ending", ["bin", "txt"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_every_cut_and_every_bit_of_colmap_models(folder, cases, ending, name):
+    model = folder / f"each-{ending}-{name}"
+    {"bin": write_bin, "txt": write_txt}[ending](model)
+    path = model / f"{name}.{ending}"
+    for content in each_flaw(path.read_bytes()):
+        path.write_bytes(content)
+        cases["COLMAP models"] += 1
+        read(lambda: colmap.read_model(model), f"{model.name}/")
+
+
+@pytest.mark.parametrize("ending", IMAGES)
+def test_every_cut_and_every_bit_of_photos(folder, cases, ending):
+    path = folder / f"each.{ending}"
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)).save(path)
+    for content in each_flaw(path.read_bytes()):
+        path.write_bytes(content)
+        cases["photos"] += 1
+        read(lambda: read_photo(path, (0.0, 0.0, 0.0), upright=True), path.name)
+
+
+def test_every_cut_and_every_bit_of_transforms(folder, cases):
+    root = folder / "each"
+    write_transforms(root, ["images/a.png"])
+    path = root / "transforms.json"
+    for content in each_flaw(path.read_bytes()):
+        path.write_bytes(content)
+        cases["transforms.json"] += 1
+        read(lambda: transforms.read_dataset(root, DataConfig()), root.name)
