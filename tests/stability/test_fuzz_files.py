@@ -382,7 +382,7 @@ def test_damaged_checkpoints(folder, cases):
 def each_flaw(content):
     """Every cut and every flipped bit of a file, or as many of them, evenly spread, as the profile has cases for."""
     total = 9 * len(content)
-    for at in range(0, total, max(1, total // (10 * settings.default.max_examples))):
+    for at in range(0, total, max(1, total // settings.default.max_examples)):
         place, bit = divmod(at, 9)
         yield damaged(content, [("cut", place) if bit == 8 else ("flip", place, bit)])
 

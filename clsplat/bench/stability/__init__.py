@@ -1,6 +1,6 @@
 """How much the method's known failures cost without their remedies and with them: `clsplat bench stability`."""
 
-from clsplat.bench.stability import coordinates, order, photos, popping
+from clsplat.bench.stability import coordinates, densities, gradients, images, order, photos, popping
 from clsplat.bench.stability.experiment import Experiment
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -12,5 +12,9 @@ EXPERIMENTS: dict[str, Experiment] = {
     "poses": photos.POSES,
     "few-views": photos.FEW_VIEWS,
     "dark-areas": photos.DARK_AREAS,
+    "constants": gradients.CONSTANTS,
+    "everything-pruned": densities.ALL_PRUNED,
+    "dead-gaussians": densities.DEAD,
+    "images": images.KINDS,
 }
 """In the order of docs/stability.md; a line enrols an experiment in the command, the page and the tests."""
