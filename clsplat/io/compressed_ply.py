@@ -81,7 +81,8 @@ def load_compressed_ply(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.f
         finite.
     """
     try:
-        with open(path, "rb") as file:
+        # What is not finite in the end is refused then.
+        with open(path, "rb") as file, np.errstate(over="ignore", invalid="ignore"):
             return _load(path, file)
     except OSError as error:
         raise InputError(f"{path}: expected a readable PLY file, found: {error.strerror or error}") from error
