@@ -2,6 +2,7 @@
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import numpy as np
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.io.atomic import replacing
-from clsplat.raytrace import Array, Solid, bake, camera_rays, radiance
+from clsplat.raytrace import Array, Solid, bake, camera_rays, radiance, trace
+from clsplat.scene import Scene, View
 from clsplat.still_life import still_life
 
 SENSOR_NOISE = 0.005
@@ -109,3 +111,57 @@ def make_photos(folder: Path, count: int = 30, width: int = 480, height: int = 3
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(write, range(count)))
     return cameras
+
+
+def known_scene(count: int = 24, width: int = 160, height: int = 120, points: int = 2000, seed: int = 0) -> Scene:
+    """The still life with its true cameras and points: no files, no structure from motion, no noise of a sensor.
+
+    For experiments that take seconds: the light is gathered from fewer directions than in `make_photos`.
+
+    Parameters
+    ----------
+    count : int
+        Number of photos; every eighth is held out.
+    width, height : int
+        Their size in pixels.
+    points : int
+        Number of rays from the photos to train on that look for a surface; each that meets one leaves a point.
+    seed : int
+        Of the cameras' places and of the points.
+
+    Returns
+    -------
+    Scene
+        In metres, z up.
+
+    Raises
+    ------
+    InputError
+        If there would be no photo to train on, one without a pixel, or no point.
+    """
+    if count < 2 or min(width, height, points) < 1:
+        found = f"found {count}, {width}, {height}, {points}"
+        raise InputError(f"count, width, height, points: expected at least 2, 1, 1 and 1, {found}")
+    cameras = viewpoints(count, width, height, np.random.default_rng(seed))
+    solids = still_life()
+    bake(solids, sun_rays=3, sky_rays=12)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        photos = pool.map(partial(take_photo, solids=solids), cameras)
+        views = [
+            View(f"{k:03}.png", camera, np.rint(255 * photo).astype(np.uint8))
+            for k, (camera, photo) in enumerate(zip(cameras, photos, strict=True))
+        ]
+    train = [view for k, view in enumerate(views) if k % 8]
+    each = np.diff(np.arange(len(train) + 1) * points // len(train))
+    parts = [_points(view, n, [seed, k], solids) for k, (view, n) in enumerate(zip(train, each, strict=True))]
+    return Scene(train, views[::8], *(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _points(view: View, count: int, seed: list[int], solids: list[Solid]) -> tuple[Array, Array]:
+    """Points (count, 3) where random rays of a photo end, and their colours, uint8."""
+    camera, rng = view.camera, np.random.default_rng(seed)
+    x, y = rng.uniform(0, [[camera.width], [camera.height]], (2, count))
+    rays = camera_rays(camera, x, y)
+    t, _ = trace(camera.position[:, None], rays, solids)
+    seen = np.isfinite(t)
+    return (camera.position[:, None] + t * rays).T[seen], view.image[y.astype(int), x.astype(int)][seen]

@@ -379,3 +379,26 @@ def test_poses_are_recovered_from_the_photos_alone(tmp_path):
     for k, camera in enumerate(cameras):
         turn = poses[k][:, :3] @ rotation.T @ camera.viewmat[:3, :3].T
         assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 0.2  # 0.06 was seen
+
+
+def test_the_known_scene_knows_its_cameras_and_points():
+    scene = demo.known_scene(9, 64, 48, points=300)
+    assert [v.name for v in scene.test] == ["000.png", "008.png"] and len(scene.train) == 7
+    assert 200 < len(scene.points) <= 300 and scene.colors.shape == scene.points.shape
+    # Each point was seen by one photo: of those that have it in the image, one has its colour there, to the bit.
+    matched = np.zeros(len(scene.points), bool)
+    for view in scene.train:
+        p = scene.points @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
+        x, y = (p[:, :2] / p[:, 2:] * [view.camera.fx, view.camera.fy] + [view.camera.cx, view.camera.cy]).T
+        inside = (p[:, 2] > 0) & (x >= 0) & (x < 64) & (y >= 0) & (y < 48)
+        rows = np.flatnonzero(inside)
+        matched[rows] |= (view.image[y[rows].astype(int), x[rows].astype(int)] == scene.colors[rows]).all(axis=1)
+    # A ray within rounding of a pixel's edge may fall into the neighbour.
+    assert matched.mean() > 0.99
+    again = demo.known_scene(9, 64, 48, points=300)
+    assert (again.points == scene.points).all() and (again.train[3].image == scene.train[3].image).all()
+
+
+def test_the_known_scene_wants_photos():
+    with pytest.raises(InputError, match="expected at least 2, 1, 1 and 1, found 1, 64, 48, 10"):
+        demo.known_scene(1, 64, 48, points=10)
