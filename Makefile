@@ -21,8 +21,8 @@ fuzz:
 
 # Style, types, and the kernels' format.
 lint:
-	$(PYTHON) -m ruff check clsplat tests
-	$(PYTHON) -m ruff format --check clsplat tests
+	$(PYTHON) -m ruff check clsplat tests notebooks
+	$(PYTHON) -m ruff format --check clsplat tests notebooks
 	$(PYTHON) -m mypy
 	@if command -v clang-format; then clang-format --dry-run --Werror cl/*.cl cl/*.h; \
 	else echo "clang-format is missing: the kernels' format is not checked"; fi
@@ -48,6 +48,7 @@ bench-quality:
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods $(METHODS) \
 	  $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/quality
 	cp build/quality/results.jsonl docs/results/quality.jsonl
+	cp build/quality/time-psnr.svg docs/results/quality.svg
 
 # The knobs of docs/benchmarks.md, measured anew: make bench-knobs WORKLOAD=10k-320x240 (default: 100k-640x480).
 bench-knobs:

@@ -85,7 +85,7 @@ class Gaussians:
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def _repr_html_(self) -> str:
-        title = f"{len(self):,} Gaussians"
+        title = f"{len(self):,} Gaussian{'s' * (len(self) != 1)}"
         if not isinstance(self.means, np.ndarray):
             return display.facts(title, {"arrays": "on the device"})
         rows = {"spherical harmonics": f"degree {self.sh_degree}"}

@@ -1,11 +1,16 @@
 """Configuration of the documentation: ``python -m sphinx -W -b html docs docs/_build/html``."""
 
+import hashlib
+import os
 import re
 import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE.parent), str(HERE / "_ext")]
+ROOT = HERE.parent
+sys.path[:0] = [str(ROOT), str(HERE / "_ext")]
+# The notebooks' kernels are processes of their own.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
 
 project = "clsplat"
 author = "the clsplat authors"
@@ -16,7 +21,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.viewcode",
     "numpydoc",
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.mathjax",
     "sphinx-mathjax-offline",
     "matplotlib.sphinxext.plot_directive",
@@ -24,6 +29,25 @@ extensions = [
 ]
 exclude_patterns = ["_build"]
 default_role = "py:obj"
+
+
+def package_digest():
+    """Of what a notebook's outputs depend on beside its own cells."""
+    digest = hashlib.sha256()
+    for path in sorted([*ROOT.glob("clsplat/**/*.py"), *ROOT.glob("cl/*"), *ROOT.glob("docs/results/*")]):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+# Notebooks are executed where they or the package changed; their outputs are kept below _build only.
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(HERE / "_build" / "notebooks" / package_digest())
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_merge_streams = True
+# Progress bars, and how many warnings a driver had about a kernel.
+nb_output_stderr = "remove"
 
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
@@ -54,5 +78,20 @@ def escape_bars(app, what, name, obj, options, lines):
         lines[i] = "".join(p if k % 2 else p.replace("|", r"\|") for k, p in enumerate(parts))
 
 
+def copy_notebooks():
+    """Sphinx reads what lies below docs/: copies whose links to pages of docs/ are shortened by that folder."""
+    (HERE / "notebooks").mkdir(exist_ok=True)
+    names = {path.name for path in ROOT.glob("notebooks/*.ipynb")}
+    for path in HERE.glob("notebooks/*.ipynb"):
+        if path.name not in names:
+            path.unlink()
+    for name in names:
+        text = (ROOT / "notebooks" / name).read_text().replace("](../docs/", "](../")
+        copy = HERE / "notebooks" / name
+        if not copy.exists() or copy.read_text() != text:
+            copy.write_text(text)
+
+
 def setup(app):
+    copy_notebooks()
     app.connect("autodoc-process-docstring", escape_bars)
