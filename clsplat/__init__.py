@@ -1,9 +1,13 @@
 """3D Gaussian Splatting on any OpenCL device, without CUDA and without torch.
 
 >>> import clsplat
->>> gaussians, mode, offset = clsplat.load_gaussians("scene.ply")              # doctest: +SKIP
->>> rendering = clsplat.render(gaussians, camera, device=clsplat.Device())    # doctest: +SKIP
->>> gradients = rendering.backward(rendering.rgb - photo)                     # doctest: +SKIP
+>>> from clsplat.testing import synthetic_scene
+>>> gaussians, camera = synthetic_scene(20)
+>>> rendering = clsplat.render(gaussians, camera)  # in NumPy; device=clsplat.Device() for kernels
+>>> rendering.rgb.shape
+(29, 37, 3)
+>>> rendering.backward(rendering.rgb).gaussians.means.shape
+(20, 3)
 """
 
 from typing import TYPE_CHECKING, Any

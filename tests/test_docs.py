@@ -2,6 +2,8 @@
 
 import ast
 import dataclasses
+import doctest
+import importlib
 import re
 import typing
 from pathlib import Path
@@ -107,3 +109,44 @@ def test_every_message_under_troubleshooting_exists():
     for heading in headings:
         pattern = re.compile(".*".join(map(re.escape, heading.split("…"))))
         assert any(pattern.match(text) for text in known), heading
+
+
+def slugs(page):
+    """Anchors of a page's headings, as GitHub and MyST make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
+    for heading in re.findall(r"^#+ (.*)$", text, flags=re.M):
+        yield re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
+
+
+def tables(page):
+    """Anchors of what Sphinx makes of directives: the headings of constants and configuration classes."""
+    return [name.lower() for name in re.findall(r"```\{\w+\} (\w+)", page.read_text())]
+
+
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("*/*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
+    text = re.sub(r"`[^`\n]*`", "", text)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", target) or "api/" in target:  # the API's pages are named without a suffix
+            continue
+        name, _, anchor = target.partition("#")
+        file = page.parent / name if name else page
+        if file.suffix == ".ipynb":  # docs/notebooks holds copies
+            file = ROOT / "notebooks" / file.name
+        assert file.exists(), f"{target}: no such file"
+        if anchor and file.suffix == ".md":
+            assert anchor in set(slugs(file)) | set(tables(file)), f"{target}: no such heading"
+
+
+WITH_DOCTESTS = [path for path in (ROOT / "clsplat").rglob("*.py") if ">>>" in path.read_text()]
+
+
+@pytest.mark.parametrize("path", WITH_DOCTESTS, ids=lambda path: path.stem)
+def test_examples_in_docstrings_hold(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    outcome = doctest.testmod(importlib.import_module(".".join(p for p in parts if p != "__init__")))
+    assert outcome.attempted and not outcome.failed
