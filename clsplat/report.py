@@ -200,7 +200,7 @@ def training_curve(log: Path, path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    records = _read_log(log)
+    records = read_log(log)
     figure = Figure(figsize=(8, 5.5), dpi=150, layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
     for axes in (upper, lower):
@@ -330,7 +330,14 @@ def _card(view: dict[str, Any], index: int) -> str:
     )
 
 
-def _read_log(path: Path) -> list[dict[str, Any]]:
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The records of a training log, in their order; a last line without its end is still being written and left out.
+
+    Raises
+    ------
+    InputError
+        If the log cannot be read, has no line or a line that is no record of training.
+    """
     try:
         lines = path.read_text(encoding="utf-8").split("\n")[:-1]
     except (OSError, UnicodeDecodeError) as error:

@@ -174,7 +174,7 @@ def _load_gzip(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArr
     with gzip.GzipFile(fileobj=file) as packed:
         header = packed.read(HEADER.size)
         version, n, degree, bits, flags, _ = _parse_header(path, header, (2, 3))
-        sizes = _plane_sizes(n, degree, version)
+        sizes = plane_sizes(n, degree, version)
         check_expansion(path, sum(sizes), size)
         planes = [packed.read(count) for count in sizes]
         if [len(plane) for plane in planes] != sizes:
@@ -192,7 +192,7 @@ def _load_zstd(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArr
 
     data = file.read()
     version, n, degree, bits, flags, streams = _parse_header(path, data, (4,))
-    sizes = [size for size in _plane_sizes(n, degree, version) if size]
+    sizes = [size for size in plane_sizes(n, degree, version) if size]
     check_expansion(path, sum(sizes), len(data))
     try:
         (start,) = struct.unpack_from("<I", data, HEADER.size)
@@ -241,7 +241,8 @@ def _parse_header(path: str | Path, header: bytes, versions: tuple[int, ...]) ->
     return version, n, degree, bits, flags, last
 
 
-def _plane_sizes(n: int, degree: int, version: int) -> list[int]:
+def plane_sizes(n: int, degree: int, version: int) -> list[int]:
+    """Bytes of positions, opacities, colours, log scales, quaternions and spherical harmonics, before compression."""
     rest = 3 * ((degree + 1) ** 2 - 1)
     return [n * width for width in (9, 1, 3, 3, 3 if version == 2 else 4, rest)]
 
@@ -252,7 +253,7 @@ def _decode(
     version, n, degree, bits, flags = header
     positions, opacities, colors, scales, quats, rest = (
         np.frombuffer(plane, np.uint8).reshape(n, size // n)
-        for plane, size in zip(planes, _plane_sizes(n, degree, version), strict=True)
+        for plane, size in zip(planes, plane_sizes(n, degree, version), strict=True)
     )
     fixed = np.zeros((n, 3, 4), np.uint8)
     fixed[:, :, 1:] = positions.reshape(n, 3, 3)  # the sign in the highest bit; a division by 256 moves it down

@@ -1,0 +1,193 @@
+"""The command `info`: what a file of Gaussians, a run or a dataset is and holds, as text."""
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tyro
+
+from clsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from clsplat.gaussians import Gaussians
+
+BAR = 40
+"""Width of a histogram's longest bar in characters."""
+
+BINS = 10
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what a file of Gaussians, the folder of a run or a dataset is, and what it holds."""
+
+    path: tyro.conf.Positional[Path]
+    """File of Gaussians in any format, folder that `train` has written, or dataset."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.io.sog import META
+
+        if not self.path.exists():
+            raise InputError(f"{self.path}: expected a file of Gaussians, a run or a dataset, found nothing")
+        if self.path.is_dir() and not (self.path / META).is_file():
+            lines = run_lines(self.path) if (self.path / "log.jsonl").is_file() else dataset_lines(self.path)
+        else:
+            lines = scene_lines(self.path)
+        print("\n".join(lines))
+
+
+def scene_lines(path: Path) -> list[str]:
+    """What `info` says about a file of Gaussians."""
+    from clsplat.io import load_gaussians, suffix_of
+    from clsplat.io.anatomy import ANATOMIES
+
+    gaussians, mode, offset = load_gaussians(path)
+    anatomy = ANATOMIES[suffix_of(path) or ".sog"](path)
+    size = path.stat().st_size if suffix_of(path) else sum(anatomy.parts.values())
+    low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
+    first, middle, last = np.percentile(gaussians.means, [1, 50, 99], axis=0)
+    rows = {
+        "format": anatomy.format,
+        "Gaussians": f"{len(gaussians):,}",
+        "sh degree": str(gaussians.sh_degree),
+        "mode": mode,
+        "size": f"{_size(size)}, {size / len(gaussians):.1f} bytes for a Gaussian",
+        "bounds": f"{_vector(low)} to {_vector(high)}",
+        "98 % within": f"{_vector(first)} to {_vector(last)}",
+        "middle": _vector(middle),
+    }
+    if offset.any():
+        rows["offset"] = f"{_vector(offset, 10)}, to be added for coordinates of the world"
+    if anatomy.comments:
+        rows["comments"] = "; ".join(anatomy.comments)
+    title = "bytes by part, before they are compressed together" if anatomy.packed else "bytes by part"
+    parts = {name: (_size(n), n) for name, n in anatomy.parts.items()}
+    return [str(path), *_table(rows), "", title, *_bars(parts), "", *_histograms(gaussians)]
+
+
+def run_lines(folder: Path) -> list[str]:
+    """What `info` says about a folder that `train` has written, finished or not."""
+    from clsplat.presets import DATA_PATH
+    from clsplat.report import read_log
+
+    last = read_log(folder / "log.jsonl")[-1]
+    rows = {"what": "a run of clsplat train"}
+    config = folder / "config.json"
+    if config.is_file():
+        try:
+            settings = json.loads(config.read_text(encoding="utf-8"))
+            total = f" of {settings['iterations']:,}"
+            rows |= {"dataset": str(settings[DATA_PATH])} if DATA_PATH in settings else {}
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{config}: expected the settings of a run, found {error!r}") from error
+        rows["iterations"] = f"{last['iteration']:,}{total}"
+    rows["time"] = f"{last['seconds']:.0f} s"
+    if last.get("psnr") is not None:
+        rows["held-out PSNR"] = f"{last['psnr']:.2f} dB"
+    scene = folder / "scene.ply"
+    if not scene.is_file():
+        rows["Gaussians"] = f"{last['num_gaussians']:,}"
+        rows["scene.ply"] = "none: the run was interrupted, or goes on; the same command with --resume finishes it"
+        return [str(folder), *_table(rows)]
+    return [str(folder), *_table(rows), "", *scene_lines(scene)]
+
+
+def dataset_lines(path: Path) -> list[str]:
+    """What `info` says about a dataset; no cameras are recovered for it."""
+    from clsplat import sfm
+    from clsplat.config import DataConfig
+    from clsplat.io import colmap, transforms
+    from clsplat.photos import list_photos, photo_folder, photo_size
+
+    record, model = sfm.read_record(path), colmap.find_model(path)
+    source = path / record["photos"] if record else path
+    photos = [photo_folder(source) / name for name in list_photos(source)]
+    if model is not None:
+        cameras, posed, points, _ = colmap.read_model(model)
+        lenses = [cameras[camera] for _, camera, _ in posed]
+        what = "photos and the cameras that clsplat found" if record else "COLMAP model"
+    elif transforms.find_transforms(path):
+        dataset = transforms.read_dataset(path, DataConfig())
+        photos = [photo.path for photo in dataset.photos]
+        lenses, points, what = [photo.intrinsics for photo in dataset.photos], dataset.points, "transforms.json"
+    elif photos:
+        lenses, points, what = [], np.empty((0, 3)), "photos without cameras: train, or sfm, finds them"
+    else:
+        raise InputError(f"{path}: expected a scene, a run or a dataset, found neither photos nor cameras")
+    rows = {"what": what, "photos": f"{len(photos):,}"}
+    smaller = {f: list_photos(source / f) for f in ("images_2", "images_4", "images_8") if (source / f).is_dir()}
+    if smaller:
+        rows["smaller copies"] = ", ".join(f"{len(files):,} in {name}" for name, files in smaller.items())
+    if photos:
+        rows["sizes"] = _counts(Counter("{}x{}".format(*photo_size(photo)) for photo in photos))
+    if model is not None:
+        rows["model"] = str(model)
+    if lenses:
+        rows["poses"] = f"{len(lenses):,}"
+        rows["cameras"] = _counts(Counter(f"{lens.model} {lens.width}x{lens.height}" for lens in lenses))
+        rows["points"] = f"{len(points):,}"
+    if len(points):
+        first, last = np.percentile(points, [1, 99], axis=0)
+        rows["98 % within"] = f"{_vector(first)} to {_vector(last)}"
+    return [str(path), *_table(rows)]
+
+
+def _histograms(gaussians: "Gaussians") -> list[str]:
+    opacities = _histogram(gaussians.opacities, np.linspace(0, 1, BINS + 1))
+    sizes = np.exp(gaussians.log_scales.mean(axis=1, dtype=np.float64))
+    low, high = np.percentile(sizes, [0.5, 99.5])
+    edges = np.geomspace(low, max(high, low * 1.01), BINS + 1)
+    return [
+        "opacity",
+        *_bars(opacities),
+        "",
+        "size: geometric mean of the standard deviations; the ends take what lies beyond",
+        *_bars(_histogram(sizes, edges)),
+    ]
+
+
+def _histogram(values: "NDArray[Any]", edges: "NDArray[Any]") -> dict[str, tuple[str, int]]:
+    """Share and count by range."""
+    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+    counts = np.bincount(bins, minlength=len(edges) - 1)
+    return {
+        f"{low:.3g} to {high:.3g}": (f"{100 * count / len(values):.1f} %", int(count))
+        for low, high, count in zip(edges, edges[1:], counts, strict=False)
+    }
+
+
+def _bars(rows: Mapping[str, tuple[str, int]]) -> list[str]:
+    """Lines of a name, a figure in words, and a bar in proportion to the number."""
+    top = max((value for _, value in rows.values()), default=0)
+    figures = {name: text for name, (text, _) in rows.items()}
+    width = max(map(len, figures.values()), default=0)
+    left = max(map(len, figures), default=0)
+    return [
+        f"  {name:<{left}}  {text:>{width}}  {'#' * round(BAR * rows[name][1] / max(top, 1))}".rstrip()
+        for name, text in figures.items()
+    ]
+
+
+def _table(rows: Mapping[str, str]) -> list[str]:
+    width = max(map(len, rows))
+    return [f"  {name:<{width}}  {value}" for name, value in rows.items()]
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    """Most frequent first."""
+    return ", ".join(f"{count:,} of {name}" for name, count in sorted(counts.items(), key=lambda x: -x[1]))
+
+
+def _vector(values: Iterable[float], digits: int = 4) -> str:
+    return "(" + ", ".join(f"{v + 0.0:.{digits}g}" for v in values) + ")"  # + 0.0: no -0
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:.3g} MB" if count >= 1e6 else f"{count / 1e3:.3g} kB" if count >= 1000 else f"{count} bytes"
