@@ -1,6 +1,16 @@
 """How much the method's known failures cost without their remedies and with them: `clsplat bench stability`."""
 
-from clsplat.bench.stability import coordinates, densities, gradients, images, order, photos, popping
+from clsplat.bench.stability import (
+    coordinates,
+    densities,
+    gradients,
+    images,
+    order,
+    photos,
+    popping,
+    projection,
+    scales,
+)
 from clsplat.bench.stability.experiment import Experiment
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -8,6 +18,10 @@ EXPERIMENTS: dict[str, Experiment] = {
     "equal-depths": order.EQUAL_DEPTHS,
     "repeated-runs": order.REPEATED_RUNS,
     "popping": popping.POPPING,
+    "poisoning": projection.POISONING,
+    "needles": projection.NEEDLES,
+    "wide-angle": projection.WIDE_ANGLE,
+    "scales": scales.SCALE,
     "exposure": photos.EXPOSURE,
     "poses": photos.POSES,
     "few-views": photos.FEW_VIEWS,

@@ -1,0 +1,232 @@
+"""Experiments on projection: parameters that are no numbers, needles, and wide angles."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat import reference
+from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig
+from clsplat.constants import ALPHA_MAX, ALPHA_MIN, BLUR, EXTENT_SLACK
+from clsplat.device import Device
+from clsplat.gaussians import Gaussians
+from clsplat.reference.project import rotations
+from clsplat.render import render
+from clsplat.stages import Image, Splats
+from clsplat.testing import synthetic_scene
+
+Array = NDArray[np.float64]
+
+POISONS = (np.nan, np.inf, -np.inf, 0.0, 1e-40, 1e38, -1e38, 1e-38, 1 / 255)
+
+FIELDS_OF_VIEW = (20, 40, 60, 80, 100, 120, 140)
+"""Degrees across the image."""
+
+
+def poisons() -> list[tuple[str, float]]:
+    """Every field of Gaussians with every value that an unlucky step, file or division can leave there."""
+    return [(field, value) for field in Gaussians.__dataclass_fields__ for value in POISONS]
+
+
+def poisoned(field: str, value: float) -> tuple[Gaussians, Camera]:
+    """A scene whose Gaussian 0, in the middle of the image, has the value in the field's first component."""
+    gaussians, camera = synthetic_scene(30, 1, width=48, height=32)
+    gaussians.means[0] = 0
+    scene = gaussians.astype(np.float32)
+    getattr(scene, field).reshape(30, -1)[0, 0] = value
+    return scene, camera
+
+
+def harm(device: Device | None, field: str, value: float, config: RenderConfig) -> str:
+    """What a poison does beyond its own Gaussian; nothing if the string is empty."""
+    scene, camera = poisoned(field, value)
+    rendering = render(scene, camera, config, device, depth=True)
+    v_rgb = np.random.default_rng(0).normal(size=rendering.rgb.shape)
+    gradients = rendering.backward(v_rgb, viewmat_grad=True)
+    arrays: dict[str, Any] = {"rgb": rendering.rgb, "alpha": rendering.alpha, "depth": rendering.depth}
+    arrays |= {f"v_{k}": a for k, a in gradients.gaussians.arrays().items()} | {"v_viewmat": gradients.viewmat}
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            return f"{name} is not finite"
+    alone = render(scene.take(np.array([0])), camera, config, device, gradients=False).alpha > 0
+    others = render(scene.take(np.arange(1, 30)), camera, config, device, depth=True)
+    if not np.array_equal(others.rgb[~alone], rendering.rgb[~alone]):
+        return "pixels change where it is not seen"
+    if not alone.any():
+        clean = others.backward(v_rgb).gaussians
+        for name, array in clean.arrays().items():
+            if not np.array_equal(array, getattr(gradients.gaussians, name)[1:]):
+                return f"v_{name} of others changes"
+    return ""
+
+
+def _naive(field: str, value: float) -> bool:
+    """Whether equations 5 and 6 of the paper, as they stand, yield anything that is not finite in float32."""
+    scene, camera = poisoned(field, value)
+    with np.errstate(all="ignore"):
+        g = scene.take(np.array([0]))
+        view = camera.viewmat[:3, :3].astype(np.float32)
+        x, y, z = (g.means @ view.T + camera.viewmat[:3, 3].astype(np.float32))[0]
+        jacobian = np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]], np.float32) * np.float32(camera.fx)
+        root = jacobian @ view @ rotations(g.quats / np.linalg.norm(g.quats))[0] * g.scales[0]
+        cov = root @ root.T + np.float32(BLUR) * np.eye(2, dtype=np.float32)
+        conic = cov / (cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2)
+        outputs = [x / z, y / z, *conic.ravel(), *g.opacities, *g.sh[0, 0]]
+    return not np.isfinite(outputs).all()
+
+
+def _poisoning(device: Device, data: Path | None) -> Found:
+    configs = RenderConfig(), RenderConfig(mode="antialiased"), RenderConfig(sort="pixel")
+    harmed = {(f, v) for f, v in poisons() for c in configs if harm(device, f, v, c)}
+    return Found(
+        [
+            Figure("equations as they stand", float(sum(_naive(f, v) for f, v in poisons())), f"of {len(poisons())}"),
+            Figure("tested before use", float(len(harmed)), f"of {len(poisons())}"),
+        ]
+    )
+
+
+def _determinants(device: Device, data: Path | None) -> Found:
+    """Covariances of needles from the two vectors that make them, in float32."""
+    rng = np.random.default_rng(0)
+    lengths = 10.0 ** np.arange(0, 6)
+    series: dict[str, list[tuple[float, float | None]]] = {"xx yy - xy^2": [], "|b0 x b1|^2 + blur": []}
+    for length in lengths:
+        angle, ratio = rng.uniform(0, 2 * np.pi, 20_000), rng.uniform(0, 1e-3, 20_000)
+        b0 = np.stack([length * np.cos(angle), ratio * np.sin(angle)], axis=1)
+        b1 = np.stack([length * np.sin(angle), -ratio * np.cos(angle)], axis=1)
+        (xx, yy, xy), cross = (
+            (a.astype(np.float64) for a in np.array([(b0**2).sum(1), (b1**2).sum(1), (b0 * b1).sum(1)])),
+            b0[:, 0] * b1[:, 1] - b0[:, 1] * b1[:, 0],
+        )
+        exact = cross**2 + BLUR * (xx + yy) + BLUR**2
+        single = [np.float32(a) for a in (xx, yy, xy, cross)]
+        blur = np.float32(BLUR)
+        plain = (single[0] + blur) * (single[1] + blur) - single[2] ** 2
+        stable = single[3] ** 2 + blur * (single[0] + single[1]) + blur**2
+        for label, found in zip(series, (plain, stable), strict=True):
+            wrong = ~(np.abs(found / exact - 1) < 0.01)
+            series[label].append((float(length), 100 * float(wrong.mean())))
+    figures = [Figure(label, points[-1][1] or 0.0, "%") for label, points in series.items()]
+    return Found(figures, Plot("length of the needle, px", "determinants off by more than 1 %, %", series, "x"))
+
+
+def shell(n: int) -> Gaussians:
+    """Gaussians in all directions at distances of 2 to 6, about a tenth of their distance in size."""
+    rng = np.random.default_rng(0)
+    gaussians = synthetic_scene(n, sh_degree=0)[0]
+    directions = rng.normal(size=(n, 3))
+    distances = rng.uniform(2, 6, (n, 1))
+    gaussians.means[:] = directions / np.linalg.norm(directions, axis=1, keepdims=True) * distances
+    gaussians.log_scales[:] = np.log(distances) + rng.uniform(np.log(0.02), np.log(0.12), (n, 3))
+    gaussians.logit_opacities[:] = 2
+    return gaussians
+
+
+def wide_camera(degrees: float, width: int = 120) -> Camera:
+    """Looks along z from the origin."""
+    focal = 0.5 * width / np.tan(0.5 * np.radians(degrees))
+    return Camera(np.eye(4), focal, focal, width / 2, width / 3, width, width * 2 // 3)
+
+
+def ray_image(gaussians: Gaussians, camera: Camera) -> Image:
+    """Each Gaussian where the ray of a pixel finds it densest, without a projection, in the order of splats.
+
+    Its alpha is opacity exp(-D^2/2), where D is the ray's least distance from the centre in standard deviations.
+    """
+    g = gaussians.astype(np.float64)
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    points = g.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    axes = camera.viewmat[:3, :3] @ rotations(g.quats / np.linalg.norm(g.quats, axis=1, keepdims=True))
+    image, transmittance = np.zeros((camera.height, camera.width, 3)), np.ones((camera.height, camera.width))
+    colors = np.maximum(0.5 + 0.28209479177387814 * g.sh[:, 0], 0)
+    order = np.argsort(points[:, 2])
+    for i in order[points[order, 2] > -3 * g.scales[order].max(axis=1)]:  # the others are behind
+        whiten = axes[i] / g.scales[i]
+        ray, centre = rays @ whiten, points[i] @ whiten
+        along = ray @ centre
+        squared = centre @ centre - along**2 / (ray**2).sum(axis=-1)
+        alpha = np.minimum(g.opacities[i] * np.exp(-0.5 * squared), ALPHA_MAX)
+        alpha = np.where((alpha >= ALPHA_MIN) & (along > 0), alpha, 0)
+        image += (alpha * transmittance)[..., None] * colors[i]
+        transmittance *= 1 - alpha
+    return Image(image, 1 - transmittance)
+
+
+def unscented_image(gaussians: Gaussians, camera: Camera) -> Image:
+    """Splats whose centre and covariance come from seven points of each Gaussian that are projected exactly (3DGUT,
+    Wu et al. 2025, equations 5 to 9, with their weights)."""
+    g = gaussians.astype(np.float64)
+    axes = camera.viewmat[:3, :3] @ rotations(g.quats / np.linalg.norm(g.quats, axis=1, keepdims=True))
+    points = g.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    spread = 3.0  # alpha 1, kappa 0: sqrt(3) standard deviations, weights 1/6, none for the centre
+    offsets = np.sqrt(spread) * np.swapaxes(axes * g.scales[:, None, :], 1, 2)
+    sigma = np.concatenate([points[:, None] + offsets, points[:, None] - offsets], axis=1)
+    seen: NDArray[np.bool_] = np.all(sigma[:, :, 2] > 0.05, axis=1)
+    with np.errstate(all="ignore"):
+        pixels = np.stack([camera.fx * sigma[..., 0] / sigma[..., 2], camera.fy * sigma[..., 1] / sigma[..., 2]], -1)
+        pixels += [camera.cx, camera.cy]
+    size = np.array([camera.width, camera.height])
+    seen = seen & np.all(
+        (pixels > -size) & (pixels < 2 * size), axis=(1, 2)
+    )  # beyond, the points say little about the splat
+    means = pixels.mean(axis=1)
+    deviations = pixels - means[:, None]
+    cov = np.einsum("nki,nkj->nij", deviations, deviations) / 6 + BLUR * np.eye(2)
+    conics = np.linalg.inv(np.where(seen[:, None, None], cov, np.eye(2)))[:, [0, 0, 1], [0, 1, 1]]
+    extents = np.sqrt(2 * (np.log(g.opacities / ALPHA_MIN) + EXTENT_SLACK)[:, None] * cov[:, [0, 1], [0, 1]])
+    colors = np.maximum(0.5 + 0.28209479177387814 * g.sh[:, 0], 0)
+    splats = Splats(means, conics, points[:, 2], np.where(seen[:, None], extents, 0), g.opacities, colors)
+    splats = Splats(*(np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), a, 0) for a in splats))
+    bins = reference.bin_splats(splats, camera.width, camera.height, max(camera.width, camera.height))
+    return reference.composite_fwd(splats, bins, np.zeros(3))
+
+
+def _psnr(image: Array, truth: Array) -> float:
+    return float(-10 * np.log10(((np.clip(image, 0, 1) - np.clip(truth, 0, 1)) ** 2).mean()))
+
+
+def _wide_angle(device: Device, data: Path | None) -> Found:
+    scene = shell(600)
+    series: dict[str, list[tuple[float, float | None]]] = {"affine": [], "unscented": []}
+    for degrees in FIELDS_OF_VIEW:
+        camera = wide_camera(degrees)
+        truth = ray_image(scene, camera).image
+        affine = render(scene.astype(np.float32), camera, device=device, gradients=False).rgb
+        for label, image in (("affine", affine), ("unscented", unscented_image(scene, camera).image)):
+            series[label].append((float(degrees), _psnr(image, truth)))
+    figures = [Figure(f"{label}, 120 degrees", dict(points)[120.0] or 0.0, "dB") for label, points in series.items()]
+    figures.insert(1, Figure("affine, 60 degrees", dict(series["affine"])[60.0] or 0.0, "dB"))
+    return Found(figures, Plot("field of view, degrees", "PSNR against Gaussians along rays, dB", series))
+
+
+POISONING = Experiment(
+    failure="zero quaternions, NaN, infinities, denormals in any parameter",
+    source="Brush's fuzz tests; one NaN spreads through a tile, its gradients through the scene",
+    remedy="what is not finite is not drawn, and passes no gradient on",
+    test="tests/stability/test_projection.py::test_a_poison_harms_nobody_else",
+    measure=_poisoning,
+    figure="poisons, of five fields times nine values, that reach the image, a gradient or another pixel",
+)
+
+NEEDLES = Experiment(
+    failure="singular covariance of needles",
+    source="xx yy - xy^2 cancels in float32; culling det < 1e-6 drops what should be seen",
+    remedy="the determinant as a sum of positive terms (Lagrange's identity)",
+    test="tests/stability/test_projection.py::test_needles_keep_their_determinant",
+    measure=_determinants,
+    figure="determinants off by more than 1 %, of needles 1e5 px long",
+)
+
+WIDE_ANGLE = Experiment(
+    failure="wide-angle projection error",
+    source="3DGUT, Wu et al. 2025; Optimal Projection, Huang et al. 2024",
+    remedy=None,
+    test="tests/stability/test_projection.py::test_the_affine_projection_is_right_on_the_axis",
+    measure=_wide_angle,
+    figure="PSNR against Gaussians evaluated along rays; the unscented projection is a prototype in float64",
+)

@@ -1,0 +1,63 @@
+"""Projection where it fails: parameters that are no numbers, needles, the edge of the frustum, wide angles."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat import ops, reference
+from clsplat.bench.stability.projection import POISONS, _psnr, harm, ray_image, shell, wide_camera
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig
+from clsplat.constants import FRUSTUM_MARGIN
+from clsplat.gaussians import Gaussians
+from clsplat.render import render, upload
+from clsplat.testing import synthetic_scene
+
+
+@pytest.mark.parametrize("field", Gaussians.__dataclass_fields__)
+def test_a_poison_harms_nobody_else(device, field):
+    """One NaN spreads through its tile, and with the gradient through the scene (Brush's fuzz tests)."""
+    for k, value in enumerate(POISONS):
+        mode = ("classic", "antialiased")[k % 2]
+        for sort in ("auto", "pixel"):
+            assert harm(device, field, value, RenderConfig(mode=mode, sort=sort)) == "", (value, mode, sort)
+
+
+def test_needles_keep_their_determinant(device):
+    """xx yy - xy^2 cancels: in float32 a needle of 1000 px has no determinant left, or a negative one."""
+    gaussians, camera = synthetic_scene(200, width=97, height=61)
+    rng = np.random.default_rng(0)
+    gaussians.means[:] = rng.uniform(-0.3, 0.3, (200, 3))
+    gaussians.log_scales[:] = np.log([40.0, 1e-3, 1e-3])
+    needles = gaussians.astype(np.float32)
+    found = ops.project_fwd(device, upload(device, needles), camera, 0)
+    expected = reference.project_fwd(needles, camera, 0)
+    shown = expected.extents[:, 0] > 1000
+    assert shown.sum() > 50, "the needles must be long"
+    trace = [(c[:, 0] + c[:, 2])[shown] for c in (found.conics.get(), expected.conics)]
+    np.testing.assert_allclose(*trace, rtol=1e-3)
+
+
+def test_extents_stay_bounded_beside_the_image(any_device):
+    """Beyond the frustum the affine approximation grows without bound (diff-gaussian-rasterization #75): slopes are
+    clamped to the enlarged image, also just above the near plane."""
+    camera = Camera(np.eye(4), 50, 50, 50, 50, 100, 100)
+    gaussians = replace(synthetic_scene(3)[0], means=np.array([[0, 0, 1.0], [2, 0, 1], [40, 0, 1]]) * 0.0105)
+    gaussians.log_scales[:] = np.log(0.5)
+    splats = ops.project_fwd(any_device, upload(any_device, gaussians), camera, 0)
+    extents, logits = splats.extents.get()[:, 0], splats.opacities.get()
+    r = np.sqrt(2 * np.log(255 * logits))
+    expected = np.sqrt(1 + (1 + FRUSTUM_MARGIN) ** 2)
+    assert extents[1] / r[1] / (extents[0] / r[0]) == pytest.approx(expected, rel=5e-3)
+    assert (extents[2] / r[2] if extents[2] else 0) <= 1.01 * extents[1] / r[1]
+
+
+def test_the_affine_projection_is_right_on_the_axis(device):
+    """Against Gaussians along rays: what is lost at wide angles (3DGUT) is not lost at narrow ones."""
+    scene, found = shell(150), {}
+    for degrees in (40, 140):
+        camera = wide_camera(degrees, width=60)
+        rgb = render(scene.astype(np.float32), camera, device=device, gradients=False).rgb
+        found[degrees] = _psnr(rgb, ray_image(scene, camera).image)
+    assert found[40] > 30 > 25 > found[140]
