@@ -1,12 +1,19 @@
 """Scenes whose coordinates are geo-referenced: float32 has steps of 0.06 at 1e6, and of 0.5 at 5e6."""
 
+from dataclasses import replace
+
 import numpy as np
 from test_io_dataset import write_colmap
 
+from clsplat.bench.stability.small import CONFIG, small_scene
 from clsplat.config import DataConfig, InitConfig
+from clsplat.evaluate import mean_metrics
 from clsplat.initialize import initialize
 from clsplat.io import load_scene
+from clsplat.io.dataset import _near_origin
 from clsplat.render import render
+from clsplat.scene import Scene
+from clsplat.train import train
 
 
 def test_the_same_image_in_coordinates_of_the_world(device, tmp_path):
@@ -22,3 +29,17 @@ def test_the_same_image_in_coordinates_of_the_world(device, tmp_path):
         images.append(render(gaussians, scene.test[0].camera, device=device, gradients=False).rgb)
     assert images[0].std(axis=(0, 1)).min() > 0.1, "both Gaussians must be seen"
     np.testing.assert_allclose(images[0], images[1], atol=1e-5)
+
+
+def test_training_is_the_same_a_million_units_away(device, tmp_path):
+    """The origin moves to the cameras in float64; positions of 1e6 in float32 would have steps of 0.06."""
+    scene, offset = small_scene(device), np.array([1e6, -1e6, 1e6])
+
+    def far(views):
+        return [replace(view, camera=view.camera.translated(-offset)) for view in views]
+
+    there = _near_origin(Scene(far(scene.train), far(scene.test), scene.points + offset, scene.colors))
+    assert np.abs(there.offset - offset).max() < 10
+    config = replace(CONFIG, iterations=100)
+    psnrs = [mean_metrics(train(s, config, device, tmp_path), s.test, device=device)["psnr"] for s in (scene, there)]
+    assert abs(psnrs[0] - psnrs[1]) < 0.01
