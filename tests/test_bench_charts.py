@@ -141,6 +141,7 @@ def test_origins(records):
     (line,) = origins(records + later)
     assert line.startswith("here, 2 compute units, driver 3; clsplat 1, commit abc; 2026-11-21 to 2026-11-22, load")
     assert line.endswith(" 2.0")
+    assert "times do not count" in origins([records[0] | {"load": 2.1}])[0]
     assert len(origins([*records, records[0] | {"commit": "def"}])) == 2
 
 

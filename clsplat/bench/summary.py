@@ -238,6 +238,8 @@ def origins(records: Iterable[Record]) -> list[str]:
         loads = [record["load"] for record in of_key if record["load"] is not None]
         busy = f", load of the machine before it {max(loads):.1f}" if loads else ""
         units = of_key[0]["compute_units"]
+        if loads and max(loads) > units:
+            busy += ": it was busy with other work, and times do not count"
         lines.append(
             f"{device}, {units} compute units, driver {driver}; clsplat {version}, commit {commit}; {when}{busy}"
         )
