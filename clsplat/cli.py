@@ -10,7 +10,7 @@ import tyro
 from clsplat.bench.commands import Chart, Kernels, Knobs, Quality, Stability
 from clsplat.commands.compact import Compact
 from clsplat.commands.console import say
-from clsplat.commands.files import Devices, Export, Sfm
+from clsplat.commands.files import Devices, Export, Frames, Sfm
 from clsplat.commands.info import Info
 from clsplat.commands.pictures import Eval, Render
 from clsplat.commands.training import Demo, Train
@@ -38,7 +38,7 @@ class Bench:
         self.what.run()
 
 
-COMMANDS = Devices | Sfm | Train | Eval | Render | View | Export | Compact | Info | Demo | Bench
+COMMANDS = Devices | Frames | Sfm | Train | Eval | Render | View | Export | Compact | Info | Demo | Bench
 
 
 def main(arguments: list[str] | None = None) -> None:

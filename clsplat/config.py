@@ -41,8 +41,9 @@ class RenderConfig:
 class SfmConfig:
     """How poses are recovered from photos (pycolmap: SIFT, matching, incremental mapping)."""
 
-    matching: Literal["exhaustive", "sequential"] = "exhaustive"
-    """exhaustive: every pair of photos. sequential: neighbours by file name, for video frames."""
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """exhaustive: every pair of photos. sequential: neighbours by file name. auto: sequential for the frames that
+    clsplat took out of a video, exhaustive otherwise."""
     camera_model: str = "OPENCV"
     """COLMAP camera model that is fitted; photos are undistorted when they are loaded."""
     single_camera: bool = True
@@ -68,6 +69,8 @@ class DataConfig:
     background through. Evaluation keeps `background`."""
     masks: str | None = None
     """Folder of masks named as the photos (NAME.png or NAME.jpg.png): white pixels train, black ones do not."""
+    invert_masks: bool = False
+    """The other way round: black pixels train, white ones do not."""
     sfm: SfmConfig = field(default_factory=SfmConfig)
     """Used where there are photos but no poses."""
 

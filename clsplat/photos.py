@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,15 @@ from PIL import ExifTags, Image, ImageOps
 
 from clsplat.errors import InputError
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+HEIF = (".heic", ".heif")
+"""Endings, in lower case, of photos that are read by pillow-heif."""
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF)
 """Endings, in lower case, of the files that count as photos."""
 
+FRAMES = "clsplat_frames.json"
+"""File among photos that are the frames of a video, in the order of their names: which video, and how they were
+chosen."""
 
 TRANSPARENT = ("RGBA", "RGBa", "LA", "La", "PA")
 """Pillow's modes with an alpha channel."""
@@ -37,8 +44,24 @@ def list_photos(path: Path) -> list[str]:
     )
 
 
+@cache
+def heif_is_read() -> bool:
+    """Teach Pillow to read HEIF, where pillow-heif is installed; such photos come upright."""
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        return False
+    register_heif_opener()
+    return True
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
+    if path.suffix.lower() in HEIF and not heif_is_read():
+        raise InputError(
+            f"{path}: expected the package pillow-heif, which reads this photo, found none: pip install "
+            "'clsplat[heic]', or convert the photos to JPEG"
+        )
     try:
         with Image.open(path) as image:
             yield image
@@ -176,3 +199,11 @@ def _rgb(image: Image.Image, background: tuple[float, float, float], path: Path)
         blended = rgba[..., :3] * alpha + 255 * np.asarray(background, dtype=np.float32) * (1 - alpha)
         return np.rint(blended).astype(np.uint8)
     return np.array(image if image.mode == "RGB" else image.convert("RGB"))
+
+
+def sharpness(grey: NDArray[np.uint8]) -> float:
+    """Variance of the Laplacian of an image (H, W): less for a blurred photo of the same (Pech-Pacheco et al. 2000,
+    doi:10.1109/ICPR.2000.903548)."""
+    g = grey.astype(np.float32)
+    laplacian = g[1:-1, :-2] + g[1:-1, 2:] + g[:-2, 1:-1] + g[2:, 1:-1] - 4 * g[1:-1, 1:-1]
+    return float(laplacian.var(dtype=np.float64)) if laplacian.size else 0.0

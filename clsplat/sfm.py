@@ -26,7 +26,7 @@ from clsplat.lenses import camera_models
 
 # Not only for these names: a Pillow that is loaded after pycolmap 4.2.1 takes over some of the zlib inside it and
 # crashes when it writes a PNG. Loaded first, it keeps its own.
-from clsplat.photos import is_plain, list_photos, photo_folder, photo_size, read_photo, write_upright_png
+from clsplat.photos import FRAMES, is_plain, list_photos, photo_folder, photo_size, read_photo, write_upright_png
 
 RECORD = "clsplat_sfm.json"
 """File beside the model's folder ``0``: of which photos and with which options the model was made."""
@@ -115,7 +115,7 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
             return model
 
     with _workspace(output) as work, _quiet(verbose):
-        found = _largest_model(_readable(folder, names, work), names, work, config)
+        found = _largest_model(_readable(folder, names, work), names, work, _matched(config, folder))
         registered = 0 if found is None else int(found.num_reg_images())
         _check_registered(registered, len(names), photos, config)
         _turn_upright(found)
@@ -131,12 +131,19 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
 
 
 def _check_options(config: SfmConfig) -> None:
-    if config.matching not in ("exhaustive", "sequential"):
-        raise InputError(f"matching: expected exhaustive or sequential, found {config.matching!r}")
+    if config.matching not in ("auto", "exhaustive", "sequential"):
+        raise InputError(f"matching: expected auto, exhaustive or sequential, found {config.matching!r}")
     if config.camera_model not in camera_models():
         raise InputError(f"camera_model: expected one of {', '.join(camera_models())}, found {config.camera_model!r}")
     if config.max_image_size < 1:
         raise InputError(f"max_image_size: expected a number of pixels, found {config.max_image_size}")
+
+
+def _matched(config: SfmConfig, folder: Path) -> SfmConfig:
+    """The options with what `matching` means for the photos in `folder`."""
+    if config.matching != "auto":
+        return config
+    return replace(config, matching="sequential" if (folder / FRAMES).is_file() else "exhaustive")
 
 
 def _check_registered(registered: int, count: int, photos: Path, config: SfmConfig) -> None:

@@ -23,7 +23,7 @@ LAYERS = """
     constants errors stages randomness display
     config photos
     presets
-    camera gaussians lenses
+    camera gaussians lenses video
     sfm
     scene structs device reference perphoto metrics raytrace orbit
     ops io testing still_life memory pyramid
@@ -45,7 +45,13 @@ LAYER = {unit: depth for depth, row in enumerate(LAYERS) for unit in row.split()
 BENCH_KERNELS = {"roof"}
 
 # Where a foreign package may be imported at all, whose absence or weight the rest must not feel.
-ONLY_IN = {"pyopencl": {"device", "ops"}, "pycolmap": {"sfm", "lenses"}, "viser": {"viewer"}}
+ONLY_IN = {
+    "pyopencl": {"device", "ops"},
+    "pycolmap": {"sfm", "lenses"},
+    "viser": {"viewer"},
+    "av": {"video"},
+    "pillow_heif": {"photos"},
+}
 
 
 def imports_of(path):

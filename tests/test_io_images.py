@@ -36,9 +36,9 @@ def posed(path, intrinsics=PINHOLE, viewmat=None, mask=None):
     return PosedPhoto(path.name, path, np.eye(4) if viewmat is None else viewmat, intrinsics, mask)
 
 
-def load(*photos, reduce=1, upright=False, background="black"):
+def load(*photos, reduce=1, upright=False, **options):
     dataset = Dataset(list(photos), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), reduce, upright)
-    return load_views(dataset, DataConfig(background=background))
+    return load_views(dataset, DataConfig(**options))
 
 
 def noise(width=64, height=48):
@@ -215,6 +215,15 @@ def test_masks_take_the_photos_size(tmp_path):
     photo, mask = save(tmp_path / "a.png", noise()), save(tmp_path / "m.png", small.astype(np.uint8) * 255)
     (view,) = load(posed(photo, mask=mask))
     np.testing.assert_array_equal(view.mask, np.kron(small, np.ones((2, 2), bool)))
+
+
+def test_inverted_masks_train_black_and_averages_of_black_alone(tmp_path):
+    full = RNG.integers(0, 8, (48, 64)) == 0
+    photo, mask = save(tmp_path / "a.png", noise()), save(tmp_path / "m.png", full.astype(np.uint8) * 255)
+    (view,) = load(posed(photo, mask=mask), invert_masks=True)
+    np.testing.assert_array_equal(view.mask, ~full)
+    (view,) = load(posed(photo, mask=mask), reduce=2, invert_masks=True)
+    np.testing.assert_array_equal(view.mask, ~full.reshape(24, 2, 32, 2).any(axis=(1, 3)))
 
 
 def test_reduced_masks_count_pixels_without_a_masked_part(tmp_path):

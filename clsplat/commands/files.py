@@ -1,4 +1,4 @@
-"""The commands `devices`, `sfm` and `export`."""
+"""The commands `devices`, `frames`, `sfm` and `export`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from clsplat.commands.console import moved, say
+from clsplat.commands.console import Out, moved, say
 from clsplat.config import DataConfig, Mode, SfmConfig
 from clsplat.errors import InputError
 
@@ -35,6 +35,25 @@ class Devices:
             ]
             print(f"{'*' if device == default else ' '} {device_label(device)}\n    {'; '.join(abilities)}")
         print("* is taken by default; choose another by part of its name: --device NAME, or by PYOPENCL_CTX")
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Make photos of a video: the sharpest frame of each interval; `train` and `sfm` then match neighbours."""
+
+    video: tyro.conf.Positional[Path]
+    """The video; needs the extra `video`."""
+    out: Out
+    """New folder for the photos."""
+    fps: float = 2.0
+    """Photos for each second of the video."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.video import extract_frames
+
+        count = extract_frames(self.video, self.out, self.fps)
+        say(f"{self.out}: {count} frames of {self.video.name}; next: clsplat train {self.out} -o SCENE")
 
 
 @dataclass(frozen=True)

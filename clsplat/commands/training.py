@@ -25,10 +25,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Train:
-    """Train Gaussians on photos: a folder of photos, a COLMAP model with its photos, or a transforms.json."""
+    """Train Gaussians on photos: a folder of them, a video, a COLMAP model with its photos, or a transforms.json."""
 
     data: tyro.conf.Positional[Path]
-    """Folder of the dataset, or of photos alone."""
+    """Folder of the dataset, or of photos alone; or a video, of which the sharpest two frames of each second are put
+    into the folder `frames` of OUT (`clsplat frames` takes more or fewer)."""
     out: Out
     """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians (*.spz, say) to write as well,
     whose name without the suffix becomes the folder."""
@@ -56,6 +57,7 @@ class Train:
         from clsplat.initialize import start_size
         from clsplat.io import load_scene, save_gaussians, suffix_of
         from clsplat.memory import Footprint, parse_size
+        from clsplat.video import extract_frames, is_video
 
         suffix = "" if self.out.is_dir() else suffix_of(self.out)
         out = self.out.with_name(self.out.name[: -len(suffix)]) if suffix else self.out
@@ -68,7 +70,11 @@ class Train:
             config = replace(config, data=replace(config.data, masks=str(Path(config.data.masks).resolve())))
         limit = None if config.memory_limit is None else parse_size(config.memory_limit, "--memory-limit")
         device = open_device(config.device, limit)
-        scene = load_scene(self.data, config.data)
+        data = self.data
+        if is_video(data):
+            data = out / "frames"
+            say(f"{data}: {extract_frames(self.data, data)} frames of {self.data.name}")
+        scene = load_scene(data, config.data)
         say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
         adapted = few_views.adapted(config, scene)
         if adapted != config:

@@ -213,6 +213,7 @@ class _Plan:
     camera: Camera
     size: tuple[int, int]
     upright: bool
+    invert_mask: bool
 
 
 def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
@@ -225,7 +226,7 @@ def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
     dataset : Dataset
         From a reader.
     config : DataConfig
-        Its background is put behind transparent photos.
+        Its background is put behind transparent photos, and masks may be inverted.
 
     Returns
     -------
@@ -241,12 +242,12 @@ def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
     from tqdm import tqdm
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        plans = list(pool.map(lambda photo: _plan(photo, dataset), dataset.photos))
+        plans = list(pool.map(lambda photo: _plan(photo, dataset, config.invert_masks), dataset.photos))
         views = pool.map(lambda plan: _view(plan, dataset.reduce, config), plans)
         return list(tqdm(views, "photos", len(plans), unit="photo", dynamic_ncols=True, leave=False))
 
 
-def _plan(photo: PosedPhoto, dataset: Dataset) -> _Plan:
+def _plan(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> _Plan:
     declared = photo.intrinsics
     width, height = photo_size(photo.path)
     turned = orientation(photo.path) >= 5 if dataset.upright else False
@@ -272,7 +273,7 @@ def _plan(photo: PosedPhoto, dataset: Dataset) -> _Plan:
         camera = Camera(photo.viewmat, fx, fy, cx, cy, across // dataset.reduce, down // dataset.reduce)
     except InputError as error:
         raise InputError(f"photo {photo.name}: {error}") from error
-    return _Plan(photo, camera, (width, height), upright)
+    return _Plan(photo, camera, (width, height), upright, invert_mask)
 
 
 def _fits(size: tuple[int, int], declared: Intrinsics) -> bool:
@@ -298,7 +299,8 @@ def _pixels(
     """Photo and mask: decoded, undistorted, reduced."""
     photo, camera = plan.photo, plan.camera
     image = read_photo(photo.path, background, plan.upright)
-    mask = None if photo.mask is None else _fitted_mask(photo.mask, image.shape[1], image.shape[0])
+    # Inverted before it is averaged: a pixel counts if all that it is made of does.
+    mask = None if photo.mask is None else _fitted_mask(photo.mask, *image.shape[1::-1]) ^ plan.invert_mask
     if not is_pinhole(photo.intrinsics):
         rows, columns = camera.height * reduce, camera.width * reduce
         positions = _positions(photo.intrinsics, plan.size, (rows, columns))
