@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from small import CONFIG, small_scene
 
 from clsplat.bench.stability.densities import left_by_pruning
+from clsplat.bench.stability.small import CONFIG, small_scene
 from clsplat.constants import ALPHA_MIN
 from clsplat.gaussians import logit
 from clsplat.prune import without_invisible
