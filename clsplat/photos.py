@@ -17,6 +17,9 @@ HEIF = (".heic", ".heif")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF)
 """Endings, in lower case, of the files that count as photos."""
 
+SHARPNESS_EDGE = 640
+"""Longer edge, in pixels, of the copies whose sharpness is compared: motion blurs wider than this, noise is finer."""
+
 FRAMES = "clsplat_frames.json"
 """File among photos that are the frames of a video, in the order of their names: which video, and how they were
 chosen."""
@@ -199,6 +202,21 @@ def _rgb(image: Image.Image, background: tuple[float, float, float], path: Path)
         blended = rgba[..., :3] * alpha + 255 * np.asarray(background, dtype=np.float32) * (1 - alpha)
         return np.rint(blended).astype(np.uint8)
     return np.array(image if image.mode == "RGB" else image.convert("RGB"))
+
+
+def photo_sharpness(path: Path) -> float:
+    """`sharpness` of a photo at `SHARPNESS_EDGE`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be decoded.
+    """
+    with _opened(path) as image:
+        image.draft("L", (SHARPNESS_EDGE, SHARPNESS_EDGE))  # JPEG: decodes a smaller copy, in a fraction of the time
+        grey = Image.fromarray(_rgb(image, (0.0, 0.0, 0.0), path)).convert("L")
+    grey.thumbnail((SHARPNESS_EDGE, SHARPNESS_EDGE))
+    return sharpness(np.asarray(grey))
 
 
 def sharpness(grey: NDArray[np.uint8]) -> float:

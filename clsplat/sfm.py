@@ -14,11 +14,12 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.config import SfmConfig
 from clsplat.errors import InputError
@@ -63,6 +64,65 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         raise InputError(
             f"{path}: expected our record of a structure from motion, found {error!r}; delete its folder to redo it"
         ) from error
+
+
+@dataclass(frozen=True, eq=False)
+class SparseModel:
+    """A model as it is looked at.
+
+    Parameters
+    ----------
+    names : list of str
+        Photos with a pose, sorted; V of them.
+    positions, directions : (V, 3) float64
+        Of their cameras, in world units, and the way they look, of length 1.
+    points_seen : (V,) int
+        Points of the model in each photo.
+    points : (P, 3) float64
+    colors : (P, 3) uint8
+    error : float
+        Mean reprojection error, in pixels of the photos that were matched.
+    track_length : float
+        Photos that a point is seen in, on average.
+    """
+
+    names: list[str]
+    positions: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    points_seen: NDArray[np.int64]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    error: float
+    track_length: float
+
+
+def read_sparse(model: Path) -> SparseModel:
+    """Read a COLMAP model in its binary or text format.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    import pycolmap
+
+    try:
+        found = pycolmap.Reconstruction(model)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"{model}: expected a COLMAP model, found: {error}") from error
+    images = sorted((i for i in found.images.values() if i.has_pose), key=lambda image: image.name)
+    poses = [image.cam_from_world() for image in images]
+    points = list(found.points3D.values())
+    return SparseModel(
+        [image.name for image in images],
+        np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3),
+        np.array([pose.rotation.matrix()[2] for pose in poses]).reshape(-1, 3),
+        np.array([image.num_points3D for image in images]),
+        np.array([point.xyz for point in points]).reshape(-1, 3),
+        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        float(found.compute_mean_reprojection_error()),
+        float(found.compute_mean_track_length()),
+    )
 
 
 def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, verbose: bool = False) -> Path:

@@ -12,16 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError
-from clsplat.photos import FRAMES, sharpness
+from clsplat.photos import FRAMES, SHARPNESS_EDGE, sharpness
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 """Endings, in lower case, of the files that count as videos."""
 
 QUALITY = 95
 """Of the JPEG files: what is lost then is less than what the video's own compression has lost."""
-
-SHARPNESS_EDGE = 640
-"""Longer edge, in pixels, of the copies whose sharpness is compared: motion blurs wider than this, noise is finer."""
 
 
 def is_video(path: Path) -> bool:

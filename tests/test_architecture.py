@@ -27,7 +27,7 @@ LAYERS = """
     sfm
     scene structs device reference perphoto metrics raytrace orbit
     ops io testing still_life memory pyramid
-    page render optim densify initialize exposure few_views report demo
+    page render optim densify initialize exposure few_views report demo preview
     prune rasterization survey poses
     size
     checkpoint

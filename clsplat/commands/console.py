@@ -55,6 +55,20 @@ def moved(gaussians: "Gaussians", by: Any) -> "Gaussians":
     return replace(gaussians, means=(gaussians.means + by).astype(gaussians.means.dtype))
 
 
+def say_cameras(dataset: Path, picture: Path) -> None:
+    """Tell what structure from motion found, if it was ours, with warnings, and draw it."""
+    from clsplat.preview import draw_cameras, preview
+
+    found = preview(dataset)
+    if found is None:
+        return
+    say(f"cameras: {found.summary()}")
+    for warning in found.warnings():
+        say(f"warning: {warning}")
+    draw_cameras(picture, found.model)
+    say(f"cameras: {picture} shows them")
+
+
 def say_scores(report: dict[str, Any], out: Path) -> None:
     """Tell the mean figures and where the page is."""
     from clsplat.report import METRICS

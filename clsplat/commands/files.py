@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from clsplat.commands.console import Out, moved, say
+from clsplat.commands.console import Out, moved, say, say_cameras
 from clsplat.config import DataConfig, Mode, SfmConfig
 from clsplat.errors import InputError
 
@@ -70,7 +70,9 @@ class Sfm:
         """Run the command."""
         from clsplat.sfm import reconstruct
 
-        print(reconstruct(self.photos, self.sfm, self.out))
+        model = reconstruct(self.photos, self.sfm, self.out)
+        say_cameras(self.out or self.photos, model.parent / "cameras.png")
+        print(model)
 
 
 @dataclass(frozen=True)

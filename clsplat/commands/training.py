@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from clsplat.commands.console import STARTED, Out, new_folder, open_device, say, say_scores, write_json
+from clsplat.commands.console import STARTED, Out, new_folder, open_device, say, say_cameras, say_scores, write_json
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
 from clsplat.presets import DATA_PATH, PRESETS, load_config, load_preset
@@ -88,6 +88,7 @@ class Train:
         say(need.describe(start, config.max_gaussians, device.memory_limit))
         new_folder(out)
         write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
+        say_cameras(data, out / "cameras.png")
         viewer = open_viewer(scene, config, device) if self.viewer else None
         gaussians = train_and_report(scene, config, device, out, self.resume, viewer)
         if suffix:
