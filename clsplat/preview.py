@@ -64,8 +64,8 @@ class Preview:
         missing = [name for name in self.photos if name not in set(m.names)]
         if missing:
             found.append(
-                f"no pose was found for {self._share(missing)}; they are not trained on. They overlap too little with "
-                "the others, are blurred, or show what has no texture; take photos in between"
+                f"no pose was found for {self._share(missing)}; they are not trained on. They overlap too little "
+                "with the others, are blurred, or show what has no texture; take photos in between"
             )
         blurred = [
             name
