@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -204,9 +205,19 @@ def test_control_c_saves_and_says_how_to_go_on(dataset: Path, tmp_path: Path) ->
     process.send_signal(signal.SIGINT)
     error = process.communicate(timeout=120)[1]
     assert process.returncode == 130
-    assert "--resume continues from there" in error
+    assert re.search(r"stopped after iteration \d+$", error, flags=re.M)
+    assert f"to continue: clsplat {shlex.join(command[3:])} --resume\n" in error
     assert "Traceback" not in error
     assert (tmp_path / "checkpoint.npz").exists()
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_shells_can_complete_every_command(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["--tyro-print-completion", shell])
+    script = capsys.readouterr().out
+    assert not exit_.value.code
+    assert all(word in script for word in ("clsplat", "train", "info", "--max-gaussians", "--invert-masks"))
 
 
 def test_devices_names_the_default(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """The commands `train` and `demo`."""
 
+import shlex
 import signal
 import sys
 import threading
@@ -90,7 +91,13 @@ class Train:
         write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
         say_cameras(data, out / "cameras.png")
         viewer = open_viewer(scene, config, device) if self.viewer else None
-        gaussians = train_and_report(scene, config, device, out, self.resume, viewer)
+        try:
+            gaussians = train_and_report(scene, config, device, out, self.resume, viewer)
+        except KeyboardInterrupt:
+            if (out / "checkpoint.npz").is_file():
+                again = sys.argv[1:] + ([] if self.resume else ["--resume"])
+                say(f"to continue: {shlex.join(['clsplat', *again])}")
+            raise
         if suffix:
             save_gaussians(self.out, gaussians, config.render.mode, scene.offset)
             say(f"{self.out}: {self.out.stat().st_size / 1e6:.3g} MB")
@@ -151,7 +158,7 @@ def train_and_report(
                 viewer.tell(facts)
                 viewer.follow(record["gaussians"], interrupted.is_set)
             if interrupted.is_set():
-                say(f"\n{out}: stopped after iteration {record['iteration']}; --resume continues from there")
+                say(f"\n{out}: stopped after iteration {record['iteration']}")
                 raise KeyboardInterrupt
 
         def held_out(gaussians: "Gaussians") -> dict[str, float]:
