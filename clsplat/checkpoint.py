@@ -23,7 +23,7 @@ from clsplat.perphoto import PerPhoto
 from clsplat.poses import refined
 from clsplat.render import download, fetch
 from clsplat.scene import Scene
-from clsplat.size import Kept, Point, Search
+from clsplat.size import Kept, Point, Rival, Search, Trial
 
 
 @dataclass
@@ -63,15 +63,15 @@ def save_state(path: Path, state: State, config: TrainConfig) -> None:
         if learned:
             arrays |= {f"{part}.{name}": array for name, array in learned.arrays().items()}
     if search := state.search:
-        arrays["search"] = json.dumps({"points": search.points, "grown": search.grown, "settled": search.settled})
-        if best := search.best:
-            for part, kept in {
-                "": best.gaussians,
-                "first.": best.moments.first,
-                "second.": best.moments.second,
-            }.items():
-                arrays |= {f"best.{part}{name}": array for name, array in kept.arrays().items()}
-            arrays |= {f"best.statistics.{name}": array for name, array in best.statistics.items()}
+        about = {name: getattr(search, name) for name in ("most", "trials", "degrees", "settled", "seen")}
+        if search.rival:
+            about["rival"] = search.rival.point
+            rival = search.rival.kept
+            parts = {"": rival.gaussians, "first.": rival.moments.first, "second.": rival.moments.second}
+            for part, kept in parts.items():
+                arrays |= {f"rival.{part}{name}": array for name, array in kept.arrays().items()}
+            arrays |= {f"rival.statistics.{name}": array for name, array in rival.statistics.items()}
+        arrays["search"] = json.dumps(about)
     with replacing(path) as file:
         np.savez(file, **arrays)
 
@@ -139,9 +139,11 @@ def _to_state(arrays: dict[str, NDArray[Any]], extent: float, config: TrainConfi
     numbers = int(arrays["iteration"]), float(arrays["seconds"]), extent
     if "search" in arrays:
         saved = json.loads(str(arrays["search"]))
-        search = Search([Point(*p) for p in saved["points"]], saved["grown"], saved["settled"])
-        if "best.means" in arrays:
-            search.best = kept("best", "best.")
+        trials = [Trial(grows, Point(*smaller), Point(*larger)) for grows, smaller, larger in saved["trials"]]
+        degrees = [Point(*p) for p in saved["degrees"]]
+        search = Search(saved["most"], trials, degrees, saved["settled"], saved["seen"])
+        if "rival" in saved:
+            search.rival = Rival(kept("rival", "rival."), Point(*saved["rival"]))
     state = State(*numbers, now.gaussians, now.moments, strategy, float(arrays["intersections"]), search)
     state.pixels = arrays.get("pixels")
     for name in ("exposures", "poses"):

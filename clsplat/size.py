@@ -1,21 +1,25 @@
 """How many Gaussians a scene needs: chosen from its photos (docs/size.md).
 
 Of the training photos some validate. A size is worth its PSNR on them less a price for each doubling of the
-Gaussians, and the size that is worth most is chosen: growth stops when a doubling gains less than the price, then a
-path of pruning by removal price and refitting leads down in steps, and the best step is kept. The degree of the
-spherical harmonics is chosen by the same price on bytes. At the end all photos train.
+Gaussians, and sizes are compared in trials: two copies of the scene that differ in nothing but their size train for
+the same iterations, and the one that is worth more goes on. In the first half of a run the trials are of growth,
+then of Gaussians removed by price. The degree of the spherical harmonics is chosen by the same price on bytes. At the
+end all photos train.
 """
 
 import json
 from dataclasses import dataclass, field
+from itertools import pairwise
 from math import log, log2, sqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.densify.schedule import TRIAL_LENGTH, growth_window
+from clsplat.densify.strategy import MOST_GAUSSIANS
 from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
 from clsplat.metrics import psnr, to_uint8
@@ -31,37 +35,73 @@ VALIDATES = 8
 """Every 8th training photo validates while the size is sought."""
 
 FEWEST_VALIDATING = 2
-"""With fewer photos to validate on, a difference of PSNR has no error that can be told: the size is not sought."""
+"""At least so many do: the difference of PSNR of a single photo has no error that can be told."""
 
-PATH_START = 0.55
-"""Fraction of the iterations at which the path down begins: growth of the default strategy ends at 0.5, and what it
-added has settled."""
+FEWEST_PHOTOS = 8
+"""With fewer photos to train on, every one is needed: the size is not sought."""
 
-PATH_END = 0.9
-"""Fraction by which it ends: all photos train for the rest."""
+GROWTH_END = 0.5
+"""Fraction of the iterations at which trials of growth end: the paper's densification ends there."""
 
-STEP_LENGTH = 0.05
-"""Iterations of a step of the path, as a fraction of all. On photos of 64 known Gaussians (tests/test_size.py) steps
-of 0.03 of 1500 iterations refitted too little: every one lost 0.1 to 0.4 dB, and 512 Gaussians were kept."""
+PRUNING_START = 0.6
+"""Fraction at which trials of pruning begin, with learning rates that have come down. At high ones more Gaussians
+show nothing of what they are worth in the end: on fox_pinhole at 135x240 trials at 0.5 to 0.8 of 7000 iterations went
+down to 24 600 Gaussians, 0.4 dB below 64 000."""
 
-STEP = sqrt(0.5)
-"""Fraction of the Gaussians that a step leaves: two steps are a halving."""
+PRUNING_END = 0.85
+"""Fraction by which they end: all photos train for the rest."""
+
+REWARMED = 0.5
+"""Where the schedule of the learning rates goes on once the size is settled, so that the validation photos, which
+join, can still move something."""
+
+GROWTH_START = 500
+"""Iterations before the first trial of growth, fewer in short runs, as before the strategies' first rounds."""
+
+SURE = 2.0
+"""Standard errors."""
+
+LOST_GROWTH = 2
+"""After so many trials in turn that the smaller side has won, growth has ended."""
+
+LOOKS = 4
+"""Validations of each side of a trial, averaged: PSNR goes up and down while the learning rates are high. From single
+looks at five photos of fox_pinhole the differences of sides had standard errors of 0.1 to 0.4 dB."""
+
+TRIAL = sqrt(0.5)
+"""Fraction of the Gaussians that a trial leaves: two are a halving."""
 
 
 class Point(NamedTuple):
     """A size that was validated.
 
-    iteration; phase: growth, path or degree; n Gaussians of a degree of the spherical harmonics; psnr: dB, the mean
-    over the validation photos; views: of each. worth: psnr less the price, for a degree on bytes.
+    iteration: before which; n Gaussians of a degree of the spherical harmonics; psnr: dB, the mean over the
+    validation photos; views: of each. worth: psnr less the price.
     """
 
     iteration: int
-    phase: str
     n: int
     sh_degree: int
     psnr: float
     views: list[float]
     worth: float
+
+
+class Trial(NamedTuple):
+    """Two sizes after the same iterations from the same scene, of which either the larger has grown or the smaller
+    has been pruned."""
+
+    grows: bool
+    smaller: Point
+    larger: Point
+
+    @property
+    def takes_smaller(self) -> bool:
+        """Whether the smaller goes on: pruned, if it is worth as much; against growth, which pays late, only if the
+        larger is worse by more than chance."""
+        if self.grows:
+            return self.larger.psnr - self.smaller.psnr < -SURE * standard_error(self.larger, self.smaller)
+        return self.smaller.worth >= self.larger.worth
 
 
 class Kept(NamedTuple):
@@ -77,26 +117,40 @@ class Kept(NamedTuple):
         return Kept(self.gaussians.take(rows), self.moments.take(rows, np.zeros(len(rows), bool)), statistics)
 
 
+class Rival(NamedTuple):
+    """The smaller side of a trial, trained ahead, and what it came to."""
+
+    kept: Kept
+    point: Point
+
+
 @dataclass
 class Search:
-    """The state of the search: the points so far, whether growth has ended, the iteration after which the size was
-    settled (0: it is still sought), and the best of the path."""
+    """The state of the search.
 
-    points: list[Point] = field(default_factory=list)
-    grown: bool = False
+    most: Gaussians that an edit may leave; trials that have ended; degrees: of the spherical harmonics, in the scene
+    that was chosen; settled: the iteration before which it was, 0 while it is sought; seen: PSNR of the validation
+    photos at each look at the larger side of the trial that runs; rival: its smaller side.
+    """
+
+    most: int
+    trials: list[Trial] = field(default_factory=list)
+    degrees: list[Point] = field(default_factory=list)
     settled: int = 0
-    best: Kept | None = None
+    seen: list[list[float]] = field(default_factory=list)
+    rival: Rival | None = None
 
 
 def split(views: list[View]) -> tuple[list[View], list[View]]:
     """Photos to train on and to validate on."""
-    chosen = range(VALIDATES // 2, len(views), VALIDATES)
+    every = max(1, min(VALIDATES, len(views) // FEWEST_VALIDATING))
+    chosen = range(every // 2, len(views), every)
     return [v for i, v in enumerate(views) if i not in chosen], [views[i] for i in chosen]
 
 
 def can_search(views: list[View]) -> bool:
     """Whether there are photos enough."""
-    return len(split(views)[1]) >= FEWEST_VALIDATING
+    return len(views) >= FEWEST_PHOTOS
 
 
 def sh_bytes(sh_degree: int) -> int:
@@ -105,24 +159,35 @@ def sh_bytes(sh_degree: int) -> int:
 
 
 def stops(config: TrainConfig) -> list[int]:
-    """The iterations after which the path is visited."""
-    first, last = round(PATH_START * config.iterations), round(PATH_END * config.iterations)
-    return list(range(max(1, first), max(1, last) + 1, max(1, round(STEP_LENGTH * config.iterations))))
+    """The iterations before which trials begin or end: of growth, and from `first_shrink` on of pruning."""
+    first, length = first_shrink(config), max(1, round(TRIAL_LENGTH * config.iterations))
+    shrinks = range(first, max(first, round(PRUNING_END * config.iterations)) + 1, length)
+    earliest, window = config.shortened(GROWTH_START), growth_window(config)
+    grows = range(round(GROWTH_END * config.iterations), earliest - 1, -window)
+    return [*grows[::-1], *shrinks]
+
+
+def looks(config: TrainConfig) -> set[int]:
+    """The iterations before which the two sides of a trial are validated: from its middle to its end."""
+    ends = pairwise(stops(config))
+    return {end - round(k * (end - begin) / 2 / LOOKS) for begin, end in ends for k in range(LOOKS)}
+
+
+def first_shrink(config: TrainConfig) -> int:
+    """The iteration before which the first trial of pruning begins."""
+    return max(1, round(PRUNING_START * config.iterations))
 
 
 def progress(iteration: int, config: TrainConfig, search: Search | None) -> float:
     """Where an iteration stands in the schedule of the learning rates, from 0 to 1.
 
-    On the path it stands still: every size is refitted under the same conditions, and what the photos gain by smaller
-    steps alone favours none. Once the size is settled the rest of the schedule follows.
+    Where the size is sought it has ended when pruning begins, and its end follows again once the size is settled.
     """
-    last = max(config.iterations - 1, 1)
     if search is None:
-        return (iteration - 1) / last
-    start = (stops(config)[0] - 1) / last
+        return (iteration - 1) / max(config.iterations - 1, 1)
     if not search.settled:
-        return min((iteration - 1) / last, start)
-    return start + (1 - start) * (iteration - search.settled) / max(config.iterations - search.settled, 1)
+        return min(1, (iteration - 1) / max(first_shrink(config) - 1, 1))
+    return REWARMED + (1 - REWARMED) * (iteration - search.settled) / max(config.iterations - search.settled, 1)
 
 
 def validate(
@@ -142,58 +207,52 @@ def validate(
     return [psnr(to_uint8(r.rgb), view.image, view.mask) for r, view in zip(renderings, views, strict=True)]
 
 
-def point(
-    iteration: int, phase: str, gaussians: Gaussians, views: list[float], sh_degree: int, config: TrainConfig
-) -> Point:
-    """The point of a validation, and what it is worth."""
-    n, mean = len(gaussians), float(np.mean(views))
-    doublings = log2(n) if phase != "degree" else log2(sh_bytes(sh_degree))
-    return Point(iteration, phase, n, sh_degree, mean, views, mean - config.size_price * doublings)
+def point(iteration: int, n: int, sh_degree: int, seen: list[list[float]], config: TrainConfig) -> Point:
+    """What a size is worth by the PSNR of each photo at each look."""
+    views = [float(view) for view in np.mean(seen, axis=0)]
+    mean = float(np.mean(views))
+    return Point(iteration, n, sh_degree, mean, views, mean - config.size_price * log2(n * sh_bytes(sh_degree)))
 
 
-def growth_pays(points: list[Point], price_db: float) -> bool:
-    """Whether the last doubling of the Gaussians, if there was one, gained the price.
-
-    The best PSNR until now is compared with the best until there were half as many: what training itself gained
-    in the meantime counts too, so growth never stops too early, and a reset of the opacities does not stop it.
-    """
-    growth = [p for p in points if p.phase == "growth"]
-    half = [p for p in growth if p.n <= growth[-1].n / 2] if growth else []
-    if not half:
-        return True
-    return max(p.psnr for p in growth) - max(p.psnr for p in half) >= price_db * log2(growth[-1].n / half[-1].n)
-
-
-def path_ends(points: list[Point], price_db: float) -> bool:
-    """Whether the path has lost a whole price from its best point."""
-    path = [p.worth for p in points if p.phase == "path"]
-    return path[-1] < max(path) - price_db
+def next_trial(search: Search, iteration: int, config: TrainConfig) -> Literal["grow", "rest", "shrink", "settle"]:
+    """What follows at one of the `stops`."""
+    if iteration < first_shrink(config):
+        lost = [trial.takes_smaller for trial in search.trials[-LOST_GROWTH:]]
+        ended = (len(lost) == LOST_GROWTH and all(lost)) or iteration >= round(GROWTH_END * config.iterations)
+        return "rest" if ended or search.most >= (config.max_gaussians or MOST_GAUSSIANS) else "grow"
+    shrunk = [trial for trial in search.trials if not trial.grows]
+    if iteration == stops(config)[-1] or (shrunk and not shrunk[-1].takes_smaller):
+        return "settle"
+    return "shrink"
 
 
 def costliest_rows(
     gaussians: Gaussians, views: list[View], config: TrainConfig, device: "Device"
 ) -> NDArray[np.intp]:
-    """The rows that a step of the path leaves, in their order: those whose removal costs most.
+    """The rows that a trial leaves, in their order: those whose removal costs most.
 
     In the order of `clsplat.prune.removal_order`, but priced once: its rounds took as long as the refit.
     """
     prices = price(gaussians, views, config.render, device, BACKGROUNDS[config.data.background])
-    left = max(1, int(STEP * len(gaussians)))
+    left = max(1, int(TRIAL * len(gaussians)))
     return np.sort(np.argsort(-prices.costs, kind="stable")[:left])
 
 
-def settle(search: Search, views: list[View], config: TrainConfig, device: "Device") -> Kept:
-    """The best of the path with the degree of the spherical harmonics that is worth most; ends the search."""
-    assert search.best is not None, "the path has no point"
-    best, search.best, search.settled = search.best, None, search.points[-1].iteration
-    from_path = max((p for p in search.points if p.phase == "path"), key=lambda p: p.worth)
-    points = [
-        point(from_path.iteration, "degree", best.gaussians, scores, degree, config)
-        for degree in range(from_path.sh_degree + 1)
-        for scores in [validate(best.gaussians, views, config, device, degree)]
-    ]
-    search.points += points
-    return lower_degree(best, max(points, key=lambda p: p.worth).sh_degree)
+def settle(
+    search: Search,
+    iteration: int,
+    kept: Kept,
+    views: list[View],
+    config: TrainConfig,
+    device: "Device",
+    sh_degree: int,
+) -> Kept:
+    """With the degree of the spherical harmonics that is worth most, of those that are trained; ends the search."""
+    search.settled = iteration
+    for degree in range(sh_degree + 1):
+        seen = validate(kept.gaussians, views, config, device, degree)
+        search.degrees.append(point(iteration, len(kept.gaussians), degree, [seen], config))
+    return lower_degree(kept, max(search.degrees, key=lambda p: p.worth).sh_degree)
 
 
 def training_views(views: list[View], search: Search | None) -> list[View]:
@@ -222,18 +281,29 @@ def write_report(path: Path, search: Search, config: TrainConfig) -> None:
     fraction p ln(10)/10, and is ln(2) on the natural scale of N: the last Gaussian must lower it by this part of a
     Gaussian's even share.
     """
-    chosen = [
-        max((p for p in search.points if p.phase == phase), key=lambda p: p.worth) for phase in ("path", "degree")
-    ]
+    chosen = max(search.degrees, key=lambda p: p.worth)
     content = {
-        "rule": "the point of the path with the largest worth = psnr - price log2(n), then the degree with the "
-        "largest psnr - price log2(bytes per Gaussian)",
+        "rule": "growth unless it loses more than twice the standard error; pruning if worth = psnr - price "
+        "log2(bytes) is as large; then the degree with the largest worth",
         "price": config.size_price,
         "least_share": config.size_price * log(10) / (10 * log(2)),
-        "chosen": {"n": chosen[0].n, "sh_degree": chosen[1].sh_degree},
-        "points": [
-            {**p._asdict(), "bytes": p.n * sh_bytes(p.sh_degree), "standard_error": standard_error(p, chosen[0])}
-            for p in search.points
+        "chosen": {"n": chosen.n, "sh_degree": chosen.sh_degree},
+        "trials": [
+            {
+                "iteration": trial.larger.iteration,
+                "kind": "growth" if trial.grows else "pruning",
+                "n": [trial.smaller.n, trial.larger.n],
+                "psnr": [trial.smaller.psnr, trial.larger.psnr],
+                "gain": trial.larger.psnr - trial.smaller.psnr,
+                "standard_error": standard_error(trial.larger, trial.smaller),
+                "price": config.size_price * log2(trial.larger.n / trial.smaller.n),
+                "taken": trial.smaller.n if trial.takes_smaller else trial.larger.n,
+            }
+            for trial in search.trials
+        ],
+        "degrees": [
+            {"sh_degree": p.sh_degree, "bytes": p.n * sh_bytes(p.sh_degree), "psnr": p.psnr, "worth": p.worth}
+            for p in search.degrees
         ],
     }
     with replacing(path) as file:
@@ -247,7 +317,10 @@ def standard_error(a: Point, b: Point) -> float:
 
 
 def size_chart(report: Path, path: Path) -> None:
-    """Draw how the size of a scene was chosen, as a PNG: validation PSNR against the number of Gaussians and bytes.
+    """Draw how the size of a scene was chosen, as a PNG.
+
+    Left, the validation PSNR against the number of Gaussians: the two sides of each trial joined; right, against the
+    bytes, of each degree of the spherical harmonics.
 
     Parameters
     ----------
@@ -260,39 +333,33 @@ def size_chart(report: Path, path: Path) -> None:
     from matplotlib.ticker import FuncFormatter
 
     content = json.loads(report.read_text())
-    points, chosen = content["points"], content["chosen"]
+    chosen, degrees = content["chosen"], content["degrees"]
     figure = Figure(figsize=(9, 4.2), dpi=150, layout="constrained")
-    by_n, by_bytes = figure.subplots(1, 2, sharey=True, width_ratios=[3, 2])
-    growth, down, degrees = ([p for p in points if p["phase"] == phase] for phase in ("growth", "path", "degree"))
-    blue, orange, green = "#0072b2", "#d55e00", "#009e73"
-    by_n.plot([p["n"] for p in growth], [p["psnr"] for p in growth], ".-", color="0.7", label="growing")
-    errors = [p["standard_error"] for p in down]
-    by_n.errorbar(
-        [p["n"] for p in down],
-        [p["psnr"] for p in down],
-        errors,
-        fmt="o-",
-        color=blue,
-        capsize=3,
-        label="pruned, refitted",
-    )
-    best = max(down, key=lambda p: p["worth"])
-    width = np.array([best["n"] / 3, best["n"] * 3])
-    tangent = best["psnr"] + content["price"] * np.log2(width / best["n"])
-    by_n.plot(width, tangent, "--", color=orange, linewidth=1, label=f"price: {content['price']:g} dB per doubling")
-    by_n.plot(best["n"], best["psnr"], "*", color=orange, markersize=15, label=f"chosen: {best['n']:,}")
-    by_n.set_xlabel("Gaussians")
+    by_n, by_bytes = figure.subplots(1, 2, width_ratios=[3, 2])
+    grey, blue, orange, green = "0.55", "#0072b2", "#d55e00", "#009e73"
+    labelled: set[str] = set()
+    for trial in content["trials"]:
+        color, label = (grey, "growth") if trial["kind"] == "growth" else (blue, "pruning")
+        by_n.plot(trial["n"], trial["psnr"], "-", color=color, label=None if label in labelled else label)
+        labelled.add(label)
+        for n, quality in zip(trial["n"], trial["psnr"], strict=True):
+            by_n.plot(n, quality, "o", color=color, markerfacecolor=color if n == trial["taken"] else "white")
+        price = [trial["psnr"][0], trial["psnr"][0] + trial["price"]]
+        name = f"price: {content['price']:g} dB per doubling"
+        by_n.plot(trial["n"], price, "--", color=orange, linewidth=1, label=None if name in labelled else name)
+        labelled.add(name)
+    best = max(degrees, key=lambda p: p["worth"])
+    by_n.axvline(chosen["n"], color=orange, linewidth=0.8, label=f"chosen: {chosen['n']:,}")
+    by_n.set_xlabel("Gaussians; two sides of a trial joined, the full one goes on")
     by_n.set_ylabel("PSNR of the validation photos, dB")
     by_bytes.plot([p["bytes"] / 1e6 for p in degrees], [p["psnr"] for p in degrees], "o-", color=green)
+    by_bytes.plot(best["bytes"] / 1e6, best["psnr"], "*", color=orange, markersize=15, zorder=4)
     for p in degrees:
-        marker = ", chosen" if p["sh_degree"] == chosen["sh_degree"] else ""
+        marker = ", chosen" if p is best else ""
         by_bytes.annotate(
             f"degree {p['sh_degree']}{marker}", (p["bytes"] / 1e6, p["psnr"]), (4, -11), textcoords="offset points"
         )
     by_bytes.set_xlabel("MB, without refitting")
-    # Growth begins far below: its first points are not what the choice is about.
-    lowest = min(p["psnr"] for p in down + degrees)
-    by_n.set_ylim(bottom=lowest - 1)
     by_bytes.margins(x=0.3)
     for axes in (by_n, by_bytes):
         axes.set_xscale("log", base=2)

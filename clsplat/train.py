@@ -3,8 +3,10 @@
 import time
 import warnings
 from collections.abc import Callable, Container
+from copy import copy, deepcopy
 from dataclasses import replace
 from functools import partial
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +17,7 @@ from clsplat.checkpoint import State, load_state, log_file, save_state, write_ph
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.constants import ALPHA_MIN
 from clsplat.densify import STRATEGIES, Contributions, Edit
+from clsplat.densify.schedule import TRIAL_GROWTH
 from clsplat.errors import ClsplatError, DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians, logit
 from clsplat.initialize import initialize
@@ -116,6 +119,15 @@ def train(
         state.pixels = device.upload("pixel sizes", state.pixels)
     losses: list[float] = []
     training, factor = scene.train, 1
+
+    def tell(shown: State, loss: float) -> None:
+        about = {"iteration": state.iteration, "loss": loss, "num_gaussians": len(shown.gaussians)}
+        try:
+            progress(about | {"gaussians": shown.gaussians if shown.pixels is None else filtered(shown, device)})
+        except KeyboardInterrupt:
+            save_state(out / "checkpoint.npz", state, config)
+            raise
+
     with log_file(out / "log.jsonl", state.iteration) as log:
         started = time.perf_counter() - state.seconds
         for iteration in range(state.iteration + 1, config.iterations + 1):
@@ -124,23 +136,13 @@ def train(
                 training, photos = [pyramid.shrunk(view, factor) for view in scene.train], Photos(device)
             intersections = state.intersections or INTERSECTIONS
             photos.keep_within(device.memory_limit - need.total(len(state.gaussians), intersections))
-            views = size.training_views(training, state.search)
-            if state.strategy.due(iteration):
-                fitting = need.most_gaussians(device.memory_limit, intersections)
-                state.strategy.max_gaussians = min(config.max_gaussians or fitting, fitting)
-                if state.search and state.search.grown:
-                    state.strategy.max_gaussians = min(state.strategy.max_gaussians, len(state.gaussians))
-                elif len(state.gaussians) >= fitting:
-                    warnings.warn(f"no more than {fitting} Gaussians fit the memory: growth stops", stacklevel=2)
+            go = partial(advance, views=training, photos=photos, need=need, config=config, device=device)
             try:
                 with driver_errors():
                     if config.filter_3d and state.pixels is None:
                         measure_pixels(state, scene, device)
-                    loss = step(state, iteration, view_at(iteration, views, config.seed), photos, config, device)
-                    if state.search and not state.search.settled:
-                        seek_size(state, scene.train, config, device)
-                    if state.strategy.due(iteration):
-                        densify(state, views, config, device)
+                    state = seek_size(state, iteration, scene.train, config, device, go, tell)
+                    loss = go(state, iteration)
                     if config.filter_3d and (state.pixels is None or iteration % FILTER_EVERY == 0):
                         measure_pixels(state, scene, device)
             except DeviceError as error:
@@ -168,13 +170,7 @@ def train(
             if iteration % config.checkpoint_every == 0 or iteration == config.iterations:
                 save_state(out / "checkpoint.npz", state, config)
             left = time.perf_counter()
-            about = {"iteration": iteration, "loss": loss, "num_gaussians": len(state.gaussians)}
-            try:
-                shown = state.gaussians if state.pixels is None else filtered(state, device)
-                progress(about | {"gaussians": shown})
-            except KeyboardInterrupt:
-                save_state(out / "checkpoint.npz", state, config)
-                raise
+            tell(state, loss)
             started += time.perf_counter() - left
     if state.exposures or state.poses:
         write_photos(out / "photos.json", state, scene)
@@ -182,6 +178,35 @@ def train(
         return fetch(filtered(state, device))
     size.write_report(out / "size.json", state.search, config)
     return size.without_useless_bands(fetch(state.gaussians), as_seen(scene.train, state), config, device)
+
+
+def advance(
+    state: State,
+    iteration: int,
+    views: list[View],
+    photos: Photos,
+    need: Footprint,
+    config: TrainConfig,
+    device: "Device",
+) -> float:
+    """One iteration and the edit that is due after it. Changes `state`, returns the loss."""
+    views = size.training_views(views, state.search)
+    loss = step(state, iteration, view_at(iteration, views, config.seed), photos, config, device)
+    if state.strategy.due(iteration):
+        set_cap(state, config, need.most_gaussians(device.memory_limit, state.intersections))
+        densify(state, views, config, device)
+    return loss
+
+
+def set_cap(state: State, config: TrainConfig, fitting: int) -> None:
+    """How many Gaussians the next edit may leave: what the user allows, what fits the device, what the search for the
+    size says; where that needs more photos than there are, no more than there are Gaussians."""
+    cap = min(config.max_gaussians or fitting, fitting)
+    if config.size == "auto":
+        cap = min(cap, state.search.most if state.search else len(state.gaussians))
+    elif len(state.gaussians) >= fitting:
+        warnings.warn(f"no more than {fitting} Gaussians fit the memory: growth stops", stacklevel=2)
+    state.strategy.max_gaussians = cap
 
 
 def step(state: State, iteration: int, view: View, photos: Photos, config: TrainConfig, device: "Device") -> float:
@@ -301,33 +326,84 @@ def _edit(state: State, views: list[View], config: TrainConfig, device: "Device"
     return edit
 
 
-def seek_size(state: State, views: list[View], config: TrainConfig, device: "Device") -> None:
-    """What `clsplat.size` does after an iteration: validate, stop growth, prune, choose. Changes `state`."""
-    search, iteration = state.search, state.iteration
-    path = size.stops(config)
-    phase = "path" if iteration in path else "growth" if iteration < path[0] and state.strategy.due(iteration) else ""
-    if not search or not phase:
-        return
+def seek_size(
+    state: State,
+    iteration: int,
+    views: list[View],
+    config: TrainConfig,
+    device: "Device",
+    go: Callable[[State, int], float],
+    tell: Callable[[State, float], None],
+) -> State:
+    """What `clsplat.size` does before an iteration: end a trial, begin the next, choose.
+
+    The state that is given stays whole until another is returned: whoever interrupts a trial loses that alone.
+    """
+    before, stops, looks = state.search, size.stops(config), size.looks(config)
+    if before is None or before.settled or iteration not in (looks if before.rival else stops):
+        return state
     training, validation = (as_seen(part, state) for part in size.split(views))
-    trained = sh_degree_at(iteration, config.shortened(config.optim.sh_degree_every), state.gaussians.sh_degree)
+
+    def degree(state: State) -> int:
+        every = config.shortened(config.optim.sh_degree_every)
+        return sh_degree_at(state.iteration, every, state.gaussians.sh_degree)
+
+    def look(state: State) -> list[float]:
+        return size.validate(fetch(state.gaussians), validation, config, device, degree(state))
+
+    def point(at: int, state: State, seen: list[list[float]]) -> size.Point:
+        return size.point(at, len(state.gaussians), degree(state), seen, config)
+
+    seen = [*before.seen, look(state)] if before.rival else []
+    if iteration not in stops:
+        return replace(state, search=replace(before, seen=seen))
     move(state, None)
-    scores = size.validate(state.gaussians, validation, config, device, trained)
-    search.points.append(size.point(iteration, phase, state.gaussians, scores, trained, config))
-    if phase == "growth":
-        search.grown = search.grown or not size.growth_pays(search.points, config.size_price)
-    else:
-        search.grown = True
-        here = size.Kept(state.gaussians, state.moments, dict(state.strategy.statistics))
-        if search.points[-1].worth == max(p.worth for p in search.points if p.phase == "path"):
-            search.best = here
-        if iteration == path[-1] or size.path_ends(search.points, config.size_price):
-            kept = size.settle(search, validation, config, device)
-        else:
-            rows = size.costliest_rows(state.gaussians, training, config, device)
-            kept = here.take(rows)
+    search = replace(before, trials=[*before.trials], rival=None, seen=[])
+    state = replace(state, search=search, strategy=copy(state.strategy))
+    if before.rival:
+        grown = iteration < size.first_shrink(config)
+        search.trials.append(size.Trial(grown, before.rival.point, point(iteration, state, seen)))
+        if search.trials[-1].takes_smaller:
+            state.gaussians, state.moments, state.strategy.statistics = before.rival.kept
+    search.most = len(state.gaussians)
+    todo = size.next_trial(search, iteration, config)
+    if todo == "settle":
+        here = size.Kept(state.gaussians, state.moments, state.strategy.statistics)
+        kept = size.settle(search, iteration, here, validation, config, device, degree(state))
         state.gaussians, state.moments, state.strategy.statistics = kept
+    elif todo != "rest":
+        end = stops[stops.index(iteration) + 1]
+        trial = smaller_side(state, training if todo == "shrink" else None, config, device)
+        seen = []
+        for i in range(iteration, end):
+            tell(trial, go(trial, i))
+            if i + 1 in looks:
+                seen.append(look(trial))
+        move(trial, None)
+        kept = size.Kept(trial.gaussians, trial.moments, trial.strategy.statistics)
+        search.rival = size.Rival(kept, point(end, trial, seen))
+        if todo == "grow":
+            search.most = ceil(TRIAL_GROWTH * search.most)
     if config.optimizer == "device":
         move(state, device)
+    return state
+
+
+def smaller_side(state: State, views: list[View] | None, config: TrainConfig, device: "Device") -> State:
+    """A state that shares nothing with this one and has its Gaussians or, given views, those that they would miss
+    most."""
+    rows = np.arange(len(state.gaussians))
+    if views:
+        rows = size.costliest_rows(state.gaussians, views, config, device)
+    here = size.Kept(state.gaussians, state.moments, state.strategy.statistics)
+    gaussians, moments, statistics = here.take(rows)
+    strategy, search = copy(state.strategy), state.search and replace(state.search, most=len(rows))
+    strategy.statistics = statistics
+    learned = {name: deepcopy(getattr(state, name)) for name in ("exposures", "poses")}
+    trial = replace(state, gaussians=gaussians, moments=moments, strategy=strategy, search=search, **learned)
+    if config.optimizer == "device":
+        move(trial, device)
+    return trial
 
 
 def _apply(edit: Edit, state: State) -> None:
@@ -355,7 +431,7 @@ def initial_state(scene: Scene, config: TrainConfig) -> State:
         init = replace(init, opacity=STRATEGIES[config.strategy].start_opacity)
     gaussians = initialize(scene, init, config.seed, config.max_gaussians)
     strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
-    search = size.Search() if config.size == "auto" and size.can_search(scene.train) else None
+    search = size.Search(len(gaussians)) if config.size == "auto" and size.can_search(scene.train) else None
     state = State(0, 0.0, scene.extent, gaussians, Moments.zeros(gaussians), strategy, search=search)
     names = [view.name for view in scene.train]
     state.exposures = exposure.start(names) if config.exposure else None

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from clsplat.camera import Camera
-from clsplat.config import AdcConfig, InitConfig, OptimConfig, TrainConfig
+from clsplat.config import AdcConfig, ErrorConfig, InitConfig, OptimConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, to_uint8
@@ -18,10 +19,12 @@ from clsplat.scene import Scene, View
 from clsplat.size import (
     Point,
     Search,
+    Trial,
     can_search,
     costliest_rows,
-    growth_pays,
-    path_ends,
+    first_shrink,
+    looks,
+    next_trial,
     point,
     progress,
     sh_bytes,
@@ -72,61 +75,89 @@ def held_out(gaussians: Gaussians, scene: Scene, device: Device) -> float:
     )
 
 
-def points_of(phase: str, *pairs: tuple[int, float]) -> list[Point]:
-    return [Point(i, phase, n, 3, db, [db], db - 0.1 * np.log2(n)) for i, (n, db) in enumerate(pairs)]
-
-
 def test_some_photos_validate_until_the_size_is_settled() -> None:
     views: list[Any] = list(range(20))
     training, validation = split(views)
     assert validation == [4, 12] and sorted(training + validation) == views
-    assert can_search(views) and not can_search(views[:12])
+    assert split(views[:8])[1] == [2, 6], "two at least"
+    assert can_search(views[:8]) and not can_search(views[:7])
     assert training_views(views, None) == views
-    assert training_views(views, Search()) == training
-    assert training_views(views, Search(settled=9)) == views
+    assert training_views(views, Search(1)) == training
+    assert training_views(views, Search(1, settled=9)) == views
 
 
-def test_growth_stops_when_a_doubling_gains_too_little() -> None:
-    rising = points_of("growth", (100, 20.0), (150, 21.0), (200, 20.2))
-    assert growth_pays(rising[:2], 0.1), "not yet twice as many"
-    assert growth_pays(rising, 0.1), "a best PSNR 1 dB higher"
-    flat = points_of("growth", (100, 20.0), (150, 20.05), (200, 20.05))
-    assert not growth_pays(flat, 0.1)
-    # Four times as many at once must gain twice the price.
-    assert growth_pays(points_of("growth", (100, 20.0), (400, 20.21)), 0.1)
-    assert not growth_pays(points_of("growth", (100, 20.0), (400, 20.19)), 0.1)
-    # A reset of the opacities lowers PSNR, which the best until then does not feel.
-    assert growth_pays(points_of("growth", (100, 20.0), (150, 21.0), (210, 15.0)), 0.1)
-    assert growth_pays([], 0.1)
+@pytest.mark.parametrize(("larger", "pays"), [(30.04, True), (30.06, False)])
+def test_half_the_gaussians_pay_if_they_lose_half_a_price(larger: float, pays: bool) -> None:
+    """At 0.1 dB per doubling a loss of 0.05 dB pays for 1 / sqrt(2) of the Gaussians."""
+    sides = (point(1, n, 3, [[psnr]], replace(CONFIG, size_price=0.1)) for n, psnr in ((362, 30.0), (512, larger)))
+    assert Trial(False, *sides).takes_smaller == pays
 
 
-def test_the_path_ends_a_whole_price_below_its_best() -> None:
-    path = points_of("path", (400, 30.0), (200, 29.95), (100, 29.7), (50, 29.5))
-    worth = [p.worth for p in path]
-    assert worth[1] == max(worth)
-    assert not path_ends(path[:2], 0.1)
-    assert path_ends(path[:3], 0.1), "0.25 dB for a doubling: 0.15 below the best"
-    assert not path_ends(path[:3], 0.2)
+def test_growth_goes_on_unless_it_surely_hurts() -> None:
+    """Photo by photo the larger side is worse by 0.1 dB on the mean, with a standard error of 0.03 or of 0.1 dB."""
+    smaller = [30.0, 31.0, 25.0]
+    for errors, hurts in (((-0.13, -0.10, -0.07), True), ((-0.27, -0.10, 0.07), False), ((0.13, 0.1, 0.07), False)):
+        sides = (
+            point(1, n, 3, [views], CONFIG) for n, views in ((100, smaller), (200, list(np.add(smaller, errors))))
+        )
+        assert Trial(True, *sides).takes_smaller == hurts, errors
 
 
-def test_worth_counts_doublings_of_gaussians_or_of_bytes() -> None:
-    gaussians = synthetic_scene(64, 0)[0]
+def trials_of(grows: bool, *takes_smaller: bool) -> list[Trial]:
+    return [
+        Trial(grows, Point(1, 100, 0, 30.0, [30.0, 31.0], 0.0), Point(1, 200, 0, psnr, [psnr, psnr + 1], 0.5 - won))
+        for won in takes_smaller
+        for psnr in [29.0 if won else 31.0]
+    ]
+
+
+def test_trials_follow_each_other() -> None:
+    """Growth until two trials in turn have lost or it is late; then pruning, until it loses once."""
+    config = replace(CONFIG, iterations=2000)
+    for lost, todo in (
+        ([], "grow"),
+        ([False, False], "grow"),
+        ([False, True], "grow"),
+        ([True, False, True], "grow"),
+        ([False, True, True], "rest"),
+    ):
+        assert next_trial(Search(100, trials_of(True, *lost)), 600, config) == todo, lost
+    assert next_trial(Search(100), 1000, config) == "rest", "in the middle of the run"
+    assert next_trial(Search(100), 200, replace(config, max_gaussians=100)) == "rest", "at the cap"
+    # What growth came to does not matter to pruning.
+    grown = trials_of(True, False, False)
+    cases: tuple[tuple[list[bool], int, str], ...] = (
+        ([], 1200, "shrink"),
+        ([True], 1300, "shrink"),
+        ([True, False], 1400, "settle"),
+        ([True] * 5, 1700, "settle"),
+    )
+    for pruned, iteration, todo in cases:
+        assert next_trial(Search(100, [*grown, *trials_of(False, *pruned)]), iteration, config) == todo, pruned
+
+
+def test_worth_counts_doublings_of_bytes() -> None:
     config = replace(CONFIG, size_price=0.25)
-    assert point(1, "path", gaussians, [20.0, 22.0], 3, config).worth == pytest.approx(21 - 0.25 * 6)
     assert [sh_bytes(d) for d in range(4)] == [56, 92, 152, 236]
-    none, all_bands = (point(1, "degree", gaussians, [20.0], degree, config).worth for degree in (0, 3))
-    assert none - all_bands == pytest.approx(0.25 * np.log2(236 / 56))
+    small, large = point(1, 64, 0, [[20.0, 21.0], [20.0, 23.0]], config), point(1, 128, 3, [[20.0, 22.0]], config)
+    assert small.views == large.views == [20, 22], "the mean of all looks, photo by photo"
+    assert small.psnr == 21 and small.worth == pytest.approx(21 - 0.25 * np.log2(64 * 56))
+    assert small.worth - large.worth == pytest.approx(0.25 * (1 + np.log2(236 / 56)))
 
 
 def test_stops_are_within_the_run() -> None:
-    assert stops(replace(CONFIG, iterations=2000)) == list(range(1100, 1801, 100))
+    assert stops(replace(CONFIG, iterations=2000)) == [*range(200, 1001, 100), *range(1200, 1701, 100)]
+    assert stops(replace(CONFIG, iterations=7000))[:3] == [700, 1050, 1400]
+    found = sorted(looks(replace(CONFIG, iterations=2000)))
+    assert found[:5] == [262, 275, 288, 300, 362] and found[-1] == 1700
     for iterations in (1, 2, 3, 10, 19):
         found = stops(replace(CONFIG, iterations=iterations))
         assert found and 1 <= found[0] and found[-1] <= iterations
 
 
 def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
-    """Cap and decisions hold in a short run, and a run that is interrupted on the path ends with the same bits."""
+    """Cap and decisions hold in a short run; interrupted between two trials or within one, it ends with the same
+    bits."""
     scene = known_scene(20, device, copies=4, views=24)
     for name in ("whole", "parts"):
         (tmp_path / name).mkdir()
@@ -135,22 +166,32 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     sizes: list[int] = []
     whole = train(scene, config, device, tmp_path / "whole", progress=lambda r: sizes.append(r["num_gaussians"]))
     report = json.loads((tmp_path / "whole" / "size.json").read_text())
-    path = [p for p in report["points"] if p["phase"] == "path"]
-    assert [p["n"] for p in path][:2] == [80, 56] and max(sizes) == 80
-    best = max(path, key=lambda p: p["worth"])
-    assert report["chosen"]["n"] == best["n"] == len(whole) == sizes[-1] < 80
-    degrees = [p for p in report["points"] if p["phase"] == "degree"]
+    trials = report["trials"]
+    assert [trial["n"] for trial in trials][:2] == [[56, 80], [39, 56]] and max(sizes) == 80
+    for trial in trials:
+        assert (trial["taken"] == trial["n"][0]) == (trial["gain"] <= trial["price"]), trial
+        assert trial["price"] == pytest.approx(8 * np.log2(trial["n"][1] / trial["n"][0]))
+    # Each begins with what the one before it came to; the first that is not paid is the last.
+    assert all(b["n"][1] == a["taken"] == a["n"][0] for a, b in pairwise(trials))
+    assert report["chosen"]["n"] == trials[-1]["taken"] == len(whole) == sizes[-1]
+    degrees = report["degrees"]
     assert report["chosen"]["sh_degree"] == max(degrees, key=lambda p: p["worth"])["sh_degree"] == whole.sh_degree
-    assert all(len(p["views"]) == len(split(scene.train)[1]) for p in path)
     size_chart(tmp_path / "whole" / "size.json", tmp_path / "size.png")
     assert (tmp_path / "size.png").read_bytes().startswith(b"\x89PNG")
 
-    def interrupt(record: dict[str, Any]) -> None:
-        if record["iteration"] == 125:
-            raise KeyboardInterrupt
+    # A trial tells of the iteration before it, once for each of its own.
+    for iteration, told in ((132, 1), (139, 4)):
+        calls: list[int] = []
 
-    with pytest.raises(KeyboardInterrupt):
-        train(scene, config, device, tmp_path / "parts", progress=interrupt)
+        def interrupt(
+            record: dict[str, Any], at: int = iteration, after: int = told, calls: list[int] = calls
+        ) -> None:
+            calls.append(record["iteration"])
+            if calls.count(at) == after:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            train(scene, config, device, tmp_path / "parts", resume=iteration > 132, progress=interrupt)
     resumed = train(scene, config, device, tmp_path / "parts", resume=True)
     assert len(resumed) == len(whole)
     for name, array in whole.arrays().items():
@@ -170,20 +211,23 @@ def test_a_step_leaves_what_the_photos_would_miss(device: Device) -> None:
 
 
 def test_too_few_photos_to_validate(device: Device, tmp_path: Path) -> None:
-    scene = known_scene(5, device, copies=1, views=10)
-    gaussians = train(scene, replace(CONFIG, iterations=3), device, tmp_path)
-    assert len(gaussians) == 5 and not (tmp_path / "size.json").exists()
+    """The size is not sought, and no strategy adds Gaussians."""
+    scene = known_scene(5, device, copies=1, views=8)
+    error = ErrorConfig(start=1, every=1)
+    config = replace(CONFIG, iterations=20, strategy="error", error=error)
+    assert len(scene.train) == 6
+    gaussians = train(scene, config, device, tmp_path)
+    assert len(gaussians) <= 5 and not (tmp_path / "size.json").exists()
 
 
-def test_learning_rates_rest_on_the_path() -> None:
+def test_learning_rates_come_down_before_pruning_and_again_at_the_end() -> None:
     config = replace(CONFIG, iterations=101)
     assert [progress(i, config, None) for i in (1, 51, 101)] == [0, 0.5, 1]
-    first = stops(config)[0]
-    seeking, settled = Search(), Search(settled=first + 20)
-    start = progress(first, config, seeking)
-    assert start == progress(first, config, None) == progress(first + 20, config, seeking)
-    assert progress(first + 20, config, settled) == start
-    assert progress(101, config, settled) == 1
+    first = first_shrink(config)
+    assert first == 61
+    assert [progress(i, config, Search(1)) for i in (1, 31, 61, 70)] == [0, 0.5, 1, 1]
+    settled = Search(1, settled=81)
+    assert [progress(i, config, settled) for i in (81, 91, 101)] == [0.5, 0.75, 1]
 
 
 @pytest.mark.slow
