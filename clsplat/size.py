@@ -100,7 +100,8 @@ class Trial(NamedTuple):
         """Whether the smaller goes on: pruned, if it is worth as much; against growth, which pays late, only if the
         larger is worse by more than chance."""
         if self.grows:
-            return self.larger.psnr - self.smaller.psnr < -SURE * standard_error(self.larger, self.smaller)
+            lost = self.smaller.psnr - self.larger.psnr
+            return self.larger.n == self.smaller.n or lost > SURE * standard_error(self.larger, self.smaller)
         return self.smaller.worth >= self.larger.worth
 
 

@@ -101,6 +101,8 @@ def test_growth_goes_on_unless_it_surely_hurts() -> None:
             point(1, n, 3, [views], CONFIG) for n, views in ((100, smaller), (200, list(np.add(smaller, errors))))
         )
         assert Trial(True, *sides).takes_smaller == hurts, errors
+    same = point(1, 100, 3, [smaller], CONFIG)
+    assert Trial(True, same, same).takes_smaller, "nothing has grown: two such trials end growth"
 
 
 def trials_of(grows: bool, *takes_smaller: bool) -> list[Trial]:
