@@ -15,10 +15,12 @@
 //   filter_bwd      in pixels[N]; in and out v_log_scales[N,3], v_logit_opacities[N]: of the filtered ones, then of those
 //                   that were filtered
 // -DFILTER_VARIANCE  of the filter, in squared sizes of a pixel
+// -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  the camera's model (lens.h)
 #include "common.h"
 #include "linalg.h"
 #include "power.h"
 #include "structs.h"
+#include "lens.h"
 
 #ifndef FILTER_VARIANCE
 #error "-DFILTER_VARIANCE must give the variance of the filter, in squared sizes of a pixel"
@@ -30,18 +32,16 @@ __kernel void pixel_sizes(const uint n, const Camera camera, const __global real
     const size_t i = get_global_id(0);
     if (i >= n)
         return;
-    const real *r = camera.rotation, *t = camera.translation;
-    const real3 mean = load3(means, i);
-    const real x = r[0] * mean.x + r[1] * mean.y + r[2] * mean.z + t[0];
-    const real y = r[3] * mean.x + r[4] * mean.y + r[5] * mean.z + t[1];
-    const real z = r[6] * mean.x + r[7] * mean.y + r[8] * mean.z + t[2];
-    if (!(z > NEAR))
+    const real *t = camera.translation;
+    const real3 p = mat3_mul(camera_rotation(&camera), load3(means, i)) + (real3)(t[0], t[1], t[2]);
+    if (!lens_sees(&camera, p))
         return;
-    const real u = camera.fx * x / z + camera.cx, v = camera.fy * y / z + camera.cy;
+    const real2 centre = lens_centre(&camera, p);
     const real margin_x = (real)(0.5 * FRUSTUM_MARGIN) * camera.width,
                margin_y = (real)(0.5 * FRUSTUM_MARGIN) * camera.height;
-    if (u >= -margin_x && u <= camera.width + margin_x && v >= -margin_y && v <= camera.height + margin_y)
-        pixels[i] = LESSER(pixels[i], z / GREATER(camera.fx, camera.fy));
+    if (centre.x >= -margin_x && centre.x <= camera.width + margin_x && centre.y >= -margin_y &&
+        centre.y <= camera.height + margin_y)
+        pixels[i] = LESSER(pixels[i], lens_reach(&camera, p) / GREATER(camera.fx, camera.fy));
 }
 
 // 2^t, finite and not 0; NaN stays.

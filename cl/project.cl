@@ -9,7 +9,7 @@
 // and, where pixels are sorted one by one, the disparity 1/z at which a pixel's ray meets it (project_disparities).
 // docs/stages/project.md derives the gradients; clsplat/reference/project.py is the float64 twin.
 //
-// Mapping: one work-item per Gaussian, no local memory except for VIEWMAT_GRAD.
+// Mapping: one work-item per Gaussian, no local memory except for CAMERA_GRAD.
 //
 // Buffers, N Gaussians with K = (degree + 1)^2 coefficients stored, C = CHANNELS:
 //   in   means[N,3] world, log_scales[N,3] ln(world), quats[N,4] wxyz of any norm, logit_opacities[N], sh[N,K,3]
@@ -17,12 +17,13 @@
 //        colors[N,C] (RGB, then the depth if C is 4)
 //        An invisible Gaussian has extents 0 and all its other outputs 0.
 //   out  disparities[N,3] of project_disparities: 1/z at the centre in 1/world, and its derivatives by x and y per px
-//   v_x  is the gradient with respect to x; v_viewmat[groups,12] holds a partial sum per work-group of the
-//        gradient with respect to rotation (9, row-major) and translation (3).
+//   v_x  is the gradient with respect to x; v_camera[groups,16] holds a partial sum per work-group of the gradient
+//        with respect to rotation (9, row-major), translation (3) and fx, fy, cx, cy.
 //
 // -DCHANNELS=3|4      4: the depth is composited beside RGB
 // -DANTIALIASED=0|1   opacity compensation
-// -DVIEWMAT_GRAD=0|1  the backward kernels also write v_viewmat; needs -DGROUP, the work-group size
+// -DCAMERA_GRAD=0|1   the backward kernels also write v_camera; needs -DGROUP, the work-group size
+// -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  the camera's model (lens.h)
 #include "common.h"
 #include "adam.h"
 #include "ellipse.h"
@@ -30,39 +31,24 @@
 #include "power.h"
 #include "sh.h"
 #include "structs.h"
+#include "lens.h"
 
 #if !defined(CHANNELS) || (CHANNELS != 3 && CHANNELS != 4)
 #error "-DCHANNELS must be 3 (RGB) or 4 (RGB and depth)"
 #endif
-#if !defined(ANTIALIASED) || !defined(VIEWMAT_GRAD) || ANTIALIASED & ~1 || VIEWMAT_GRAD & ~1
-#error "-DANTIALIASED and -DVIEWMAT_GRAD must be 0 or 1"
+#if !defined(ANTIALIASED) || !defined(CAMERA_GRAD) || ANTIALIASED & ~1 || CAMERA_GRAD & ~1
+#error "-DANTIALIASED and -DCAMERA_GRAD must be 0 or 1"
 #endif
-#if VIEWMAT_GRAD && (!defined(GROUP) || GROUP < 1)
-#error "-DVIEWMAT_GRAD=1 needs -DGROUP, the work-group size of the backward kernels"
+#if CAMERA_GRAD && (!defined(GROUP) || GROUP < 1)
+#error "-DCAMERA_GRAD=1 needs -DGROUP, the work-group size of the backward kernels"
 #endif
-
-static inline mat3 camera_rotation(const Camera *camera) {
-    const real *r = camera->rotation;
-    mat3 m = {(real3)(r[0], r[1], r[2]), (real3)(r[3], r[4], r[5]), (real3)(r[6], r[7], r[8])};
-    return m;
-}
-
-// Slopes x/z and y/z at which the Jacobian is evaluated: clamped to the image enlarged by FRUSTUM_MARGIN.
-static inline real2 clamped_slopes(const Camera *camera, real2 slopes) {
-    const real2 focal = (real2)(camera->fx, camera->fy), centre = (real2)(camera->cx, camera->cy);
-    const real2 size = (real2)(camera->width, camera->height);
-    const real2 margin = (real)(0.5 * FRUSTUM_MARGIN) * size / focal;
-    const real2 lo = -centre / focal - margin, hi = (size - centre) / focal + margin;
-    return CLAMP(slopes, lo, hi);
-}
 
 // What forward and backward both need of one Gaussian.
 typedef struct {
     real3 p;         // centre, camera frame
-    real2 slopes;    // clamped x/z, y/z
+    Lens lens;       // there: J and the depth
     mat3 rotation;   // of the Gaussian
     real3 scales;    // standard deviations, world units
-    real3 j0, j1;    // rows of J
     real3 t0, t1;    // rows of J W
     real3 b0, b1;    // rows of J W R S: cov2d = B B^T + BLUR I
     real xx, xy, yy; // cov2d
@@ -73,12 +59,9 @@ static inline Footprint footprint(const Camera *camera, real3 mean, real3 scales
     Footprint f;
     const mat3 view = camera_rotation(camera);
     f.p = mat3_mul(view, mean) + (real3)(camera->translation[0], camera->translation[1], camera->translation[2]);
-    const real inv_z = 1 / f.p.z;
-    f.slopes = clamped_slopes(camera, f.p.xy * inv_z);
-    f.j0 = (real3)(camera->fx * inv_z, 0, -camera->fx * f.slopes.x * inv_z);
-    f.j1 = (real3)(0, camera->fy * inv_z, -camera->fy * f.slopes.y * inv_z);
-    f.t0 = mat3_tmul(view, f.j0);
-    f.t1 = mat3_tmul(view, f.j1);
+    f.lens = lens(camera, f.p);
+    f.t0 = mat3_tmul(view, f.lens.j0);
+    f.t1 = mat3_tmul(view, f.lens.j1);
     f.rotation = rotation_from_quat(unit_quat);
     f.scales = scales;
     f.b0 = mat3_tmul(f.rotation, f.t0) * f.scales;
@@ -99,6 +82,7 @@ typedef struct {
     real3 p, log_scales, mean;
     real4 quat; // of the unit quaternion
     mat3 view;
+    real4 intrinsics;
 } FootprintGrad;
 
 // v_xx, v_xy, v_yy: gradients of cov2d, where xy stands for both off-diagonal entries.
@@ -117,19 +101,8 @@ static inline FootprintGrad footprint_vjp(const Camera *camera, const Footprint 
 
     // t = W^T j
     const real3 v_j0 = mat3_mul(view, v_t0), v_j1 = mat3_mul(view, v_t1);
-    v.view = mat3_outer2(f->j0, v_t0, f->j1, v_t1);
-
-    // j(slopes, z), the slopes' own derivative being 0 where they are clamped; then the centre and the depth.
-    const real inv_z = 1 / f->p.z;
-    const real2 focal = (real2)(camera->fx, camera->fy), slopes = f->p.xy * inv_z;
-    real2 v_slopes = v_mean2d * focal;
-    if (slopes.x == f->slopes.x)
-        v_slopes.x -= focal.x * inv_z * v_j0.z;
-    if (slopes.y == f->slopes.y)
-        v_slopes.y -= focal.y * inv_z * v_j1.z;
-    v.p.xy = v_slopes * inv_z;
-    v.p.z = v_depth - (v_slopes.x * slopes.x + v_slopes.y * slopes.y) * inv_z -
-            inv_z * inv_z * (focal.x * (v_j0.x - f->slopes.x * v_j0.z) + focal.y * (v_j1.y - f->slopes.y * v_j1.z));
+    v.view = mat3_outer2(f->lens.j0, v_t0, f->lens.j1, v_t1);
+    v.p = lens_vjp(camera, f->p, &f->lens, v_mean2d, v_j0, v_j1, v_depth, &v.intrinsics);
 
     // p = W mean + translation
     v.mean = mat3_tmul(view, v.p);
@@ -177,10 +150,6 @@ static inline real3 conic_vjp(real3 q, real3 v) {
                     q.y * q.y * v.x + q.y * q.z * v.y + q.z * q.z * v.z);
 }
 
-static inline real3 from_camera(const Camera *camera, real3 mean) {
-    return mean - (real3)(camera->position[0], camera->position[1], camera->position[2]);
-}
-
 __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
                           const __global real *means, const __global real *log_scales, const __global real *quats,
                           const __global real *logit_opacities, const __global real *sh, __global real *means2d,
@@ -197,9 +166,9 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
     const Footprint f = footprint(&camera, mean, activated.xyz, quat / sqrt(norm2));
     const real opacity = activated.w * compensation(f.det0, f.det);
     const real r2 = ellipse_r2(opacity);
-    const real2 centre = (real2)(camera.fx * f.p.x / f.p.z + camera.cx, camera.fy * f.p.y / f.p.z + camera.cy);
+    const real2 centre = lens_centre(&camera, f.p);
     const real2 extent = sqrt(r2 * (real2)(f.xx, f.yy));
-    const real3 offset = from_camera(&camera, mean), direction = offset / sqrt(dot3(offset, offset));
+    const real3 offset = lens_offset(&camera, mean), direction = offset / sqrt(dot3(offset, offset));
     real basis[16];
     sh_basis(direction, sh_degree, basis);
     real3 color = (real)0.5;
@@ -207,8 +176,9 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
         color += basis[k] * load3(sh, i * sh_stride + k);
 
     // Zero times infinity is NaN: one test finds what is not finite in any term.
-    const real any = norm2 + f.det + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
-    bool visible = 0 * any == 0 && f.p.z > NEAR && norm2 >= QUAT_NORM2_MIN && r2 > 0;
+    const real any =
+        norm2 + f.det + f.lens.depth + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
+    bool visible = 0 * any == 0 && lens_sees(&camera, f.p) && norm2 >= QUAT_NORM2_MIN && r2 > 0;
     if (visible) {
         const int2 columns = pixels_between(centre.x - extent.x, centre.x + extent.x, camera.width);
         const int2 rows = pixels_between(centre.y - extent.y, centre.y + extent.y, camera.height);
@@ -216,13 +186,13 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
     }
     store2(means2d, i, visible ? centre : (real2)0);
     store3(conics, i, visible ? (real3)(f.yy, -f.xy, f.xx) / f.det : (real3)0);
-    depths[i] = visible ? f.p.z : 0;
+    depths[i] = visible ? f.lens.depth : 0;
     store2(extents, i, visible ? extent : (real2)0);
     opacities[i] = visible ? opacity : 0;
     for (int k = 0; k < 3; ++k)
         colors[CHANNELS * i + k] = visible ? GREATER(((const real *)&color)[k], (real)0) : 0;
 #if CHANNELS == 4
-    colors[CHANNELS * i + 3] = visible ? f.p.z : 0;
+    colors[CHANNELS * i + 3] = visible ? f.lens.depth : 0;
 #endif
 }
 
@@ -243,8 +213,9 @@ __kernel void project_disparities(const uint n, const Camera camera, const __glo
         const real4 quat = load4(quats, i);
         const Footprint f =
             footprint(&camera, load3(means, i), activate(load3(log_scales, i), 0).xyz, quat / sqrt(dot4(quat, quat)));
-        const real3 b2 = mat3_tmul(f.rotation, camera_rotation(&camera).row2) * f.scales, conic = load3(conics, i);
-        const real xz = dot3(f.b0, b2), yz = dot3(f.b1, b2), inv_z = 1 / f.p.z;
+        const real3 b2 = mat3_tmul(f.rotation, mat3_tmul(camera_rotation(&camera), f.lens.onward)) * f.scales,
+                    conic = load3(conics, i);
+        const real xz = dot3(f.b0, b2), yz = dot3(f.b1, b2), inv_z = 1 / f.lens.depth;
         const real2 slope = -inv_z * inv_z * (real2)(conic.x * xz + conic.y * yz, conic.y * xz + conic.z * yz);
         // What is not finite at some pixel has no order.
         const bool finite = 0 * (slope.x * extents[2 * i] + slope.y * extents[2 * i + 1]) == 0;
@@ -297,12 +268,15 @@ static inline GaussianGrad gaussian_vjp(size_t i, const Camera *camera, int sh_s
     v.color.x = color[0] > 0 ? v_color[0] : 0;
     v.color.y = color[1] > 0 ? v_color[1] : 0;
     v.color.z = color[2] > 0 ? v_color[2] : 0;
-    const real3 offset = from_camera(camera, mean), direction = offset / sqrt(dot3(offset, offset));
+    const real3 offset = lens_offset(camera, mean), direction = offset / sqrt(dot3(offset, offset));
     real v_basis[16];
     sh_basis(direction, sh_degree, v.basis);
     for (int k = 0; k < (sh_degree + 1) * (sh_degree + 1); ++k)
         v_basis[k] = dot3(load3(gaussians.sh, i * sh_stride + k), v.color);
     const real3 v_offset = normalize_vjp(offset, sh_basis_vjp(direction, sh_degree, v_basis));
+#if LENS == ORTHOGRAPHIC
+    v.geometry.view.row2 += v_offset;
+#else
     v.geometry.mean += v_offset;
 
     // position = -W^-1 translation: v_translation = W v_offset, v_W = (W v_offset) position^T
@@ -312,29 +286,34 @@ static inline GaussianGrad gaussian_vjp(size_t i, const Camera *camera, int sh_s
     v.geometry.view.row0 += v_translation.x * position;
     v.geometry.view.row1 += v_translation.y * position;
     v.geometry.view.row2 += v_translation.z * position;
+#endif
 
     // What overflows would make Adam's moments NaN for good: such a Gaussian gets no gradient from this view.
     const real3 sum = v.geometry.mean + v.geometry.log_scales + v.geometry.p + v.geometry.quat.xyz + v.color +
                       v.geometry.view.row0 + v.geometry.view.row1 + v.geometry.view.row2;
-    const real any = sum.x + sum.y + sum.z + v.geometry.quat.w + v.logit_opacity;
+    real any = sum.x + sum.y + sum.z + v.geometry.quat.w + v.logit_opacity;
+#if CAMERA_GRAD
+    any += dot4(v.geometry.intrinsics, (real4)1);
+#endif
     const GaussianGrad none = {0};
     return 0 * any == 0 ? v : none;
 }
 
-#if VIEWMAT_GRAD
-// Adds up the gradient of the viewmat over the work-group, in the order of its work-items.
-static inline void sum_viewmat(const FootprintGrad *v, __local real *partial, __global real *v_viewmat) {
+#if CAMERA_GRAD
+// Adds up the camera's gradient over the work-group, in the order of its work-items.
+static inline void sum_camera(const FootprintGrad *v, __local real *partial, __global real *v_camera) {
     const uint lane = get_local_id(0);
-    vstore3(v->view.row0, 4 * lane, partial);
-    vstore3(v->view.row1, 4 * lane + 1, partial);
-    vstore3(v->view.row2, 4 * lane + 2, partial);
-    vstore3(v->p, 4 * lane + 3, partial);
+    vstore3(v->view.row0, 0, partial + 16 * lane);
+    vstore3(v->view.row1, 1, partial + 16 * lane);
+    vstore3(v->view.row2, 2, partial + 16 * lane);
+    vstore3(v->p, 3, partial + 16 * lane);
+    vstore4(v->intrinsics, 3, partial + 16 * lane);
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint k = lane; k < 12; k += GROUP) {
+    for (uint k = lane; k < 16; k += GROUP) {
         real sum = 0;
         for (uint j = 0; j < GROUP; ++j)
-            sum += partial[12 * j + k];
-        v_viewmat[12 * get_group_id(0) + k] = sum;
+            sum += partial[16 * j + k];
+        v_camera[16 * get_group_id(0) + k] = sum;
     }
 }
 #endif
@@ -347,9 +326,9 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
                           const __global real *v_opacities, const __global real *v_colors, __global real *v_means,
                           __global real *v_log_scales, __global real *v_quats, __global real *v_logit_opacities,
                           __global real *v_sh
-#if VIEWMAT_GRAD
+#if CAMERA_GRAD
                           ,
-                          __global real *v_viewmat
+                          __global real *v_camera
 #endif
 ) {
     const size_t i = get_global_id(0);
@@ -370,9 +349,9 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
         v_logit_opacities[i] = v.logit_opacity;
     }
 
-#if VIEWMAT_GRAD
-    __local real partial[12 * GROUP];
-    sum_viewmat(&v.geometry, partial, v_viewmat);
+#if CAMERA_GRAD
+    __local real partial[16 * GROUP];
+    sum_camera(&v.geometry, partial, v_camera);
 #endif
 }
 
@@ -387,9 +366,9 @@ __kernel void project_bwd_adam(const uint n, const Camera camera, const int sh_s
                                __global real *logit_opacities_1, __global real *sh_1, __global real *means_2,
                                __global real *log_scales_2, __global real *quats_2, __global real *logit_opacities_2,
                                __global real *sh_2
-#if VIEWMAT_GRAD
+#if CAMERA_GRAD
                                ,
-                               __global real *v_viewmat
+                               __global real *v_camera
 #endif
 ) {
     const size_t i = get_global_id(0);
@@ -399,9 +378,9 @@ __kernel void project_bwd_adam(const uint n, const Camera camera, const int sh_s
         const SplatArrays splats = {conics, colors, v_means2d, v_conics, v_opacities, v_colors};
         v = gaussian_vjp(i, &camera, sh_stride, sh_degree, gaussians, splats);
     }
-#if VIEWMAT_GRAD
-    __local real partial[12 * GROUP];
-    sum_viewmat(&v.geometry, partial, v_viewmat);
+#if CAMERA_GRAD
+    __local real partial[16 * GROUP];
+    sum_camera(&v.geometry, partial, v_camera);
 #endif
     if (i >= n)
         return;

@@ -8,6 +8,8 @@ typedef struct {
     real translation[3]; // world to camera, world units
     real position[3];    // camera centre, world units
     real fx, fy, cx, cy; // px
+    real k1, k2, k3, k4; // FISHEYE: of its polynomial (lens.h)
+    real cos_max;        // FISHEYE: cosine of the largest angle from the axis that is drawn
     int width, height;   // px
 } Camera;
 

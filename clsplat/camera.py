@@ -1,34 +1,51 @@
-"""Pinhole camera in OpenCV axes."""
+"""Cameras in OpenCV axes: pinhole, orthographic, fisheye, equirectangular."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clsplat import display
+from clsplat.constants import FISHEYE_ANGLE_MAX, FRUSTUM_MARGIN
 from clsplat.errors import InputError
+
+CameraModel = Literal["pinhole", "orthographic", "fisheye", "equirectangular"]
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera (x right, y down, z forward; pixel centres at +0.5).
+    """A camera (x right, y down, z forward; pixel centres at +0.5).
+
+    A point (x, y, z) of its frame appears at (fx a + cx, fy b + cy), where (a, b) is
+
+    * pinhole: (x/z, y/z);
+    * orthographic: (x, y);
+    * fisheye: (x, y) theta_d/rho, rho the length of (x, y), theta = atan2(rho, z) and theta_d = theta (1 + k1 theta^2
+      + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala and Brandt 2006; OpenCV's and COLMAP's OPENCV_FISHEYE);
+    * equirectangular: longitude atan2(x, z) and latitude atan2(y, length of (x, z)), down.
 
     Parameters
     ----------
     viewmat : (4, 4) float64
         World to camera, in world units.
     fx, fy : float
-        Focal lengths in pixels.
+        Focal lengths in pixels; orthographic: per world unit; equirectangular: per radian.
     cx, cy : float
         Principal point in pixels, from the upper left corner of the upper left pixel.
     width, height : int
         Image size in pixels.
+    model : {"pinhole", "orthographic", "fisheye", "equirectangular"}
+    distortion : tuple of 4 floats
+        k1 to k4 of a fisheye; 0 for the others.
 
     Raises
     ------
     InputError
-        If a value is not finite as float32, a focal length or a size is not positive, or the rotation is not one
-        (not orthonormal to 1e-3, or a reflection).
+        If the model is none of these, another one than a fisheye has a distortion, a value is not finite as float32,
+        a focal length or a size is not positive, or the rotation is not one (not orthonormal to 1e-3, or a
+        reflection).
     """
 
     viewmat: NDArray[np.float64]
@@ -38,13 +55,24 @@ class Camera:
     cy: float
     width: int
     height: int
+    model: CameraModel = "pinhole"
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        if self.model not in get_args(CameraModel):
+            raise InputError(
+                f"camera: expected a model among {', '.join(get_args(CameraModel))}, found {self.model!r}"
+            )
+        if len(self.distortion) != 4 or (any(self.distortion) and self.model != "fisheye"):
+            raise InputError(
+                f"camera: expected a distortion k1, k2, k3, k4, and 0 for all but a fisheye, found {self.distortion} "
+                f"for a camera of model {self.model}"
+            )
         viewmat = np.ascontiguousarray(self.viewmat, dtype=np.float64)
         if viewmat.shape != (4, 4):
             raise InputError(f"viewmat: expected shape (4, 4), found {viewmat.shape}")
         object.__setattr__(self, "viewmat", viewmat)
-        intrinsics = np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64)
+        intrinsics = np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=np.float64)
         values = np.abs(np.append(viewmat, intrinsics))
         if not (values <= np.finfo(np.float32).max).all():
             raise InputError(f"camera: expected finite viewmat and intrinsics, as float32, found {values.max()}")
@@ -70,12 +98,63 @@ class Camera:
         """Camera centre in world units, (3,)."""
         return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), dtype=np.float64)
 
+    @cached_property
+    def angle_max(self) -> float:
+        """Largest angle from the axis, in radians, at which a fisheye draws a Gaussian.
+
+        That of the image's farthest corner and FRUSTUM_MARGIN more, but neither beyond FISHEYE_ANGLE_MAX nor where
+        the radius in the image would fall again.
+        """
+        k1, k2, k3, k4 = self.distortion
+        turns = np.roots([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])  # d theta_d/d theta, in theta^2
+        turns = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0)]
+        most = min(FISHEYE_ANGLE_MAX, float(np.sqrt(turns.min(initial=np.inf))))
+        corners = np.hypot(*np.meshgrid(self._slopes_x([0, self.width]), self._slopes_y([0, self.height])))
+        return min(most, (1 + FRUSTUM_MARGIN) * float(_fisheye_angle(corners.max(), self.distortion, most)))
+
+    def _slopes_x(self, u: ArrayLike) -> NDArray[np.float64]:
+        return np.asarray((np.asarray(u, dtype=np.float64) - self.cx) / self.fx)
+
+    def _slopes_y(self, v: ArrayLike) -> NDArray[np.float64]:
+        return np.asarray((np.asarray(v, dtype=np.float64) - self.cy) / self.fy)
+
+    def rays(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+        """Directions in which the camera looks, in its frame.
+
+        Parameters
+        ----------
+        u, v : (...,)
+            Points of the image in pixels.
+
+        Returns
+        -------
+        (..., 3) float64
+            Unit vectors. A fisheye's image may have points that no direction appears at: NaN there.
+        """
+        a, b = np.broadcast_arrays(self._slopes_x(u), self._slopes_y(v))
+        if self.model == "orthographic":
+            return np.stack([0 * a, 0 * a, 0 * a + 1], axis=-1)
+        if self.model == "equirectangular":
+            return np.stack([np.cos(b) * np.sin(a), np.sin(b), np.cos(b) * np.cos(a)], axis=-1)
+        if self.model == "pinhole":
+            directions = np.stack([a, b, np.ones_like(a)], axis=-1)
+            return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
+        radius = np.hypot(a, b)
+        angle = _fisheye_angle(radius, self.distortion, self.angle_max)
+        angle = np.where(radius > _fisheye_radius(self.angle_max, self.distortion), np.nan, angle)
+        across = np.sin(angle) / np.where(radius > 0, radius, 1)
+        return np.stack([a * across, b * across, np.cos(angle)], axis=-1)
+
     def _repr_html_(self) -> str:
-        angles = np.degrees(2 * np.arctan2([self.width, self.height], [2 * self.fx, 2 * self.fy]))
-        rows = {
+        rows = {"model": self.model} if self.model != "pinhole" else {}
+        if self.model in ("pinhole", "fisheye"):
+            middle = self.rays([0, self.width, self.cx, self.cx], [self.cy, self.cy, 0, self.height])
+            angles = np.degrees(np.arctan2(np.hypot(middle[:, 0], middle[:, 1]), middle[:, 2]))
+            angles = np.where(np.isnan(angles), np.degrees(self.angle_max), angles).reshape(2, 2).sum(axis=1)
+            rows["field of view"] = f"{angles[0]:.0f}° x {angles[1]:.0f}°"
+        rows |= {
             "focal lengths": f"{display.numbers([self.fx, self.fy])} px",
             "principal point": f"{display.numbers([self.cx, self.cy])} px",
-            "field of view": f"{angles[0]:.0f}° x {angles[1]:.0f}°",
             "stands at": display.numbers(self.position),
             "looks along": display.numbers(self.viewmat[2, :3]),
         }
@@ -100,13 +179,40 @@ class Camera:
     def resized(self, width: int, height: int) -> "Camera":
         """The same view at another image size; the intrinsics follow."""
         sx, sy = width / self.width, height / self.height
-        return Camera(self.viewmat, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
 
     def translated(self, offset: NDArray[np.float64]) -> "Camera":
         """The same camera in a world whose origin is moved to `offset` (3,)."""
         viewmat = self.viewmat.copy()
         viewmat[:3, 3] += viewmat[:3, :3] @ offset
-        return Camera(viewmat, self.fx, self.fy, self.cx, self.cy, self.width, self.height)
+        return replace(self, viewmat=viewmat)
+
+    @classmethod
+    def panorama(cls, viewmat: NDArray[np.float64], width: int) -> "Camera":
+        """Equirectangular camera that sees all around: `width` pixels for 360 degrees, half as many for 180."""
+        height = width // 2
+        return cls(
+            viewmat, width / (2 * np.pi), height / np.pi, width / 2, height / 2, width, height, "equirectangular"
+        )
+
+
+def _fisheye_radius(angle: ArrayLike, distortion: tuple[float, ...]) -> NDArray[np.float64]:
+    """theta_d of theta, in radians."""
+    theta = np.asarray(angle, dtype=np.float64)
+    return np.asarray(theta * np.polyval([*reversed(distortion), 1.0], theta**2))
+
+
+def _fisheye_angle(radius: ArrayLike, distortion: tuple[float, ...], most: float) -> NDArray[np.float64]:
+    """theta of theta_d by bisection, between 0 and `most`, where the radius grows."""
+    low = np.zeros(np.shape(radius))
+    high = np.full(np.shape(radius), most)
+    for _ in range(53):  # bits of a double
+        middle = 0.5 * (low + high)
+        below = _fisheye_radius(middle, distortion) < radius
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return high
 
 
 # Mean squared sine of the angles between the axes and their common direction, about 3 degrees. Axes wrong by an

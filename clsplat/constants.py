@@ -5,7 +5,7 @@ and the documentation. Sources: "paper" is Kerbl et al. 2023, doi:10.1145/359243
 published with it.
 """
 
-from math import exp, log2
+from math import exp, log2, radians
 from typing import Literal
 
 ALPHA_MIN = 1.0 / 255.0
@@ -38,6 +38,9 @@ NEAR = 0.01
 
 FRUSTUM_MARGIN = 0.3
 """The Jacobian is evaluated inside the image enlarged by this fraction of its half width (original: the 1.3)."""
+
+FISHEYE_ANGLE_MAX = radians(170)
+"""From a fisheye's axis: around 180 degrees a point has no place in the image. Lenses are made for up to 140."""
 
 QUAT_NORM2_MIN = 1e-8
 """Quaternions with a smaller squared norm have no direction in float32: such Gaussians are culled (Brush)."""

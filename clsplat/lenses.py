@@ -1,4 +1,4 @@
-"""Distorted cameras made pinholes: COLMAP's camera models, through pycolmap."""
+"""COLMAP's camera models, through pycolmap: fisheyes as they are, other distorted cameras made pinholes."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -30,6 +30,31 @@ class Intrinsics:
     params: tuple[float, ...]
     width: int
     height: int
+
+
+# How the parameters of COLMAP's fisheyes whose radius is a polynomial of the angle become OPENCV_FISHEYE's.
+_FISHEYES = {
+    "OPENCV_FISHEYE": lambda *params: params,
+    "FISHEYE": lambda fx, fy, cx, cy: (fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0),
+    "SIMPLE_FISHEYE": lambda f, cx, cy: (f, f, cx, cy, 0.0, 0.0, 0.0, 0.0),
+    "SIMPLE_RADIAL_FISHEYE": lambda f, cx, cy, k: (f, f, cx, cy, k, 0.0, 0.0, 0.0),
+    "RADIAL_FISHEYE": lambda f, cx, cy, k1, k2: (f, f, cx, cy, k1, k2, 0.0, 0.0),
+}
+
+
+def rendered(intrinsics: Intrinsics) -> Intrinsics:
+    """The camera that is rendered in a photo's place.
+
+    Returns
+    -------
+    Intrinsics
+        Of model OPENCV_FISHEYE and the photo's size where the model is a fisheye with a polynomial of the angle:
+        kernels project to it, and nothing of the photo is lost. Otherwise as `undistorted`, with its errors.
+    """
+    if intrinsics.model in _FISHEYES:
+        _camera(intrinsics)  # checks the number of parameters
+        return replace(intrinsics, model="OPENCV_FISHEYE", params=_FISHEYES[intrinsics.model](*intrinsics.params))
+    return undistorted(intrinsics)
 
 
 def undistorted(intrinsics: Intrinsics) -> Intrinsics:

@@ -108,7 +108,7 @@ def aligned(
         run = forward(device, uploaded, camera, render, background, gaussians.sh_degree)
         _, v_image = stage.l1_ssim(run.image.image, photo, config.ssim_weight, mask)
         v_alpha = device.scratch("v_alpha", camera.height * camera.width)
-        v_viewmat = backward(device, run, Image(v_image, v_alpha), viewmat_grad=True).viewmat
+        v_viewmat = backward(device, run, Image(v_image, v_alpha), camera_grad=True).viewmat
         assert v_viewmat is not None
         update(pose, view.name, camera, v_viewmat, rate_at(k / ALIGNING_STEPS, config), extent, config)
     return replace(view, camera=refined(view.camera, pose.of(view.name)))

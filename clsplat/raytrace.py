@@ -347,8 +347,7 @@ def bake(solids: list[Solid], sun_rays: int = 10, sky_rays: int = 96) -> None:
 
 def camera_rays(camera: Camera, x: Array, y: Array) -> Array:
     """Unit directions (3, N) in the world of the rays through the image points `x`, `y` in pixels, (N,) each."""
-    d = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)])
-    return camera.viewmat[:3, :3].T @ (d / np.linalg.norm(d, axis=0))
+    return camera.viewmat[:3, :3].T @ camera.rays(x, y).T
 
 
 def radiance(origin: Array, directions: Array, solids: list[Solid]) -> Array:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat import display, reference
+from clsplat import display, panorama, reference
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
@@ -27,12 +27,13 @@ class Gradients(NamedTuple):
     """Gradients of a scalar with respect to what was rendered.
 
     gaussians: per field of `Gaussians`, pre-activation; means2d (N, 2): per pixel, the statistic of densification;
-    viewmat (4, 4): each entry as an independent variable, or None if it was not asked for.
+    viewmat (4, 4): each entry as an independent variable; intrinsics (4,): fx, fy, cx, cy; None if not asked for.
     """
 
     gaussians: Gaussians
     means2d: Any
     viewmat: NDArray[np.float64] | None
+    intrinsics: NDArray[np.float64] | None
 
 
 def stage_functions(device: "Device | None") -> Any:
@@ -113,19 +114,19 @@ def backward_to_splats(device: "Device | None", run: Pass, v_image: Image) -> Sp
     return v_splats
 
 
-def backward(device: "Device | None", run: Pass, v_image: Image, *, viewmat_grad: bool = False) -> Gradients:
+def backward(device: "Device | None", run: Pass, v_image: Image, *, camera_grad: bool = False) -> Gradients:
     """Gradients of a forward pass, from the gradients with respect to its image and alpha."""
     v_splats = backward_to_splats(device, run, v_image)
-    v_gaussians, v_viewmat = stage_functions(device).project_bwd(
+    v_gaussians, v_camera = stage_functions(device).project_bwd(
         run.gaussians,
         run.camera,
         run.sh_degree,
         run.splats,
         v_splats,
         antialiased=run.config.mode == "antialiased",
-        viewmat_grad=viewmat_grad,
+        camera_grad=camera_grad,
     )
-    return Gradients(v_gaussians, v_splats.means2d, v_viewmat)
+    return Gradients(v_gaussians, v_splats.means2d, *(v_camera or (None, None)))
 
 
 def upload(device: "Device | None", gaussians: Gaussians) -> Gaussians:
@@ -156,8 +157,8 @@ class Rendering:
     alpha : (H, W)
         1 - transmittance.
     depth : (H, W) or None
-        Expected depth: the mean of the splats' depths in world units, weighted as the colours are; 0 where alpha is
-        0. None unless asked for.
+        Expected depth: the mean of the splats' depths in world units (z; distances for a fisheye and a panorama),
+        weighted as the colours are; 0 where alpha is 0. None unless asked for.
     """
 
     def __init__(self, device: "Device | None", run: Pass | None, gaussians: Gaussians, image: Array, alpha: Array):
@@ -177,6 +178,7 @@ class Rendering:
         v_depth: Array | None = None,
         *,
         viewmat_grad: bool = False,
+        intrinsics_grad: bool = False,
     ) -> Gradients:
         """Gradients of a scalar with respect to the Gaussians and the camera.
 
@@ -184,8 +186,8 @@ class Rendering:
         ----------
         v_rgb, v_alpha, v_depth : arrays of the shapes of rgb, alpha and depth, optional
             The scalar's gradients with respect to them; left out: 0.
-        viewmat_grad : bool
-            Also return the gradient with respect to the viewmat.
+        viewmat_grad, intrinsics_grad : bool
+            Also return the gradient with respect to the viewmat, and to fx, fy, cx, cy.
 
         Returns
         -------
@@ -199,7 +201,10 @@ class Rendering:
             gradients.
         """
         if self._run is None and len(self._gaussians):
-            raise InputError("gradients: expected a rendering made with gradients=True, found one made without")
+            raise InputError(
+                "gradients: expected a rendering made with gradients=True of a camera that is not equirectangular, "
+                "found another"
+            )
         for name, v, shape in (
             ("v_rgb", v_rgb, self.rgb.shape),
             ("v_alpha", v_alpha, self.alpha.shape),
@@ -209,7 +214,9 @@ class Rendering:
                 raise InputError(f"{name}: expected shape {shape}, found {np.shape(v)}")
         if self._run is None:
             zeros = Gaussians(**{k: np.zeros_like(a) for k, a in self._gaussians.arrays().items()})
-            return Gradients(zeros, np.zeros((0, 2)), np.zeros((4, 4)) if viewmat_grad else None)
+            v_viewmat, v_intrinsics = np.zeros((4, 4)), np.zeros(4)
+            result = Gradients(zeros, np.zeros((0, 2)), v_viewmat, v_intrinsics)
+            return _asked_for(result, viewmat_grad, intrinsics_grad)
         # Filled on the host: its dtype is that of the image.
         v_image = np.zeros((*self.alpha.shape, 3 if self.depth is None else 4), dtype=self.alpha.dtype)
         v_total_alpha = np.zeros_like(self.alpha) if v_alpha is None else np.array(v_alpha, dtype=self.alpha.dtype)
@@ -221,8 +228,15 @@ class Rendering:
         v_run = Image(v_image, v_total_alpha)
         if self._device is not None:
             v_run = Image(*(self._device.upload("v_image", a) for a in v_run))
-        result = backward(self._device, self._run, v_run, viewmat_grad=viewmat_grad)
-        return Gradients(fetch(result.gaussians), download(result.means2d), result.viewmat)
+        result = backward(self._device, self._run, v_run, camera_grad=viewmat_grad or intrinsics_grad)
+        result = result._replace(gaussians=fetch(result.gaussians), means2d=download(result.means2d))
+        return _asked_for(result, viewmat_grad, intrinsics_grad)
+
+
+def _asked_for(gradients: Gradients, viewmat: bool, intrinsics: bool) -> Gradients:
+    return gradients._replace(
+        viewmat=gradients.viewmat if viewmat else None, intrinsics=gradients.intrinsics if intrinsics else None
+    )
 
 
 def render(
@@ -243,6 +257,7 @@ def render(
     gaussians : Gaussians
         Pre-activation, on the host.
     camera : Camera
+        An equirectangular one is resampled from six faces of a cube, and has no gradients.
     config : RenderConfig
     device : Device, optional
         None renders with the float64 twins: exact and slow.
@@ -319,11 +334,35 @@ def _renderings(
 ) -> Iterator[Rendering]:
     uploaded = upload(device, gaussians) if len(gaussians) else gaussians
     for camera in cameras:
-        if len(gaussians) == 0:
-            dtype = np.float64 if device is None else device.real
-            image = np.broadcast_to(background.astype(dtype), (camera.height, camera.width, len(background)))
-            yield Rendering(device, None, gaussians, image, np.zeros(image.shape[:2], dtype))
-            continue
-        run = forward(device, uploaded, camera, config, background, sh_degree, gradients=gradients)
-        image, alpha = download(run.image.image), download(run.image.alpha)
+        run, image, alpha = _rendered(device, uploaded, camera, config, background, sh_degree, gradients=gradients)
         yield Rendering(device, run if gradients else None, gaussians, image, alpha)
+
+
+def _rendered(
+    device: "Device | None",
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RenderConfig,
+    background: Array,
+    sh_degree: int,
+    *,
+    gradients: bool,
+) -> tuple[Pass | None, Array, Array]:
+    """The pass, where there is one, its image and its alpha, on the host."""
+    if len(gaussians) == 0:
+        dtype = np.float64 if device is None else device.real
+        image: Array = np.broadcast_to(background.astype(dtype), (camera.height, camera.width, len(background)))
+        return None, image, np.zeros(image.shape[:2], dtype)
+    if camera.model == "equirectangular":
+        layers = []
+        for face in panorama.faces(camera):
+            _, image, alpha = _rendered(device, gaussians, face, config, background, sh_degree, gradients=False)
+            if len(background) == 4:  # from depths to distances
+                u, v = np.meshgrid(np.arange(face.width) + 0.5, np.arange(face.height) + 0.5)
+                image = image.copy()
+                image[:, :, 3] /= face.rays(u, v)[:, :, 2]
+            layers.append(np.concatenate([image, alpha[:, :, None]], axis=2))
+        whole = panorama.assemble(camera, layers)
+        return None, whole[:, :, :-1], whole[:, :, -1]
+    run = forward(device, gaussians, camera, config, background, sh_degree, gradients=gradients)
+    return run, download(run.image.image), download(run.image.alpha)

@@ -74,7 +74,8 @@ class Scene:
         (the original's `cameras_extent`); 1 where all cameras stand at one place."""
         centres = np.array([view.camera.position for view in self.train])
         radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-        return 1.1 * radius if radius > 0 else 1.0
+        # Faces of a panorama stand at one place but for rounding.
+        return 1.1 * radius if radius > 1e-12 * np.abs(centres).max() else 1.0
 
     def _repr_html_(self) -> str:
         views = [*self.train, *self.test]

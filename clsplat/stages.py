@@ -39,6 +39,16 @@ class SplatGrads(NamedTuple):
     colors: Any
 
 
+class CameraGrads(NamedTuple):
+    """Gradients with respect to a camera.
+
+    viewmat (4, 4): each entry as an independent variable, its last row 0; intrinsics (4,): fx, fy, cx, cy.
+    """
+
+    viewmat: Any
+    intrinsics: Any
+
+
 class Dropout(NamedTuple):
     """Which splats are left out of an image: `rate` of them, in [0, 1), drawn anew for each seed and iteration."""
 

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from clsplat.camera import Camera
+from clsplat.errors import InputError
 from clsplat.stages import ERANK_SLACK, AdamStep
 
 PENALTIES = ("opacity_penalty", "scale_penalty", "erank_penalty")
@@ -19,6 +20,8 @@ def camera_struct(camera: Camera, real: Any) -> np.ndarray:
             ("translation", real, 3),
             ("position", real, 3),
             ("intrinsics", real, 4),
+            ("distortion", real, 4),
+            ("cos_max", real),
             ("size", "i4", 2),
         ]
     )
@@ -27,8 +30,26 @@ def camera_struct(camera: Camera, real: Any) -> np.ndarray:
     struct["translation"] = camera.viewmat[:3, 3]
     struct["position"] = camera.position
     struct["intrinsics"] = camera.fx, camera.fy, camera.cx, camera.cy
+    if camera.model == "fisheye":
+        struct["distortion"], struct["cos_max"] = camera.distortion, np.cos(camera.angle_max)
     struct["size"] = camera.width, camera.height
     return struct
+
+
+def lens_define(camera: Camera) -> str:
+    """Value of -DLENS (cl/lens.h) for a camera.
+
+    Raises
+    ------
+    InputError
+        If it is equirectangular, which no kernel projects to.
+    """
+    if camera.model == "equirectangular":
+        raise InputError(
+            "camera: expected a pinhole, orthographic or fisheye one, found an equirectangular one; `render` shows "
+            "such a panorama, and datasets train on its six faces"
+        )
+    return camera.model.upper()
 
 
 def adam_struct(step: AdamStep, real: Any) -> np.ndarray:

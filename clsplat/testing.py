@@ -21,6 +21,7 @@ from clsplat.constants import (
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, sigmoid
 from clsplat.reference import project_fwd
+from clsplat.reference.lens import lens
 from clsplat.reference.sh import sh_basis
 from clsplat.stages import Splats
 
@@ -195,22 +196,27 @@ def threshold_distances(gaussians: Gaussians, camera: Camera, *, antialiased: bo
     (N,) float64
         The smallest of: |ln(alpha/ALPHA_MIN)| and |ln(alpha/ALPHA_MAX)| over the pixels, |ln(T/TRANSMITTANCE_MIN)|
         behind the Gaussian where it is drawn, |ln(opacity/ALPHA_MIN)|, |ln(z/NEAR)|, |ln(z/z')| to the next depth,
-        the colour's distance from its clamp at 0, that of x/z and y/z from the clamp of the Jacobian, and that of
-        the opacity's compensation from its floor, as a logarithm. For an invisible Gaussian that of the depth from
-        NEAR, infinite if that is not why.
+        the colour's distance from its clamp at 0, that of a pinhole's x/z and y/z from the clamp of the Jacobian,
+        that of a fisheye's angle from its largest, and that of the opacity's compensation from its floor, as a
+        logarithm. For an invisible Gaussian that of the depth from NEAR, infinite if that is not why.
     """
     g = gaussians.astype(np.float64)
     splats = project_fwd(g, camera, g.sh_degree, antialiased=antialiased)
     shown = splats.extents[:, 0] > 0
     points = g.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = points[:, 2]
+    z = lens(camera, points)["depths"]
     with np.errstate(divide="ignore", invalid="ignore"):
         distances = np.where(z > 0, np.abs(np.log(z / NEAR)), np.inf)
         opacity = np.abs(np.log(splats.opacities / ALPHA_MIN))
+    if camera.model == "fisheye":
+        angles = np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
+        distances = np.minimum(distances, np.abs(angles - camera.angle_max))
     near = distances.copy()
     distances = np.minimum(distances, np.where(shown, opacity, np.inf))
 
-    offsets = g.means - camera.position
+    offsets = (
+        np.tile(camera.viewmat[2, :3], (len(g), 1)) if camera.model == "orthographic" else g.means - camera.position
+    )
     basis = sh_basis(offsets / np.linalg.norm(offsets, axis=1, keepdims=True), g.sh_degree)
     colors = 0.5 + np.einsum("nk,nkc->nc", basis, g.sh)
     distances = np.minimum(distances, np.abs(colors).min(axis=1))
@@ -218,7 +224,7 @@ def threshold_distances(gaussians: Gaussians, camera: Camera, *, antialiased: bo
     focal, size = np.array([camera.fx, camera.fy]), np.array([camera.width, camera.height])
     centre, margin = np.array([camera.cx, camera.cy]), FRUSTUM_MARGIN * 0.5 * size
     slopes = points[:, :2] / z[:, None]
-    for limit in (-(centre + margin) / focal, (size - centre + margin) / focal):
+    for limit in (-(centre + margin) / focal, (size - centre + margin) / focal) if camera.model == "pinhole" else ():
         distances = np.minimum(distances, np.abs(slopes - limit).min(axis=1))
     if antialiased:
         opacities = sigmoid(g.logit_opacities)

@@ -248,18 +248,18 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
     erank = config.optim.erank_penalty / len(gaussians)
     settings = settings._replace(penalties=(*state.strategy.penalties(len(gaussians)), erank))
     moments = state.moments.first, state.moments.second
-    options = {"antialiased": config.render.mode == "antialiased", "viewmat_grad": state.poses is not None}
+    options = {"antialiased": config.render.mode == "antialiased", "camera_grad": state.poses is not None}
     if optimizer and state.pixels is None:
-        v_viewmat = stage.project_bwd_adam(gaussians, moments, camera, run.splats, v_splats, settings, **options)
+        v_camera = stage.project_bwd_adam(gaussians, moments, camera, run.splats, v_splats, settings, **options)
     else:
-        v_gaussians, v_viewmat = stage.project_bwd(gaussians, camera, sh_degree, run.splats, v_splats, **options)
+        v_gaussians, v_camera = stage.project_bwd(gaussians, camera, sh_degree, run.splats, v_splats, **options)
         if state.pixels is not None:
             v_gaussians = stage.filter_bwd(on_device(state.gaussians, device), state.pixels, v_gaussians)
         v_gaussians = v_gaussians if optimizer else fetch(v_gaussians)
         stage_functions(optimizer).adam_step(state.gaussians, v_gaussians, *moments, settings)
     if state.poses:
         rate = poses.rate_at(progress, config.optim)
-        poses.update(state.poses, view.name, camera, v_viewmat, rate, state.extent, config.optim)
+        poses.update(state.poses, view.name, camera, v_camera.viewmat, rate, state.extent, config.optim)
     state.strategy.perturb(stage_functions(optimizer), state.gaussians, iteration, settings.rates["means"])
     state.iteration = iteration
     return loss

@@ -24,7 +24,7 @@ LAYERS = """
     config photos
     presets
     camera gaussians lenses video
-    sfm
+    sfm panorama
     scene structs device reference perphoto metrics raytrace orbit
     ops io testing still_life memory pyramid
     page render optim densify initialize exposure few_views report demo preview
@@ -154,12 +154,12 @@ DEFINES = {
     "composite_gpu": {"TILE": 8, "CHANNELS": 1, "BATCH": 16, "SUBGROUPS": 0},
     "composite_sorted": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "WINDOW": 2},
     "count": {"TILE": 16},
-    "filter": {"FILTER_VARIANCE": 0.2},
+    "filter": {"FILTER_VARIANCE": 0.2, "LENS": "FISHEYE"},
     "loss": {
         **{"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
     },
-    "project": {"CHANNELS": 4, "ANTIALIASED": 1, "VIEWMAT_GRAD": 1, "GROUP": 32},
+    "project": {"CHANNELS": 4, "ANTIALIASED": 1, "CAMERA_GRAD": 1, "GROUP": 32, "LENS": "FISHEYE"},
     "removal": {"TILE": 8, "CHANNELS": 1, "LANES": 16},
     "roof": {"WIDTH": 16, "HALVES": 1},
     "scan": {"GROUP": 32},
@@ -179,13 +179,15 @@ FORBIDDEN = [
     ("composite_sorted", "CHANNELS", 0),
     ("composite_sorted", "WINDOW", 0),
     ("count", "TILE", 0),
+    ("filter", "LENS", 4),
     ("loss", "RADIUS", 0),
     ("loss", "LANES", 8),
     ("loss", "VECTORS", 0),
     ("loss", "GROUP", 0),
     ("project", "CHANNELS", 5),
     ("project", "ANTIALIASED", 2),
-    ("project", "VIEWMAT_GRAD", 2),
+    ("project", "CAMERA_GRAD", 2),
+    ("project", "LENS", "MIRROR"),
     ("project", "GROUP", 0),
     ("removal", "TILE", 12),
     ("removal", "CHANNELS", 0),

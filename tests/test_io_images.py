@@ -20,7 +20,7 @@ from clsplat.io.images import (
     locate,
     mask_folder,
 )
-from clsplat.lenses import Intrinsics, undistorted
+from clsplat.lenses import Intrinsics, project, undistorted
 
 RNG = np.random.default_rng(11)
 PINHOLE = Intrinsics("PINHOLE", (50.0, 60.0, 30.0, 25.0), 64, 48)
@@ -246,9 +246,6 @@ DISTORTED = {
     "RADIAL": (120.0, 82.0, 58.0, 0.06, -0.02),
     "OPENCV": (120.0, 125.0, 82.0, 58.0, -0.1, 0.03, 0.004, -0.003),
     "FULL_OPENCV": (120.0, 125.0, 82.0, 58.0, -0.1, 0.03, 0.004, -0.003, 0.01, 0.02, 0.01, 0.005),
-    "OPENCV_FISHEYE": (120.0, 125.0, 82.0, 58.0, 0.02, -0.01, 0.005, 0.001),
-    "SIMPLE_RADIAL_FISHEYE": (120.0, 82.0, 58.0, 0.03),
-    "RADIAL_FISHEYE": (120.0, 82.0, 58.0, 0.03, -0.01),
     "THIN_PRISM_FISHEYE": (120.0, 125.0, 82.0, 58.0, 0.02, -0.01, 0.002, 0.001, 0.0, 0.0, 0.002, 0.001),
     "FOV": (120.0, 125.0, 82.0, 58.0, 0.7),
 }
@@ -354,23 +351,51 @@ def test_zero_coefficients_are_a_plain_pinhole(tmp_path, model):
     assert view.camera.fx == params[0]
 
 
-def test_a_fisheye_without_coefficients_is_no_pinhole(tmp_path):
-    intrinsics = Intrinsics("OPENCV_FISHEYE", (60.0, 60.0, 80.0, 60.0, 0.0, 0.0, 0.0, 0.0), 160, 120)
-    x, y = np.meshgrid((np.arange(160) + 0.5 - 80) / 60, (np.arange(120) + 0.5 - 60) / 60)
-    radius = np.hypot(x, y)
-    scale = np.tan(np.minimum(radius, 1.5)) / radius  # r = f theta
-    pixels = np.rint(pattern(x * scale / 4, y * scale / 4)).astype(np.uint8)
+FISHEYES = {
+    "OPENCV_FISHEYE": (50.0, 52.0, 82.0, 58.0, 0.02, -0.01, 0.005, 0.001),
+    "FISHEYE": (50.0, 52.0, 82.0, 58.0),
+    "SIMPLE_FISHEYE": (50.0, 82.0, 58.0),
+    "SIMPLE_RADIAL_FISHEYE": (50.0, 82.0, 58.0, 0.03),
+    "RADIAL_FISHEYE": (50.0, 82.0, 58.0, 0.03, -0.01),
+}
+
+
+@pytest.mark.parametrize("model", FISHEYES)
+def test_fisheyes_stay_as_they_are(tmp_path, model):
+    """Not a pixel is resampled, and the camera is COLMAP's: its directions appear where COLMAP says."""
+    intrinsics, pixels = Intrinsics(model, FISHEYES[model], 160, 120), noise(160, 120)
     (view,) = load(posed(save(tmp_path / "a.png", pixels), intrinsics))
-    rays = ray_grid(view.camera)
-    middle = np.hypot(*rays) < 1
-    error = np.abs(view.image.astype(float) - pattern(rays[0] / 4, rays[1] / 4))[middle]
-    assert error.max() < 3  # 5 levels per pixel here; taken for a pinhole it would be 27 % off at radius 1
+    np.testing.assert_array_equal(view.image, pixels)
+    assert view.camera.model == "fisheye"
+    u, v = np.meshgrid(np.linspace(5, 155, 16), np.linspace(5, 115, 12))
+    rays = view.camera.rays(u, v)
+    front = rays[..., 2] > 0.1  # COLMAP's function has no points behind
+    assert front.mean() > 0.6
+    np.testing.assert_allclose(project(intrinsics, rays[front]), np.stack([u, v], axis=-1)[front], atol=1e-9)
+
+
+def test_a_smaller_fisheye_keeps_its_coefficients(tmp_path):
+    intrinsics = Intrinsics("OPENCV_FISHEYE", FISHEYES["OPENCV_FISHEYE"], 160, 120)
+    (view,) = load(posed(save(tmp_path / "a.png", noise(160, 120)), intrinsics), reduce=2)
+    assert (view.camera.width, view.camera.fx, view.camera.cy) == (80, 25, 29)
+    assert view.camera.distortion == (0.02, -0.01, 0.005, 0.001)
+
+
+def test_beyond_a_fisheyes_image_nothing_counts(tmp_path):
+    """theta - 0.1 theta^3 is largest at a radius of 1.217, 24.3 px; a mask of the user's counts too."""
+    intrinsics = Intrinsics("SIMPLE_RADIAL_FISHEYE", (20.0, 32.0, 32.0, -0.1), 64, 64)
+    user = np.full((64, 64), 255, np.uint8)
+    user[30:34, 30:34] = 0
+    path, mask = save(tmp_path / "a.png", noise(64, 64)), save(tmp_path / "m.png", user)
+    (view,), (masked,) = load(posed(path, intrinsics)), load(posed(path, intrinsics, mask=mask))
+    x, y = np.meshgrid(np.arange(64) - 31.5, np.arange(64) - 31.5)
+    np.testing.assert_array_equal(view.mask, np.hypot(x, y) <= 20 * 2 / 3 * np.sqrt(1 / 0.3))
+    np.testing.assert_array_equal(masked.mask, view.mask & (user > 0))
 
 
 @pytest.mark.parametrize(
     ("intrinsics", "message"),
     [
-        (Intrinsics("EQUIRECTANGULAR", (64.0, 48.0), 64, 48), "perspective or fisheye"),
         (Intrinsics("PINBALL", (64.0, 48.0), 64, 48), "PINBALL"),
         (Intrinsics("OPENCV", (64.0, 48.0), 64, 48), "8 parameters"),
         (Intrinsics("DIVISION", (48.0, 48.0, 32.0, 24.0, 30.0), 64, 48), r"DIVISION.*undone"),  # NaN

@@ -247,7 +247,7 @@ MIRRORED = (np.array(opengl(CAMERAS[1])) @ np.diag([-1, 1, 1, 1])).tolist()
         (bad_frame(w=0), r"1\.png.*0x48"),
         (bad_frame(w=48, h=64), r"1\.png.*48x64.*64x48"),
         ({"fl_x": None}, "fl_x"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model.*EQUIRECTANGULAR"),
+        ({"camera_model": "PINBALL"}, "camera_model.*PINBALL"),
         ({"k4": 0.1}, "k4"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "p1"),
         ({"ply_file_path": "../points.ply"}, r"\.\./points\.ply"),

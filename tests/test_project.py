@@ -17,6 +17,7 @@ from clsplat.render import download, render, upload
 from clsplat.stages import SplatGrads, Splats
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene, threshold_distances
 
+INTRINSICS = ("fx", "fy", "cx", "cy")
 GRADIENTS = ("means2d", "conics", "opacities", "colors")
 MODES = pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
 
@@ -34,8 +35,13 @@ def forward(device, gaussians, camera, degree=3, **options):
 
 def backward(device, gaussians, camera, splats, v_splats, degree=3, **options):
     uploaded = [type(a)(*(device.upload("splats", x) for x in a)) for a in (splats, v_splats)]
-    v, v_viewmat = ops.project_bwd(device, upload(device, gaussians), camera, degree, *uploaded, **options)
-    return host(v), v_viewmat
+    v, v_camera = ops.project_bwd(device, upload(device, gaussians), camera, degree, *uploaded, **options)
+    return host(v), v_camera
+
+
+def assert_cameras_match(actual, expected, tolerances):
+    assert_matches("v_viewmat", actual.viewmat, expected.viewmat, tolerances)
+    assert_matches("v_intrinsics", actual.intrinsics, expected.intrinsics, tolerances)
 
 
 def random_grads(splats, seed=0):
@@ -83,15 +89,15 @@ def test_backward_matches_twin(device64, antialiased, degree):
     splats = reference.project_fwd(gaussians, camera, degree, antialiased=antialiased, channels=channels)
     v_splats = random_grads(splats)
     # The two variants of the kernel, with and without the viewmat, are one each here.
-    options = {"antialiased": antialiased, "viewmat_grad": antialiased}
-    actual, v_viewmat = backward(device64, gaussians, camera, splats, v_splats, degree, **options)
-    expected, v_viewmat_expected = reference.project_bwd(gaussians, camera, degree, splats, v_splats, **options)
+    options = {"antialiased": antialiased, "camera_grad": antialiased}
+    actual, v_camera = backward(device64, gaussians, camera, splats, v_splats, degree, **options)
+    expected, v_camera_expected = reference.project_bwd(gaussians, camera, degree, splats, v_splats, **options)
     for name, array in expected.arrays().items():
         assert_matches(f"v_{name}", actual.arrays()[name], array, DOUBLE)
     if antialiased:
-        assert_matches("v_viewmat", v_viewmat, v_viewmat_expected, DOUBLE)
+        assert_cameras_match(v_camera, v_camera_expected, DOUBLE)
     else:
-        assert v_viewmat is None and v_viewmat_expected is None
+        assert v_camera is None and v_camera_expected is None
 
 
 def random_moments(gaussians, rng):
@@ -117,12 +123,12 @@ def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degr
     fused, separate = ([upload(any_device, part) for part in parts] for _ in range(2))
 
     # The gradient of the viewmat comes along on request; without it, the kernel is another.
-    options = {"antialiased": antialiased, "viewmat_grad": degree == stored}
+    options = {"antialiased": antialiased, "camera_grad": degree == stored}
     v_fused = ops.project_bwd_adam(any_device, fused[0], tuple(fused[1:]), camera, *uploaded, step, **options)
     v, v_separate = ops.project_bwd(any_device, separate[0], camera, degree, *uploaded, **options)
-    assert (v_fused is not None) == options["viewmat_grad"]
+    assert (v_fused is not None) == options["camera_grad"]
     if v_fused is not None:
-        assert_matches("v_viewmat", v_fused, v_separate, DOUBLE if any_device.real == np.float64 else FLOAT)
+        assert_cameras_match(v_fused, v_separate, DOUBLE if any_device.real == np.float64 else FLOAT)
     ops.adam_step(any_device, separate[0], v, *separate[1:], step)
     twin = [part.astype(np.float64) for part in parts]
     reference.project_bwd_adam(twin[0], tuple(twin[1:]), camera, splats, v_splats, step, antialiased=antialiased)
@@ -153,13 +159,13 @@ def test_float_matches_twin(device, antialiased):
         assert_matches(name, getattr(actual, name), getattr(expected, name), FLOAT, where=same)
 
     v_splats = random_grads(expected)
-    options = {"antialiased": antialiased, "viewmat_grad": antialiased}
-    v_actual, v_viewmat = backward(device, gaussians, camera, expected, v_splats, **options)
-    v_expected, v_viewmat_expected = reference.project_bwd(gaussians, camera, 3, expected, v_splats, **options)
+    options = {"antialiased": antialiased, "camera_grad": antialiased}
+    v_actual, v_camera = backward(device, gaussians, camera, expected, v_splats, **options)
+    v_expected, v_camera_expected = reference.project_bwd(gaussians, camera, 3, expected, v_splats, **options)
     for name, array in v_expected.arrays().items():
         assert_matches(f"v_{name}", v_actual.arrays()[name], array, FLOAT)
     if antialiased:
-        assert_matches("v_viewmat", v_viewmat, v_viewmat_expected, FLOAT)
+        assert_cameras_match(v_camera, v_camera_expected, FLOAT)
 
 
 def check_gradients(device, gaussians, camera, antialiased, degree=3):
@@ -169,16 +175,17 @@ def check_gradients(device, gaussians, camera, antialiased, degree=3):
     assert (splats.extents > 0).all(), "every Gaussian must be visible"
     v_splats = random_grads(splats)
 
-    def scalar(viewmat, **arrays):
-        moved = forward(device, Gaussians(**arrays), replace(camera, viewmat=viewmat), degree, **options)
+    def scalar(viewmat, intrinsics, **arrays):
+        moved_camera = replace(camera, viewmat=viewmat, **dict(zip(INTRINSICS, intrinsics, strict=True)))
+        moved = forward(device, Gaussians(**arrays), moved_camera, degree, **options)
         # Differences of the outputs, lest those that are large and do not change drown the rest in rounding.
         return sum(float(((getattr(moved, k) - getattr(splats, k)) * getattr(v_splats, k)).sum()) for k in GRADIENTS)
 
-    v, v_viewmat = backward(
-        device, gaussians, camera, splats, v_splats, degree, antialiased=antialiased, viewmat_grad=True
+    v, v_camera = backward(
+        device, gaussians, camera, splats, v_splats, degree, antialiased=antialiased, camera_grad=True
     )
-    inputs = {**gaussians.arrays(), "viewmat": camera.viewmat}
-    gradcheck(scalar, inputs, {**v.arrays(), "viewmat": v_viewmat})
+    inputs = {"viewmat": camera.viewmat, "intrinsics": np.array([getattr(camera, k) for k in INTRINSICS])}
+    gradcheck(scalar, gaussians.arrays() | inputs, v.arrays() | v_camera._asdict())
     return v
 
 
@@ -338,16 +345,16 @@ def test_invalid_gaussians_are_invisible(any_device, antialiased):
         v_mixed = SplatGrads(*(np.full(getattr(grads, k).shape, 1e3) for k in GRADIENTS))
         for name in GRADIENTS:
             getattr(v_mixed, name)[healthy] = getattr(v_splats, name)
-    options = {"antialiased": antialiased, "viewmat_grad": True}
-    v_clean, v_viewmat_clean = backward(any_device, mixed.take(healthy), camera, clean, v_splats, **options)
-    v, v_viewmat = backward(any_device, mixed, camera, splats, v_mixed, **options)
-    v_twin, v_viewmat_twin = reference.project_bwd(mixed, camera, 3, twin, v_mixed, **options)
+    options = {"antialiased": antialiased, "camera_grad": True}
+    v_clean, v_camera_clean = backward(any_device, mixed.take(healthy), camera, clean, v_splats, **options)
+    v, v_camera = backward(any_device, mixed, camera, splats, v_mixed, **options)
+    v_twin, v_camera_twin = reference.project_bwd(mixed, camera, 3, twin, v_mixed, **options)
     table = DOUBLE if any_device.real == np.float64 else FLOAT
     for name, array in v.arrays().items():
         assert (array[poison] == 0).all() and (v_twin.arrays()[name][poison] == 0).all(), name
         np.testing.assert_array_equal(array[healthy], v_clean.arrays()[name], err_msg=name)
-    assert_matches("v_viewmat", v_viewmat, v_viewmat_clean, table)  # summed in other groups
-    assert_matches("v_viewmat", v_viewmat, v_viewmat_twin, table)
+    assert_cameras_match(v_camera, v_camera_clean, table)  # summed in other groups
+    assert_cameras_match(v_camera, v_camera_twin, table)
 
 
 @MODES
@@ -361,8 +368,8 @@ def test_extreme_gaussians_stay_finite(any_device, antialiased):
     splats = forward(any_device, mixed, camera, **options)
     assert (splats.extents[extreme] > 0).all()
     v_splats = random_grads(splats)
-    v, v_viewmat = backward(any_device, mixed, camera, splats, v_splats, antialiased=antialiased, viewmat_grad=True)
-    for name, array in [*splats._asdict().items(), *v.arrays().items(), ("viewmat", v_viewmat)]:
+    v, v_camera = backward(any_device, mixed, camera, splats, v_splats, antialiased=antialiased, camera_grad=True)
+    for name, array in [*splats._asdict().items(), *v.arrays().items(), *v_camera._asdict().items()]:
         assert np.isfinite(array).all(), name
     clean = forward(any_device, mixed.take(healthy), camera, **options)
     for name in Splats._fields:
@@ -389,8 +396,8 @@ def test_near_plane_and_behind(any_device):
     gaussians.log_scales[8] = -3
     splats = forward(any_device, gaussians.astype(any_device.real), camera, channels=4)
     np.testing.assert_array_equal(splats.extents[:, 0] > 0, [1, 0, 0, 0, 0, 0, 1, 1, 0])
-    v, v_viewmat = backward(any_device, gaussians, camera, splats, random_grads(splats), viewmat_grad=True)
-    for name, array in [*splats._asdict().items(), *v.arrays().items(), ("viewmat", v_viewmat)]:
+    v, v_camera = backward(any_device, gaussians, camera, splats, random_grads(splats), camera_grad=True)
+    for name, array in [*splats._asdict().items(), *v.arrays().items(), *v_camera._asdict().items()]:
         assert np.isfinite(array).all(), name
 
 

@@ -37,6 +37,7 @@ DOUBLE = {
     "v_logit_opacities": _CANCELS,
     "v_sh": _CANCELS,
     "v_viewmat": _CANCELS,
+    "v_intrinsics": _CANCELS,
     "parameters": _UPDATED,
     "first moments": _UPDATED,
     "second moments": _UPDATED,
@@ -80,6 +81,7 @@ FLOAT = {
     "v_logit_opacities": Tolerance(1e-4, 2e-5, _SUM),
     "v_sh": Tolerance(1e-4, 5e-6, _SUM),
     "v_viewmat": Tolerance(1e-4, 2e-5, _SUM),
+    "v_intrinsics": Tolerance(1e-4, 2e-5, _SUM),
     "errors": Tolerance(
         1e-4, 1e-5, "float32: what lies behind is what earlier splats left of the whole, times up to 99"
     ),

@@ -42,6 +42,7 @@ MODELS: tuple[tuple[str, int], ...] = (
     ("SIMPLE_FISHEYE", 3),
     ("FISHEYE", 4),
     ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 )
 """Camera models and their numbers of parameters; the index is the number that binary files hold."""
 

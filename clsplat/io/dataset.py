@@ -9,7 +9,7 @@ from clsplat import sfm
 from clsplat.config import DataConfig, SfmConfig
 from clsplat.errors import InputError
 from clsplat.io import colmap, transforms
-from clsplat.io.images import Dataset, PhotosMissing, load_views
+from clsplat.io.images import Dataset, PhotosMissing, by_faces, load_views
 from clsplat.photos import list_photos
 from clsplat.scene import Scene, View
 
@@ -56,13 +56,17 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
     if config.test_every < 0:
         raise InputError(f"test_every: expected 0 or more, found {config.test_every}")
     dataset = _find(path, config, verbose)
-    held_out = {photo.name: photo.held_out for photo in dataset.photos}
+    dataset = replace(dataset, photos=by_faces(dataset.photos))
+    photos = {photo.name: photo for photo in dataset.photos}
     views = sorted(load_views(dataset, config), key=lambda view: view.name)
     train: list[View] = []
     test: list[View] = []
-    for index, view in enumerate(views):
-        is_test = held_out[view.name]
+    numbers: dict[str, int] = {}  # the faces of a panorama have one number: they are held out together
+    for view in views:
+        photo = photos[view.name]
+        is_test = photo.held_out
         if is_test is None:
+            index = numbers.setdefault(str(photo.path) if photo.face else view.name, len(numbers))
             is_test = config.test_every > 0 and index % config.test_every == 0
         (test if is_test else train).append(view)
     if not train:

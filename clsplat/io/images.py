@@ -1,10 +1,10 @@
-"""From a dataset's photos and cameras to views: files found, cameras made pinholes, pixels decoded and resampled."""
+"""From a dataset's photos and cameras to views: files found, distortion undone, pixels decoded and resampled."""
 
 import os
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import floor
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, DataConfig
 from clsplat.errors import InputError
-from clsplat.lenses import Intrinsics, is_pinhole, project, undistorted
+from clsplat.lenses import Intrinsics, is_pinhole, project, rendered, undistorted
+from clsplat.panorama import FACES, face_positions, rotated
 from clsplat.photos import SUFFIXES, is_transparent, orientation, photo_size, read_mask, read_photo
 from clsplat.scene import View
 
@@ -49,6 +50,8 @@ class PosedPhoto:
         File of its mask.
     held_out : bool, optional
         Whether the dataset keeps it for testing; None where it does not say.
+    face : str, optional
+        Of the panorama at `path`: the name of the face (`clsplat.panorama.FACES`) whose viewmat this is.
     """
 
     name: str
@@ -57,6 +60,21 @@ class PosedPhoto:
     intrinsics: Intrinsics
     mask: Path | None = None
     held_out: bool | None = None
+    face: str | None = None
+
+
+def by_faces(photos: list[PosedPhoto]) -> list[PosedPhoto]:
+    """The photos, with each equirectangular panorama, of viewmat, as six: ``a_front.jpg`` and so on for ``a.jpg``."""
+    result = []
+    for photo in photos:
+        if photo.intrinsics.model != "EQUIRECTANGULAR":
+            result.append(photo)
+            continue
+        name = PurePosixPath(photo.name)
+        for face in FACES:
+            named = name.with_name(f"{name.stem}_{face}{name.suffix}").as_posix()
+            result.append(replace(photo, name=named, viewmat=rotated(photo.viewmat, face), face=face))
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,15 +280,23 @@ def _plan(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> _Plan:
             f"{photo.path}: expected a photo of {declared.width}x{declared.height} pixels or a smaller copy of it, "
             f"as its camera says, found {width}x{height}"
         )
-    pinhole = undistorted(declared)
     sx, sy = width / declared.width, height / declared.height
-    fx, fy, cx, cy = (value * s / dataset.reduce for value, s in zip(pinhole.params, (sx, sy, sx, sy), strict=True))
-    # An undistorted photo loses the last fraction of a pixel, one that is reduced what does not fill a square.
-    across, down = floor(pinhole.width * sx + 1e-6), floor(pinhole.height * sy + 1e-6)
+    if photo.face:
+        edge = round(width / np.pi)  # in the middle of a face, pixels are as small as on the panorama's equator
+        target = Intrinsics("PINHOLE", (edge / 2 / sx, edge / 2 / sy, edge / 2 / sx, edge / 2 / sy), 0, 0)
+        across = down = edge
+    else:
+        target = rendered(declared)
+        # An undistorted photo loses the last fraction of a pixel, one that is reduced what does not fill a square.
+        across, down = floor(target.width * sx + 1e-6), floor(target.height * sy + 1e-6)
+    fx, fy, cx, cy = (v * s / dataset.reduce for v, s in zip(target.params[:4], (sx, sy, sx, sy), strict=True))
     if min(across, down) < dataset.reduce:
         raise InputError(f"{photo.path}: expected at least {dataset.reduce} pixels per edge, found {across}x{down}")
     try:
         camera = Camera(photo.viewmat, fx, fy, cx, cy, across // dataset.reduce, down // dataset.reduce)
+        if target.model == "OPENCV_FISHEYE":
+            k1, k2, k3, k4 = target.params[4:]
+            camera = replace(camera, model="fisheye", distortion=(k1, k2, k3, k4))
     except InputError as error:
         raise InputError(f"photo {photo.name}: {error}") from error
     return _Plan(photo, camera, (width, height), upright, invert_mask)
@@ -301,9 +327,16 @@ def _pixels(
     image = read_photo(photo.path, background, plan.upright)
     # Inverted before it is averaged: a pixel counts if all that it is made of does.
     mask = None if photo.mask is None else _fitted_mask(photo.mask, *image.shape[1::-1]) ^ plan.invert_mask
-    if not is_pinhole(photo.intrinsics):
+    positions = None
+    if photo.face:
+        positions = face_positions(photo.face, image.shape[1], image.shape[0], camera.width * reduce) + 1
+        # Left of the first column lies the last.
+        image = np.pad(np.pad(image, ((0, 0), (1, 1), (0, 0)), "wrap"), ((1, 1), (0, 0), (0, 0)), "edge")
+        mask = None if mask is None else np.pad(np.pad(mask, ((0, 0), (1, 1)), "wrap"), ((1, 1), (0, 0)), "edge")
+    elif camera.model == "pinhole" and not is_pinhole(photo.intrinsics):
         rows, columns = camera.height * reduce, camera.width * reduce
         positions = _positions(photo.intrinsics, plan.size, (rows, columns))
+    if positions is not None:
         image = np.stack([_resample(image[..., channel], positions, 1) for channel in range(3)], axis=-1)
         mask = None if mask is None else _resample(mask, positions, 0)
     if reduce > 1:
@@ -313,7 +346,17 @@ def _pixels(
         image = np.rint(total / reduce**2).astype(np.uint8)
         # A pixel that is averaged from a masked one does not count either.
         mask = None if mask is None else np.asarray(_squares(mask, camera, reduce).all(axis=(1, 3)))
+    if camera.model == "fisheye":
+        seen = _image_circle(camera)
+        if not seen.all():
+            mask = seen if mask is None else mask & seen
     return image, mask
+
+
+def _image_circle(camera: Camera) -> NDArray[np.bool_]:
+    """Where a fisheye's image shows anything, (H, W): beyond, the lens's polynomial has no angle."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return np.asarray(np.isfinite(camera.rays(u, v)[..., 0]))
 
 
 def _squares(pixels: NDArray[Any], camera: Camera, edge: int) -> NDArray[Any]:

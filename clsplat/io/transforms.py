@@ -147,13 +147,15 @@ def _intrinsics(frame: Json, where: str, file: Path, downscaled: int) -> Intrins
     height = round(_number_or(stored[1] * downscaled, frame, "h", where))
     if not (1 <= width <= SIZE_MAX and 1 <= height <= SIZE_MAX):
         raise InputError(f"{where}: expected 1 to {SIZE_MAX} pixels per edge in w and h, found {width}x{height}")
+    model = frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV")
+    if model == "EQUIRECTANGULAR":
+        return Intrinsics("EQUIRECTANGULAR", (float(width), float(height)), width, height)
     fx, fy = _focal(frame, "x", width, where), _focal(frame, "y", height, where)
     fx, fy = fx or fy, fy or fx  # one alone stands for square pixels
     if fx is None or fy is None:
         raise InputError(f"{where}: expected fl_x or camera_angle_x, found neither")
     cx, cy = _number_or(width / 2, frame, "cx", where), _number_or(height / 2, frame, "cy", where)
 
-    model = frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV")
     keys = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
     k1, k2, k3, k4, k5, k6, p1, p2 = (_number_or(0.0, frame, key, where) for key in keys)
     if model in FISHEYE:
@@ -162,7 +164,8 @@ def _intrinsics(frame: Json, where: str, file: Path, downscaled: int) -> Intrins
         return Intrinsics("OPENCV_FISHEYE", (fx, fy, cx, cy, k1, k2, k3, k4), width, height)
     if model not in PERSPECTIVE:
         raise InputError(
-            f"{where}: expected a camera_model among {', '.join(PERSPECTIVE + FISHEYE)}, found {model!r}"
+            f"{where}: expected a camera_model among {', '.join(PERSPECTIVE + FISHEYE)} and EQUIRECTANGULAR, found "
+            f"{model!r}"
         )
     if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
         return Intrinsics("PINHOLE", (fx, fy, cx, cy), width, height)

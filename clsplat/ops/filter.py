@@ -10,9 +10,10 @@ from clsplat.camera import Camera
 from clsplat.constants import FILTER_VARIANCE
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.structs import camera_struct
+from clsplat.structs import camera_struct, lens_define
 
-DEFINES = {"FILTER_VARIANCE": FILTER_VARIANCE}
+# Of the kernels that see no camera; all are built together.
+DEFINES = {"FILTER_VARIANCE": FILTER_VARIANCE, "LENS": "PINHOLE"}
 
 
 def pixel_sizes(device: Device, gaussians: Gaussians, cameras: Iterable[Camera]) -> Any:
@@ -22,18 +23,19 @@ def pixel_sizes(device: Device, gaussians: Gaussians, cameras: Iterable[Camera])
     ----------
     gaussians : Gaussians of N >= 1 rows
     cameras : iterable of Camera
-        One sees a Gaussian whose centre lies beyond the near plane and in its image, enlarged as for the clamp.
+        One sees a Gaussian whose centre lies where it draws Gaussians and in its image, enlarged as for the clamp.
 
     Returns
     -------
     (N,)
-        depth/focal, in world units. Where no camera sees a Gaussian the largest of all; 0 where none sees any.
+        depth/focal (orthographic: 1/focal), in world units. Where no camera sees a Gaussian the largest of all; 0
+        where none sees any.
     """
     n = len(gaussians)
     result = device.upload("pixel sizes", np.full(n, np.inf))
     for camera in cameras:
         arguments = [n, camera_struct(camera, device.real), gaussians.means, result]
-        device.launch("filter", "pixel_sizes", (n,), arguments, defines=DEFINES)
+        device.launch("filter", "pixel_sizes", (n,), arguments, defines=DEFINES | {"LENS": lens_define(camera)})
     sizes = result.get()
     seen = np.isfinite(sizes)
     if not seen.all():

@@ -7,11 +7,11 @@ import numpy as np
 from clsplat.camera import Camera
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.stages import AdamStep, SplatGrads, Splats
-from clsplat.structs import adam_struct, camera_struct
+from clsplat.stages import AdamStep, CameraGrads, SplatGrads, Splats
+from clsplat.structs import adam_struct, camera_struct, lens_define
 
-# Work-group size of the backward kernel where it adds up the gradient of the viewmat: 3 KiB of local memory.
-VIEWMAT_GROUP = 64
+# Work-group size of the backward kernel where it adds up the camera's gradient: 4 KiB of local memory.
+CAMERA_GROUP = 64
 
 
 def project_fwd(
@@ -55,7 +55,12 @@ def project_fwd(
         "project_fwd",
         (n,),
         [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree, *g.arrays().values(), *splats],
-        defines={"CHANNELS": channels, "ANTIALIASED": int(antialiased), "VIEWMAT_GRAD": 0},
+        defines={
+            "CHANNELS": channels,
+            "ANTIALIASED": int(antialiased),
+            "CAMERA_GRAD": 0,
+            "LENS": lens_define(camera),
+        },
     )
     return splats
 
@@ -79,7 +84,7 @@ def project_disparities(device: Device, gaussians: Gaussians, camera: Camera, sp
     n, g = len(gaussians), gaussians
     result = device.empty("disparities", (n, 3))
     arguments = [n, camera_struct(camera, device.real), g.means, g.log_scales, g.quats, splats.extents, splats.conics]
-    defines = {"CHANNELS": splats.colors.shape[1], "ANTIALIASED": 0, "VIEWMAT_GRAD": 0}
+    defines = {"CHANNELS": splats.colors.shape[1], "ANTIALIASED": 0, "CAMERA_GRAD": 0, "LENS": lens_define(camera)}
     device.launch("project", "project_disparities", (n,), [*arguments, result], defines=defines)
     return result
 
@@ -93,9 +98,9 @@ def project_bwd(
     v_splats: SplatGrads,
     *,
     antialiased: bool = False,
-    viewmat_grad: bool = False,
-) -> tuple[Gaussians, np.ndarray[Any, Any] | None]:
-    """Gradients with respect to the Gaussians and, if asked for, the viewmat.
+    camera_grad: bool = False,
+) -> tuple[Gaussians, CameraGrads | None]:
+    """Gradients with respect to the Gaussians and, if asked for, the camera.
 
     Parameters
     ----------
@@ -110,8 +115,7 @@ def project_bwd(
     -------
     v_gaussians : Gaussians
         One gradient per field; 0 for invisible Gaussians.
-    v_viewmat : (4, 4) or None
-        Gradient with respect to each entry of the viewmat as an independent variable, its last row 0.
+    v_camera : CameraGrads or None
     """
     n, g = len(gaussians), gaussians
     empty: dict[str, Any] = {name: device.empty(f"v_{name}", array.shape) for name, array in g.arrays().items()}
@@ -131,33 +135,34 @@ def project_bwd(
     defines = {
         "CHANNELS": splats.colors.shape[1],
         "ANTIALIASED": int(antialiased),
-        "VIEWMAT_GRAD": int(viewmat_grad),
+        "CAMERA_GRAD": int(camera_grad),
+        "LENS": lens_define(camera),
     }
     return v, _backward(device, "project_bwd", n, arguments, defines)
 
 
 def _backward(
-    device: Device, kernel: str, n: int, arguments: list[Any], defines: dict[str, int]
-) -> np.ndarray[Any, Any] | None:
-    """Launch a backward kernel; the gradient with respect to the viewmat, if it is defined to write that."""
-    if not defines["VIEWMAT_GRAD"]:
+    device: Device, kernel: str, n: int, arguments: list[Any], defines: dict[str, Any]
+) -> CameraGrads | None:
+    """Launch a backward kernel; the gradients with respect to the camera, if it is defined to write them."""
+    if not defines["CAMERA_GRAD"]:
         device.launch("project", kernel, (n,), arguments, defines=defines)
         return None
-    groups = -(-n // VIEWMAT_GROUP)
-    partial = device.empty("v_viewmat", (groups, 12))
+    groups = -(-n // CAMERA_GROUP)
+    partial = device.empty("v_camera", (groups, 16))
     device.launch(
         "project",
         kernel,
-        (groups * VIEWMAT_GROUP,),
+        (groups * CAMERA_GROUP,),
         [*arguments, partial],
-        defines=defines | {"GROUP": VIEWMAT_GROUP},
-        group=(VIEWMAT_GROUP,),
+        defines=defines | {"GROUP": CAMERA_GROUP},
+        group=(CAMERA_GROUP,),
     )
     total = partial.get().astype(np.float64).sum(axis=0)
     v_viewmat = np.zeros((4, 4))
     v_viewmat[:3, :3] = total[:9].reshape(3, 3)
-    v_viewmat[:3, 3] = total[9:]
-    return v_viewmat
+    v_viewmat[:3, 3] = total[9:12]
+    return CameraGrads(v_viewmat, total[12:])
 
 
 def project_bwd_adam(
@@ -170,8 +175,8 @@ def project_bwd_adam(
     step: AdamStep,
     *,
     antialiased: bool = False,
-    viewmat_grad: bool = False,
-) -> np.ndarray[Any, Any] | None:
+    camera_grad: bool = False,
+) -> CameraGrads | None:
     """`project_bwd` and `adam_step` in one pass over the Gaussians, in place; arguments as theirs.
 
     Parameters
@@ -182,8 +187,7 @@ def project_bwd_adam(
 
     Returns
     -------
-    v_viewmat : (4, 4) or None
-        As `project_bwd`.
+    v_camera : CameraGrads or None
     """
     fields = [splats.extents, splats.conics, splats.colors, *v_splats]
     arrays = [array for part in (gaussians, *moments) for array in part.arrays().values()]
@@ -199,6 +203,7 @@ def project_bwd_adam(
     defines = {
         "CHANNELS": splats.colors.shape[1],
         "ANTIALIASED": int(antialiased),
-        "VIEWMAT_GRAD": int(viewmat_grad),
+        "CAMERA_GRAD": int(camera_grad),
+        "LENS": lens_define(camera),
     }
     return _backward(device, "project_bwd_adam", len(gaussians), arguments, defines)

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.constants import FILTER_VARIANCE, FRUSTUM_MARGIN, NEAR
+from clsplat.constants import FILTER_VARIANCE, FRUSTUM_MARGIN
 from clsplat.gaussians import Gaussians, sigmoid
+from clsplat.reference.lens import lens
 
 Array = NDArray[np.float64]
 
@@ -17,13 +18,13 @@ def pixel_sizes(gaussians: Gaussians, cameras: Iterable[Camera]) -> Array:
     """Smallest sizes of a pixel; arguments and result as `clsplat.ops.pixel_sizes`."""
     sizes = np.full(len(gaussians), np.inf)
     for camera in cameras:
-        x, y, z = camera.viewmat[:3, :3] @ gaussians.means.T.astype(np.float64) + camera.viewmat[:3, 3:]
+        points = gaussians.means.astype(np.float64) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
         with np.errstate(all="ignore"):
-            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            inside = np.abs(u / camera.width - 0.5) <= 0.5 + 0.5 * FRUSTUM_MARGIN
-            inside &= np.abs(v / camera.height - 0.5) <= 0.5 + 0.5 * FRUSTUM_MARGIN
-            seen = inside & (z > NEAR)
-        sizes[seen] = np.minimum(sizes, z / max(camera.fx, camera.fy))[seen]
+            f = lens(camera, points)
+            within = np.abs(f["means2d"] / [camera.width, camera.height] - 0.5) <= 0.5 + 0.5 * FRUSTUM_MARGIN
+            seen = f["seen"] & within.all(axis=1)
+            reach = np.ones(len(points)) if camera.model == "orthographic" else f["depths"]
+        sizes[seen] = np.minimum(sizes, reach / max(camera.fx, camera.fy))[seen]
     seen = np.isfinite(sizes)
     sizes[~seen] = sizes[seen].max(initial=0)
     return sizes

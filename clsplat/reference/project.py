@@ -14,14 +14,13 @@ from clsplat.constants import (
     BLUR,
     COMPENSATION_MIN,
     EXTENT_SLACK,
-    FRUSTUM_MARGIN,
-    NEAR,
     QUAT_NORM2_MIN,
 )
 from clsplat.gaussians import Gaussians, sigmoid
 from clsplat.reference.adam import adam_step
+from clsplat.reference.lens import lens
 from clsplat.reference.sh import sh_basis, sh_basis_jacobian
-from clsplat.stages import AdamStep, SplatGrads, Splats
+from clsplat.stages import AdamStep, CameraGrads, SplatGrads, Splats
 
 Array = NDArray[np.float64]
 
@@ -55,16 +54,8 @@ def _forward(gaussians: Gaussians, camera: Camera, sh_degree: int) -> dict[str, 
     g = gaussians.astype(np.float64)
     view, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     p = g.means @ view.T + translation
-    z = p[:, 2]
-    focal, size = np.array([camera.fx, camera.fy]), np.array([camera.width, camera.height])
-    centre = np.array([camera.cx, camera.cy])
-    slopes = p[:, :2] / z[:, None]
-    margin = FRUSTUM_MARGIN * 0.5 * size / focal
-    clamped = np.clip(slopes, -centre / focal - margin, (size - centre) / focal + margin)
-
-    jacobian = np.zeros((len(g), 2, 3))
-    jacobian[:, 0, 0], jacobian[:, 1, 1] = camera.fx / z, camera.fy / z
-    jacobian[:, :, 2] = -focal * clamped / z[:, None]
+    seen = lens(camera, p)
+    jacobian = seen["jacobian"]
     norm = np.linalg.norm(g.quats, axis=1)
     unit = g.quats / norm[:, None]
     rotation = rotations(unit)
@@ -74,13 +65,12 @@ def _forward(gaussians: Gaussians, camera: Camera, sh_degree: int) -> dict[str, 
     det0 = (normal**2).sum(axis=1)
     det = det0 + BLUR * (cov[:, 0, 0] + cov[:, 1, 1]) + BLUR**2
 
-    offset = g.means - camera.position
+    offset = np.tile(view[2], (len(g), 1)) if camera.model == "orthographic" else g.means - camera.position
     basis = sh_basis(offset / np.linalg.norm(offset, axis=1, keepdims=True), sh_degree)
     color = 0.5 + np.einsum("nk,nkc->nc", basis, g.sh[:, : basis.shape[1]])
     return dict(
-        g=g, p=p, focal=focal, slopes=slopes, clamped=clamped, jacobian=jacobian, norm=norm, unit=unit,
-        rotation=rotation, root=root, cov=cov, det0=det0, det=det, offset=offset, basis=basis, color=color,
-        means2d=slopes * focal + centre,
+        g=g, p=p, norm=norm, unit=unit, rotation=rotation, root=root, cov=cov, det0=det0, det=det, offset=offset,
+        basis=basis, color=color, **seen,
     )  # fmt: skip
 
 
@@ -98,7 +88,7 @@ def project_fwd(
         extents = np.sqrt(2 * threshold[:, None] * np.stack([cov[:, 0, 0], cov[:, 1, 1]], axis=1))
         colors = np.maximum(f["color"], 0)
         if channels == 4:
-            colors = np.concatenate([colors, f["p"][:, 2:]], axis=1)
+            colors = np.concatenate([colors, f["depths"][:, None]], axis=1)
         conics = np.stack([cov[:, 1, 1], -cov[:, 0, 1], cov[:, 0, 0]], axis=1) / f["det"][:, None]
 
         # The first and the last pixel centre inside the box exist and are in order.
@@ -107,11 +97,16 @@ def project_fwd(
         last = np.floor(np.clip(f["means2d"] + extents - 0.5, -1, size - 1))
         norm2 = f["norm"] ** 2
         finite = np.isfinite(
-            norm2 + f["det"] + (f["means2d"] + extents).sum(axis=1) + f["color"].sum(axis=1) + f["p"].sum(axis=1)
+            norm2
+            + f["det"]
+            + (f["means2d"] + extents).sum(axis=1)
+            + f["color"].sum(axis=1)
+            + f["p"].sum(axis=1)
+            + f["depths"]
         )
-        visible = finite & (f["p"][:, 2] > NEAR) & (norm2 >= QUAT_NORM2_MIN) & (threshold > 0)
+        visible = finite & f["seen"] & (norm2 >= QUAT_NORM2_MIN) & (threshold > 0)
         visible &= (first <= last).all(axis=1)
-    splats = Splats(f["means2d"], conics, f["p"][:, 2], extents, opacities, colors)
+    splats = Splats(f["means2d"], conics, f["depths"], extents, opacities, colors)
     return Splats(*(np.where(visible.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in splats))
 
 
@@ -122,8 +117,8 @@ def project_disparities(gaussians: Gaussians, camera: Camera, splats: Splats) ->
     """
     shown = splats.extents[:, 0] > 0
     f = _forward(gaussians.take(shown), camera, 0)
-    z, (a, b, c) = f["p"][:, 2], splats.conics[shown].T
-    depth_root = camera.viewmat[2, :3] @ f["rotation"] * f["g"].scales
+    z, (a, b, c) = f["depths"], splats.conics[shown].T
+    depth_root = np.einsum("nj,jk,nkl->nl", f["onward"], camera.viewmat[:3, :3], f["rotation"]) * f["g"].scales
     xz, yz = np.einsum("nij,nj->in", f["root"], depth_root)
     result = np.zeros((len(gaussians), 3))
     result[shown] = np.stack([1 / z, -(a * xz + b * yz) / z**2, -(b * xz + c * yz) / z**2], axis=1)
@@ -138,14 +133,14 @@ def project_bwd(
     v_splats: SplatGrads,
     *,
     antialiased: bool = False,
-    viewmat_grad: bool = False,
-) -> tuple[Gaussians, Array | None]:
+    camera_grad: bool = False,
+) -> tuple[Gaussians, CameraGrads | None]:
     """Gradients of `project_fwd`; arguments and result as `clsplat.ops.project_bwd`."""
     shown = splats.extents[:, 0] > 0
     rows = gaussians.take(shown)
     f = _forward(rows, camera, sh_degree)
     v_means2d, v_conics, v_opacities, v_colors = (np.asarray(v, dtype=np.float64)[shown] for v in v_splats)
-    view, g, z = camera.viewmat[:3, :3], f["g"], f["p"][:, 2]
+    view, g = camera.viewmat[:3, :3], f["g"]
 
     # conic = inverse of cov: v_cov = -Q V Q
     q = splats.conics[shown][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
@@ -173,16 +168,10 @@ def project_bwd(
     v_jacobian = v_turned @ view.T
     v_view = np.einsum("nij,nik->jk", f["jacobian"], v_turned)
 
-    # jacobian and means2d as functions of the slopes and z; the clamped slopes are constants where the clamp acts
-    v_slopes = v_means2d * f["focal"]
-    v_slopes -= np.where(f["clamped"] == f["slopes"], f["focal"] / z[:, None] * v_jacobian[:, :, 2], 0)
-    v_p = np.zeros_like(f["p"])
-    v_p[:, :2] = v_slopes / z[:, None]
-    diagonal = np.stack([v_jacobian[:, 0, 0], v_jacobian[:, 1, 1]], axis=1)
-    v_p[:, 2] = -(v_slopes * f["slopes"]).sum(axis=1) / z
-    v_p[:, 2] -= (f["focal"] * (diagonal - f["clamped"] * v_jacobian[:, :, 2])).sum(axis=1) / z**2
+    v_p = np.einsum("nij,ni->nj", f["slope_jacobian"], v_means2d)
+    v_p += np.einsum("nijk,nij->nk", f["hessian"], v_jacobian)
     if v_colors.shape[1] == 4:
-        v_p[:, 2] += v_colors[:, 3]
+        v_p += f["onward"] * v_colors[:, 3:]
 
     v_color = np.where(f["color"] > 0, v_colors[:, :3], 0)
     v_basis = np.einsum("nkc,nc->nk", g.sh[:, : f["basis"].shape[1]], v_color)
@@ -195,22 +184,29 @@ def project_bwd(
     result = Gaussians(
         np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4)), np.zeros(n), np.zeros(gaussians.sh.shape)
     )
-    result.means[shown] = v_p @ view + v_offset
+    orthographic = camera.model == "orthographic"
+    result.means[shown] = v_p @ view + (0 if orthographic else v_offset)
     result.log_scales[shown] = v_log_scales
     result.quats[shown] = v_quats
     result.logit_opacities[shown] = v_opacities * factor * opacities * (1 - opacities)
     v_sh = np.zeros((len(rows), *gaussians.sh.shape[1:]))
     v_sh[:, : f["basis"].shape[1]] = f["basis"][:, :, None] * v_color[:, None, :]
     result.sh[shown] = v_sh
-    if not viewmat_grad:
+    if not camera_grad:
         return result, None
 
-    # position = -view^-1 translation
-    v_translation = -np.linalg.solve(view.T, -v_offset.sum(axis=0))
     v_viewmat = np.zeros((4, 4))
-    v_viewmat[:3, :3] = v_view + v_p.T @ g.means + np.outer(v_translation, camera.position)
-    v_viewmat[:3, 3] = v_p.sum(axis=0) + v_translation
-    return result, v_viewmat
+    v_viewmat[:3, :3] = v_view + v_p.T @ g.means
+    v_viewmat[:3, 3] = v_p.sum(axis=0)
+    if orthographic:
+        v_viewmat[2, :3] += v_offset.sum(axis=0)
+    else:  # position = -view^-1 translation
+        v_translation = -np.linalg.solve(view.T, -v_offset.sum(axis=0))
+        v_viewmat[:3, :3] += np.outer(v_translation, camera.position)
+        v_viewmat[:3, 3] += v_translation
+    v_intrinsics = np.einsum("nic,ni->c", f["means2d_by"], v_means2d)
+    v_intrinsics += np.einsum("nijc,nij->c", f["jacobian_by"], v_jacobian)
+    return result, CameraGrads(v_viewmat, v_intrinsics)
 
 
 def project_bwd_adam(
@@ -222,11 +218,11 @@ def project_bwd_adam(
     step: AdamStep,
     *,
     antialiased: bool = False,
-    viewmat_grad: bool = False,
-) -> Array | None:
+    camera_grad: bool = False,
+) -> CameraGrads | None:
     """`project_bwd`, then `adam_step`; arguments as of `clsplat.ops.project_bwd_adam`."""
-    v, v_viewmat = project_bwd(
-        gaussians, camera, step.sh_degree, splats, v_splats, antialiased=antialiased, viewmat_grad=viewmat_grad
+    v, v_camera = project_bwd(
+        gaussians, camera, step.sh_degree, splats, v_splats, antialiased=antialiased, camera_grad=camera_grad
     )
     adam_step(gaussians, v, *moments, step)
-    return v_viewmat
+    return v_camera

@@ -1,0 +1,146 @@
+"""Equirectangular panoramas: as faces of a cube to train on, and resampled from faces when rendered."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clsplat.camera import Camera
+from clsplat.config import DataConfig
+from clsplat.constants import BLUR
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.io import load_scene
+from clsplat.lenses import Intrinsics, project
+from clsplat.panorama import FACES, assemble, face_size, faces
+from clsplat.render import render
+
+
+def pose(seed):
+    rng = np.random.default_rng(seed)
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = q * np.sign(np.linalg.det(q))
+    viewmat[:3, 3] = rng.normal(size=3)
+    return viewmat
+
+
+def sky(directions):
+    """A colour for each world direction (..., 3), without a seam; up to 240 levels per radian."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    return 127.5 + 60 * np.stack([np.sin(4 * x) + y, np.cos(4 * y) - z, np.sin(4 * z) + x], axis=-1)
+
+
+def pixel_directions(camera):
+    """World directions of all pixels, (H, W, 3)."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return camera.rays(u, v) @ camera.viewmat[:3, :3]
+
+
+def write_dataset(root, count, masks=False):
+    """Panoramas of 256 x 128 px of one sky, each in a pose of its own."""
+    frames = []
+    for k in range(count):
+        camera = Camera.panorama(pose(k), 256)
+        Image.fromarray(np.rint(sky(pixel_directions(camera))).astype(np.uint8)).save(root / f"{k}.png")
+        to_world = np.linalg.inv(camera.viewmat)
+        to_world[:, 1:3] *= -1  # OpenGL's axes
+        frames.append({"file_path": f"{k}.png", "transform_matrix": to_world.tolist()})
+        if masks:
+            Image.fromarray((pixel_directions(camera)[..., 0] > 0).astype(np.uint8) * 255).save(root / f"m{k}.png")
+            frames[-1]["mask_path"] = f"m{k}.png"
+    (root / "transforms.json").write_text(json.dumps({"camera_model": "EQUIRECTANGULAR", "frames": frames}))
+
+
+def test_faces_of_a_cube_are_rotations():
+    for face, rotation in FACES.items():
+        np.testing.assert_array_equal(rotation @ rotation.T, np.eye(3), err_msg=face)
+        assert np.linalg.det(rotation) == 1, face
+    assert {tuple(rotation[2]) for rotation in FACES.values()} == {tuple(s * e) for e in np.eye(3) for s in (1, -1)}
+
+
+def test_rays_are_colmaps():
+    """Where COLMAP sees the directions of pixels, on all sides."""
+    camera = Camera.panorama(np.eye(4), 64)
+    u, v = np.meshgrid(np.arange(64) + 0.5, np.arange(32) + 0.5)
+    pixels = project(Intrinsics("EQUIRECTANGULAR", (64.0, 32.0), 64, 32), 3 * camera.rays(u, v).reshape(-1, 3))
+    np.testing.assert_allclose(pixels.reshape(32, 64, 2), np.stack([u, v], axis=-1), atol=1e-9)
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_a_panorama_becomes_six_pinhole_views(tmp_path, downscale):
+    write_dataset(tmp_path, 1)
+    scene = load_scene(tmp_path, DataConfig(test_every=0, downscale=downscale))
+    assert [view.name for view in scene.train] == sorted(f"0_{face}.png" for face in FACES)
+    for view in scene.train:
+        camera = view.camera
+        # 256 px for 2 pi: 81 px for 90 degrees
+        assert (camera.model, camera.width, camera.height) == ("pinhole", 81 // downscale, 81 // downscale)
+        np.testing.assert_allclose(camera.position, Camera.panorama(pose(0), 256).position, atol=1e-9)
+        # Two roundings, and bilinear interpolation of second derivatives of 960 per radian^2 in steps of 1/41.
+        error = np.abs(view.image - sky(pixel_directions(camera)))
+        assert error.max() < 1.5 + 2 * 960 / 8 / 41**2 * (1 if downscale == 1 else 4), view.name
+
+
+def test_masks_become_faces_too(tmp_path):
+    write_dataset(tmp_path, 1, masks=True)
+    for view in load_scene(tmp_path, DataConfig(test_every=0)).train:
+        x = pixel_directions(view.camera)[..., 0]
+        clear = np.abs(x) > 0.03
+        np.testing.assert_array_equal(view.mask[clear], (x > 0)[clear])
+
+
+def test_faces_of_a_panorama_are_held_out_together(tmp_path):
+    write_dataset(tmp_path, 3)
+    scene = load_scene(tmp_path, DataConfig(test_every=2))
+    assert [view.name[0] for view in scene.test] == ["0"] * 6 + ["2"] * 6
+    assert [view.name[0] for view in scene.train] == ["1"] * 6
+
+
+def test_a_panorama_is_assembled_from_its_faces():
+    camera = Camera.panorama(pose(5), 200)
+    whole = assemble(camera, [sky(pixel_directions(face)) for face in faces(camera)])
+    error = np.abs(whole - sky(pixel_directions(camera)))
+    assert error.max() < 2 * 960 / 8 / (face_size(camera) / 2) ** 2
+
+
+DIRECTIONS = {
+    "front": (0.1, 0.1, 1),
+    "seam": (0, 0.2, -1),
+    "edge": (1, 0.3, 1),
+    "corner": (-1, -1, 1),
+    "down": (0.02, 1, 0.1),
+}
+
+
+@pytest.mark.parametrize("where", DIRECTIONS)
+def test_gaussians_appear_where_they_are(device, where):
+    """Centre of mass and distance of one Gaussian, at the seam and at the faces' edges too."""
+    camera = Camera.panorama(pose(1), 240)
+    direction = np.array(DIRECTIONS[where]) / np.linalg.norm(DIRECTIONS[where])
+    mean = camera.position + camera.viewmat[:3, :3].T @ direction * 5
+    one = Gaussians(mean[None], np.full((1, 3), np.log(0.25)), np.eye(1, 4), np.full(1, 3.0), np.full((1, 1, 3), 1.5))
+    rendering = render(one, camera, device=device, depth=True)
+    assert rendering.rgb.shape == (120, 240, 3)
+    directions = pixel_directions(camera) @ camera.viewmat[:3, :3].T
+    area = np.cos((np.arange(120) + 0.5 - 60) / camera.fy)[:, None]
+    centre = (directions * (rendering.alpha * area)[..., None]).sum(axis=(0, 1))
+    assert np.degrees(np.arccos(direction @ centre / np.linalg.norm(centre))) < 0.3  # a fifth of a pixel
+    seen = rendering.alpha > 0.5
+    # Within a face a splat has one depth z: distances vary over it, the more the farther from the face's middle.
+    assert np.average(rendering.depth[seen], weights=rendering.alpha[seen]) == pytest.approx(5, rel=0.02)
+    # The integral of alpha over the sphere: 2 pi sigma^2 times what opacity has over ALPHA_MIN. The blur is that of
+    # a face's pixels, which are smaller on the sphere in its corners.
+    solid_angle = (rendering.alpha * area).sum() / camera.fx / camera.fy
+    assert solid_angle == pytest.approx(2 * np.pi * (0.05**2 + BLUR / camera.fx**2) * 0.949, rel=0.08)
+
+
+def test_panoramas_have_no_gradients_and_may_be_empty():
+    camera = Camera.panorama(pose(1), 40)
+    one = Gaussians(np.ones((1, 3)), np.zeros((1, 3)), np.eye(1, 4), np.zeros(1), np.zeros((1, 1, 3)))
+    rendering = render(one, camera)
+    with pytest.raises(InputError, match="not equirectangular"):
+        rendering.backward(np.ones_like(rendering.rgb))
+    empty = render(one.take(np.zeros(0, int)), camera, background=(0.2, 0.4, 0.6))
+    np.testing.assert_array_equal(empty.rgb, np.broadcast_to([0.2, 0.4, 0.6], (20, 40, 3)))
