@@ -2,6 +2,7 @@
 
 from functools import lru_cache
 from math import ceil, pi
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,3 +73,10 @@ def face_positions(face: str, width: int, height: int, size: int) -> NDArray[np.
     columns = panorama.fx * np.arctan2(x, z) + panorama.cx
     rows = panorama.fy * np.arctan2(y, np.hypot(x, z)) + panorama.cy
     return np.stack([rows, columns]).astype(np.float32) - np.float32(0.5)
+
+
+def bordered(pixels: NDArray[Any]) -> NDArray[Any]:
+    """A panorama (H, W, ...) with a pixel more on each side: beyond a pole the opposite ones, and across the seam."""
+    half = pixels.shape[1] // 2
+    tall = np.concatenate([np.roll(pixels[:1], half, axis=1), pixels, np.roll(pixels[-1:], half, axis=1)])
+    return np.concatenate([tall[:, -1:], tall, tall[:, :1]], axis=1)

@@ -114,7 +114,7 @@ def test_imports_go_one_way(path):
 
 @pytest.mark.parametrize("path", [p for p in MODULES if unit_of(p) == "reference"], ids=lambda p: p.stem)
 def test_twins_import_numpy_only(path):
-    ours = {f"clsplat.{unit}" for unit in ("camera", "constants", "gaussians", "stages")}
+    ours = {f"clsplat.{unit}" for unit in ("camera", "constants", "errors", "gaussians", "stages")}
     for name in imports_of(path):
         allowed = name in ours or name.startswith("clsplat.reference.") or name.split(".")[0] == "numpy"
         assert allowed or name.split(".")[0] in sys.stdlib_module_names, name

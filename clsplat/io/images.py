@@ -17,7 +17,7 @@ from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, DataConfig
 from clsplat.errors import InputError
 from clsplat.lenses import Intrinsics, is_pinhole, project, rendered, undistorted
-from clsplat.panorama import FACES, face_positions, rotated
+from clsplat.panorama import FACES, bordered, face_positions, rotated
 from clsplat.photos import SUFFIXES, is_transparent, orientation, photo_size, read_mask, read_photo
 from clsplat.scene import View
 
@@ -282,7 +282,8 @@ def _plan(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> _Plan:
         )
     sx, sy = width / declared.width, height / declared.height
     if photo.face:
-        edge = round(width / np.pi)  # in the middle of a face, pixels are as small as on the panorama's equator
+        # In the middle of a face, pixels are as small as on the panorama's equator.
+        edge = round(width / np.pi / dataset.reduce) * dataset.reduce
         target = Intrinsics("PINHOLE", (edge / 2 / sx, edge / 2 / sy, edge / 2 / sx, edge / 2 / sy), 0, 0)
         across = down = edge
     else:
@@ -330,9 +331,7 @@ def _pixels(
     positions = None
     if photo.face:
         positions = face_positions(photo.face, image.shape[1], image.shape[0], camera.width * reduce) + 1
-        # Left of the first column lies the last.
-        image = np.pad(np.pad(image, ((0, 0), (1, 1), (0, 0)), "wrap"), ((1, 1), (0, 0), (0, 0)), "edge")
-        mask = None if mask is None else np.pad(np.pad(mask, ((0, 0), (1, 1)), "wrap"), ((1, 1), (0, 0)), "edge")
+        image, mask = bordered(image), None if mask is None else bordered(mask)
     elif camera.model == "pinhole" and not is_pinhole(photo.intrinsics):
         rows, columns = camera.height * reduce, camera.width * reduce
         positions = _positions(photo.intrinsics, plan.size, (rows, columns))
