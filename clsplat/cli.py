@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import tyro
@@ -44,10 +44,15 @@ COMMANDS = Devices | Frames | Sfm | Train | Eval | Render | View | Export | Comp
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``clsplat``: errors that are the user's to mend print one sentence and exit with 2."""
     warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
+    arguments = sys.argv[1:] if arguments is None else arguments
     command = tyro.cli(
         COMMANDS, prog="clsplat", args=arguments, description="3D Gaussian Splatting on any OpenCL device."
     )
     try:
+        if isinstance(command, Train) and (base := command.base()):
+            # Read again: flags are told from defaults by what they are put into.
+            start = replace(command, settings=base)
+            command = tyro.cli(Train, prog="clsplat train", args=arguments[1:], default=start)
         with driver_errors():
             command.run()
     except ClsplatError as error:
