@@ -17,7 +17,7 @@ from PIL import Image
 
 from clsplat.camera import Camera
 from clsplat.cli import main
-from clsplat.config import AdcConfig, DataConfig, TrainConfig
+from clsplat.config import DataConfig, FewViewsConfig, TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.io import FORMATS, load_gaussians, load_scene, save_gaussians
 from clsplat.metrics import to_uint8
@@ -184,8 +184,8 @@ def test_flags_count_more_than_a_preset(
     # 7000 is TrainConfig's own value: flags are not told by differing from it.
     seen: list[TrainConfig] = []
     monkeypatch.setattr("clsplat.commands.training.train_and_report", lambda scene, config, *_: seen.append(config))
-    run("train", dataset, "-o", tmp_path / "a", "--preset", "fast", "--iterations", 7000, "--adc.every", 7)
-    assert seen == [replace(load_preset("fast"), iterations=7000, adc=AdcConfig(every=7))]
+    run("train", dataset, "-o", tmp_path / "a", "--preset", "fast", "--iterations", 7000, "--few.below", 0)
+    assert seen == [replace(load_preset("fast"), iterations=7000, few=FewViewsConfig(below=0))]
     assert load_preset("fast").iterations != 7000
     assert "expected one of auto" in fails(capsys, "train", dataset, "-o", tmp_path / "b", "--preset", "nothing")
     both = ("--preset", "fast", "--config", "x.json")
