@@ -155,6 +155,8 @@ class AdcConfig:
     """Iterations between two resets of the opacities."""
     reset_opacity: float = 0.01
     """Opacities are lowered to at most this value at a reset; it lies above ALPHA_MIN, so that gradients survive."""
+    opacity_decay: float = 0.0
+    """Where above 0, opacities are not reset: each round takes this fraction of them, so that the image does not dip."""
     min_gaussians: int = 16
     """Pruning never leaves fewer, however transparent they are."""
 

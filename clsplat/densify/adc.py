@@ -52,7 +52,8 @@ class Adc(Strategy):
 
     def _resets(self, iteration: int) -> bool:
         early = self.white and iteration == self.first_edit
-        return iteration < self.stop and (early or iteration % self.config.reset_every == 0)
+        periodic = not self.config.opacity_decay and iteration % self.config.reset_every == 0
+        return iteration < self.stop and (early or periodic)
 
     def due(self, iteration: int) -> bool:
         """See `clsplat.densify.Strategy`."""
@@ -64,6 +65,8 @@ class Adc(Strategy):
         if self._densifies(iteration):
             edit = self._prune(iteration, self._densify(iteration, gaussians))
             self._clear(len(edit.rows))
+            if self.config.opacity_decay:
+                edit.gaussians.logit_opacities = logit(edit.gaussians.opacities * (1 - self.config.opacity_decay))
         if self._resets(iteration):
             lowered = Gaussians(**edit.gaussians.arrays())
             lowered.logit_opacities = np.minimum(

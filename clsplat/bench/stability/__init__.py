@@ -4,12 +4,14 @@ from clsplat.bench.stability import (
     coordinates,
     densities,
     gradients,
+    growth,
     images,
     order,
     photos,
     popping,
     projection,
     scales,
+    views,
 )
 from clsplat.bench.stability.experiment import Experiment
 
@@ -20,6 +22,8 @@ EXPERIMENTS: dict[str, Experiment] = {
     "popping": popping.POPPING,
     "poisoning": projection.POISONING,
     "needles": projection.NEEDLES,
+    "effective-rank": views.EFFECTIVE_RANK,
+    "jacobian": projection.JACOBIAN,
     "wide-angle": projection.WIDE_ANGLE,
     "scales": scales.SCALE,
     "exposure": photos.EXPOSURE,
@@ -28,6 +32,10 @@ EXPERIMENTS: dict[str, Experiment] = {
     "dark-areas": photos.DARK_AREAS,
     "constants": gradients.CONSTANTS,
     "everything-pruned": densities.ALL_PRUNED,
+    "opacity-reset": growth.OPACITY_RESET,
+    "blow-up": growth.BLOW_UP,
+    "random-start": growth.RANDOM_START,
+    "sh-extrapolation": views.EXTRAPOLATION,
     "dead-gaussians": densities.DEAD,
     "images": images.KINDS,
 }

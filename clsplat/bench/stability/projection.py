@@ -10,7 +10,7 @@ from clsplat import reference
 from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
-from clsplat.constants import ALPHA_MAX, ALPHA_MIN, BLUR, EXTENT_SLACK
+from clsplat.constants import ALPHA_MAX, ALPHA_MIN, BLUR, EXTENT_SLACK, NEAR
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.reference.project import rotations
@@ -112,6 +112,21 @@ def _determinants(device: Device, data: Path | None) -> Found:
             series[label].append((float(length), 100 * float(wrong.mean())))
     figures = [Figure(label, points[-1][1] or 0.0, "%") for label, points in series.items()]
     return Found(figures, Plot("length of the needle, px", "determinants off by more than 1 %, %", series, "x"))
+
+
+def _jacobian(device: Device, data: Path | None) -> Found:
+    """Extents of a ball of 0.5 just above the near plane, 40 half fields of view beside the image, against those of
+    the same ball on the axis."""
+    camera = Camera(np.eye(4), 50, 50, 50, 50, 100, 100)
+    balls = synthetic_scene(2)[0]
+    balls.means[:] = np.array([[0, 0, 1.0], [40, 0, 1]]) * 1.05 * NEAR
+    balls.log_scales[:] = np.log(0.5)
+    splats = reference.project_fwd(balls, camera, 0)
+    # Without a limit the Jacobian's first row is f/z (1, 0, -x/z).
+    free = np.hypot(1, balls.means[:, 0] / balls.means[:, 2])
+    lengths = splats.extents[:, 0] / np.sqrt(2 * (np.log(balls.opacities / ALPHA_MIN) + EXTENT_SLACK))
+    bounded = lengths[1] / lengths[0] if lengths[1] else 0.0
+    return Found([Figure("no limit", float(free[1] / free[0])), Figure("slopes clamped", float(bounded))])
 
 
 def shell(n: int) -> Gaussians:
@@ -220,6 +235,15 @@ NEEDLES = Experiment(
     test="tests/stability/test_projection.py::test_needles_keep_their_determinant",
     measure=_determinants,
     figure="determinants off by more than 1 %, of needles 1e5 px long",
+)
+
+JACOBIAN = Experiment(
+    failure="Jacobian off the frustum and at the near plane",
+    source="diff-gaussian-rasterization #75",
+    remedy="slopes clamped to the enlarged image; no gradient of the clamped ones",
+    test="tests/stability/test_projection.py::test_extents_stay_bounded_beside_the_image",
+    measure=_jacobian,
+    figure="a ball's extent 40 half images beside the image, in those of one in the middle; 0: not drawn",
 )
 
 WIDE_ANGLE = Experiment(

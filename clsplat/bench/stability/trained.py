@@ -16,9 +16,10 @@ from clsplat.scene import Scene
 
 SCENES = {
     "fern": TrainConfig(iterations=500, eval_every=0, data=DataConfig(downscale=8)),
+    "fox_pinhole": TrainConfig(iterations=500, eval_every=0, data=DataConfig(downscale=8)),
     "castle_p30": TrainConfig(iterations=500, eval_every=0, data=DataConfig(downscale=8)),
 }
-"""Folder of the scene -> how it is trained: fern at 120x90, castle_p30 at 96x64."""
+"""Folder of the scene -> how it is trained: fern at 120x90, fox_pinhole at 67x120, castle_p30 at 96x64."""
 
 
 def load(data: Path | None, name: str) -> tuple[Scene, TrainConfig]:

@@ -1,0 +1,147 @@
+"""Experiments on densification: resets of opacities, photos that nothing explains, starts without points."""
+
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
+from clsplat.bench.stability.small import CONFIG, small_scene, with_train
+from clsplat.bench.stability.trained import held_out, load, trained
+from clsplat.config import AdcConfig, TrainConfig
+from clsplat.device import Device
+from clsplat.evaluate import mean_metrics
+from clsplat.scene import Scene, View
+from clsplat.train import train
+
+RESET_CONFIG = replace(
+    CONFIG, iterations=600, max_gaussians=None, adc=replace(CONFIG.adc, every=25, reset_every=150, start=50)
+)
+AFTER = (-1, 0, 5, 10, 20, 40)
+"""Iterations from a reset at which the held-out photos are looked at; the rounds lie between 0 and 40."""
+
+CAP = 300
+"""Of Gaussians, for photos that nothing explains."""
+
+START_CAP = 6000
+START_SIZES = {"1x": 1 / 3, "3x": 1.0}
+"""Boxes of the random start: the default, and three times as large."""
+
+
+def around_reset(adc: AdcConfig, scene: Scene, device: Device) -> tuple[list[float], float]:
+    """PSNR of held-out photos at `AFTER` from the second reset, and at the end, dB."""
+    config, found = replace(RESET_CONFIG, adc=adc), []
+
+    def look(gaussians: object) -> dict[str, float]:
+        found.append(mean_metrics(gaussians, scene.test, config.render, device)["psnr"])  # type: ignore[arg-type]
+        return {}
+
+    marks = [2 * RESET_CONFIG.adc.reset_every + after for after in AFTER]
+    with TemporaryDirectory() as out:
+        train(scene, config, device, Path(out), evaluate=look, evaluate_after=[*marks, config.iterations])
+    return found[:-1], found[-1]
+
+
+def _reset(device: Device, data: Path | None) -> Found:
+    scene, adc = small_scene(device), replace(RESET_CONFIG.adc, stop_fraction=0.8)
+    variants = {
+        "reset": adc,
+        "--adc.opacity-decay 0.05": replace(adc, opacity_decay=0.05),
+        "--adc.opacity-decay 0.5": replace(adc, opacity_decay=0.5),
+    }
+    figures, ends, series = [], [], {}
+    for label, settings in variants.items():
+        curve, end = around_reset(settings, scene, device)
+        figures.append(Figure(f"{label}, dip", curve[0] - min(curve), "dB"))
+        ends.append(Figure(f"{label}, at the end", end, "dB"))
+        points: list[tuple[float, float | None]] = [(float(x), y) for x, y in zip(AFTER, curve, strict=True)]
+        series[label] = points
+    return Found([*figures, *ends], Plot("iterations after the reset", "PSNR of held-out photos, dB", series))
+
+
+def noise(view: View, rng: np.random.Generator) -> View:
+    """Each pixel another colour, in each photo anew."""
+    return replace(view, image=rng.integers(0, 256, view.image.shape, dtype=np.uint8))
+
+
+def checkerboard(view: View, rng: np.random.Generator) -> View:
+    """Black and white squares of two pixels, moved in each photo."""
+    y, x = np.indices(view.image.shape[:2]) + rng.integers(0, 4, 2)[:, None, None]
+    white = (x // 2 + y // 2) % 2 == 0
+    return replace(view, image=np.where(white[:, :, None], np.uint8(255), np.uint8(0)).repeat(3, axis=2))
+
+
+def largest_number(scene: Scene, config: TrainConfig, device: Device) -> int:
+    """The most Gaussians that there are in any iteration."""
+    most = 0
+
+    def watch(record: dict[str, object]) -> None:
+        nonlocal most
+        most = max(most, int(record["num_gaussians"]))  # type: ignore[call-overload]
+
+    with TemporaryDirectory() as out:
+        train(scene, config, device, Path(out), progress=watch)
+    return most
+
+
+def _blow_up(device: Device, data: Path | None) -> Found:
+    scene, figures = small_scene(device), []
+    config = replace(CONFIG, iterations=400, adc=replace(CONFIG.adc, every=25))
+    for label, photos in {
+        "scene": scene,
+        "noise": with_train(scene, noise),
+        "checkerboard": with_train(scene, checkerboard),
+    }.items():
+        for cap in (None, CAP):
+            asked = replace(config, max_gaussians=cap)
+            figures.append(
+                Figure(f"{label}, {f'cap {cap}' if cap else 'no cap'}", largest_number(photos, asked, device))
+            )
+    # Without the remedy first: what noise makes of no cap.
+    return Found([figures[2], *figures[:2], *figures[3:]])
+
+
+def _random_start(device: Device, data: Path | None) -> Found:
+    scene, config = load(data, "fox_pinhole")
+    config = replace(config, max_gaussians=START_CAP)
+    none = replace(scene, points=scene.points[:0], colors=scene.colors[:0])
+    figures = []
+    for strategy in ("adc", "mcmc", "error"):
+        asked = replace(config, strategy=strategy)
+        best = held_out(trained(scene, asked, device), scene, asked, device)
+        for label, size in START_SIZES.items():
+            start = replace(asked, init=replace(asked.init, random_extent=size, random_points=START_CAP // 2))
+            loss = best - held_out(trained(none, start, device), scene, start, device)
+            figures.append(Figure(f"{strategy}, box {label}", loss, "dB"))
+    return Found(figures)
+
+
+OPACITY_RESET = Experiment(
+    failure="opacity reset",
+    source="gsplat #1011, #1012: dips of 2.7 to 7.6 dB",
+    remedy="a fraction of the opacities taken in each round instead (`--adc.opacity-decay`)",
+    test="tests/stability/test_growth.py::test_opacities_that_decay_make_no_dip",
+    measure=_reset,
+    figure="PSNR of held-out photos before a reset, less the lowest in the 40 iterations after it; 40 balls, 40x32",
+)
+
+BLOW_UP = Experiment(
+    failure="densification blow-up",
+    source="poison-splat, Lu et al. 2024: 1.7 to 4 times the Gaussians",
+    remedy="a hard cap, the largest gradients first (`--max-gaussians`); memory is foretold (`--memory-limit`)",
+    test="tests/stability/test_growth.py::test_photos_that_nothing_explains_stay_under_the_cap",
+    measure=_blow_up,
+    figure="the most Gaussians in any of 400 iterations, from 40 points",
+)
+
+RANDOM_START = Experiment(
+    failure="no points (random start)",
+    source="Kheradmand et al. 2024: 3DGS loses 5 dB, MCMC 0.1 dB",
+    remedy="a strategy that moves Gaussians to where they are needed (`--strategy mcmc`, `error`)",
+    test="tests/stability/test_growth.py::test_a_random_start_costs_little",
+    measure=_random_start,
+    figure="what a random start costs held-out photos of fox_pinhole, 67x120, 500 iterations, "
+    f"at most {START_CAP} Gaussians, boxes of once and three times the default",
+    needs_data=True,
+)

@@ -1,0 +1,44 @@
+"""Every known failure has an experiment, and so a row on the page Stability, which is open where nothing helps."""
+
+import pytest
+
+from clsplat.bench.stability import EXPERIMENTS
+
+FAILURES = {
+    "singular covariance, zero quaternion, Inf/NaN parameters": ["poisoning", "needles"],
+    "Jacobian off the frustum and at the near plane": ["jacobian"],
+    "wide-angle projection error": ["wide-angle"],
+    "dilation and aliasing at other scales": ["scales"],
+    "popping when turning": ["popping"],
+    "needles": ["effective-rank"],
+    "forward/backward constants differ, saturated alpha": ["constants"],
+    "opacity reset": ["opacity-reset"],
+    "everything pruned": ["everything-pruned"],
+    "densification blow-up, out of memory": ["blow-up"],
+    "dead Gaussians left by MCMC": ["dead-gaussians"],
+    "few views": ["few-views"],
+    "no points (random start)": ["random-start"],
+    "exposure changes": ["exposure"],
+    "wrong or NaN poses, reflected rotation": ["poses"],
+    "geo-referenced coordinates": ["world-offset"],
+    "equal depths": ["equal-depths"],
+    "runs that differ": ["repeated-runs"],
+    "SH extrapolation": ["sh-extrapolation"],
+    "dark areas turning transparent": ["dark-areas"],
+    "floaters near cameras": ["floaters"],
+    "images of mixed size, orientation, EXIF rotation, 16-bit, grey, RGBA, CMYK, corrupt": ["images"],
+}
+"""Known from papers and issue threads -> what measures it."""
+
+OPEN = {"wide-angle"}
+"""Without a remedy."""
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+def test_a_failure_is_measured(failure):
+    assert set(FAILURES[failure]) <= set(EXPERIMENTS)
+
+
+def test_nothing_else_is_measured_and_what_is_open_is_known():
+    assert {name for names in FAILURES.values() for name in names} == set(EXPERIMENTS)
+    assert {name for name, experiment in EXPERIMENTS.items() if experiment.remedy is None} == OPEN

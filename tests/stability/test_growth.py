@@ -1,0 +1,43 @@
+"""Densification: resets of opacities, photos that nothing explains, starts without points."""
+
+from dataclasses import replace
+
+import pytest
+
+from clsplat.bench.stability.growth import (
+    CAP,
+    RESET_CONFIG,
+    _random_start,
+    around_reset,
+    checkerboard,
+    largest_number,
+    noise,
+)
+from clsplat.bench.stability.small import CONFIG, small_scene, with_train
+
+
+def test_opacities_that_decay_make_no_dip(device):
+    """gsplat #1011, #1012: after a reset to 0.01 the image is gone, and comes back over many iterations."""
+    scene = small_scene(device)
+    dip = {}
+    for decay in (0.0, 0.05):
+        curve, _ = around_reset(replace(RESET_CONFIG.adc, stop_fraction=0.8, opacity_decay=decay), scene, device)
+        dip[decay] = curve[0] - min(curve)
+    assert dip[0.0] > 3 > 1 > dip[0.05]
+
+
+@pytest.mark.parametrize("photos", [noise, checkerboard])
+def test_photos_that_nothing_explains_stay_under_the_cap(device, photos):
+    """poison-splat (Lu et al. 2024): every iteration's gradients ask for more Gaussians."""
+    scene = with_train(small_scene(device), photos)
+    config = replace(CONFIG, iterations=200, adc=replace(CONFIG.adc, every=25))
+    assert largest_number(scene, replace(config, max_gaussians=CAP), device) <= CAP
+    assert largest_number(scene, replace(config, max_gaussians=None), device) > CAP
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+def test_a_random_start_costs_little(device, shared):
+    """Kheradmand et al. 2024: 3DGS loses 5 dB, strategies that move Gaussians next to nothing."""
+    losses = {figure.label: figure.value for figure in _random_start(device, shared / "data").figures}
+    assert min(losses["error, box 1x"], losses["mcmc, box 1x"]) < losses["adc, box 3x"]
