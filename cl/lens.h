@@ -49,7 +49,7 @@ static inline real2 lens_centre(const Camera *camera, real3 p) {
 }
 
 static inline bool lens_sees(const Camera *camera, real3 p) {
-    return p.z > NEAR;
+    return p.z > camera->near;
 }
 
 static inline Lens lens(const Camera *camera, real3 p) {
@@ -93,7 +93,7 @@ static inline real2 lens_centre(const Camera *camera, real3 p) {
 }
 
 static inline bool lens_sees(const Camera *camera, real3 p) {
-    return p.z > NEAR;
+    return p.z > camera->near;
 }
 
 static inline Lens lens(const Camera *camera, real3 p) {
@@ -156,7 +156,7 @@ static inline real2 lens_centre(const Camera *camera, real3 p) {
 
 static inline bool lens_sees(const Camera *camera, real3 p) {
     const real r = sqrt(dot3(p, p));
-    return r > NEAR && p.z > r * camera->cos_max;
+    return r > camera->near && p.z > r * camera->cos_max;
 }
 
 static inline Lens lens(const Camera *camera, real3 p) {

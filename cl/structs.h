@@ -10,6 +10,7 @@ typedef struct {
     real fx, fy, cx, cy; // px
     real k1, k2, k3, k4; // FISHEYE: of its polynomial (lens.h)
     real cos_max;        // FISHEYE: cosine of the largest angle from the axis that is drawn
+    real near;           // depth up to which nothing is drawn, world units
     int width, height;   // px
 } Camera;
 

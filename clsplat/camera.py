@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat import display
-from clsplat.constants import FISHEYE_ANGLE_MAX, FRUSTUM_MARGIN
+from clsplat.constants import FISHEYE_ANGLE_MAX, FRUSTUM_MARGIN, NEAR
 from clsplat.errors import InputError
 
 CameraModel = Literal["pinhole", "orthographic", "fisheye", "equirectangular"]
@@ -39,6 +39,8 @@ class Camera:
     model : {"pinhole", "orthographic", "fisheye", "equirectangular"}
     distortion : tuple of 4 floats
         k1 to k4 of a fisheye; 0 for the others.
+    near : float
+        Depth (distance, for a fisheye) in world units up to which nothing is drawn; positive.
 
     Raises
     ------
@@ -57,6 +59,7 @@ class Camera:
     height: int
     model: CameraModel = "pinhole"
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    near: float = NEAR
 
     def __post_init__(self) -> None:
         if self.model not in get_args(CameraModel):
@@ -80,6 +83,8 @@ class Camera:
             raise InputError(f"camera: expected positive focal lengths, found fx={self.fx}, fy={self.fy}")
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: expected a size of at least 1x1, found {self.width}x{self.height}")
+        if not 0 < self.near <= np.finfo(np.float32).max:
+            raise InputError(f"near: expected a positive depth, found {self.near}")
         rotation = viewmat[:3, :3]
         # 1e-3 admits poses printed with four digits; a scaled or sheared matrix would render a wrong scene silently.
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:

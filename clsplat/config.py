@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from clsplat.constants import TILE
+from clsplat.constants import NEAR, TILE
 
 Mode = Literal["classic", "antialiased"]
 Background = Literal["black", "white"]
@@ -35,6 +35,9 @@ class RenderConfig:
     tiles (global), or within each tile afterwards (per_tile). Changes speed, not the image; auto takes global, the
     faster one where measured. pixel sorts anew in each pixel, by where its ray meets the Gaussians: nothing pops when
     the camera turns, but it is slower (StopThePop)."""
+    near: float = NEAR
+    """Depth in world units up to which nothing is drawn (the original: 0.2). Gaussians that a camera nearly touches,
+    of a wall beside the photographer for example, spread over the whole image: a view spoilt by one wants more."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +159,7 @@ class AdcConfig:
     reset_opacity: float = 0.01
     """Opacities are lowered to at most this value at a reset; it lies above ALPHA_MIN, so that gradients survive."""
     opacity_decay: float = 0.0
-    """Where above 0, opacities are not reset: each round takes this fraction of them, so that the image does not dip."""
+    """Where above 0, opacities are not reset: each round takes this fraction of them, and the image does not dip."""
     min_gaussians: int = 16
     """Pruning never leaves fewer, however transparent they are."""
 

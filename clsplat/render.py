@@ -1,7 +1,7 @@
 """Rendering and its gradients: the stages in their order, on a device or by the float64 twins."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clsplat import display, panorama, reference
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
+from clsplat.constants import NEAR
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.scene import Color
@@ -89,6 +90,8 @@ def forward(
         Which splats are left out while training.
     """
     stage = stage_functions(device)
+    if config.near != NEAR:
+        camera = replace(camera, near=config.near)
     antialiased = config.mode == "antialiased"
     splats = stage.project_fwd(gaussians, camera, sh_degree, antialiased=antialiased, channels=len(background))
     if dropout:

@@ -22,6 +22,7 @@ def camera_struct(camera: Camera, real: Any) -> np.ndarray:
             ("intrinsics", real, 4),
             ("distortion", real, 4),
             ("cos_max", real),
+            ("near", real),
             ("size", "i4", 2),
         ]
     )
@@ -32,6 +33,7 @@ def camera_struct(camera: Camera, real: Any) -> np.ndarray:
     struct["intrinsics"] = camera.fx, camera.fy, camera.cx, camera.cy
     if camera.model == "fisheye":
         struct["distortion"], struct["cos_max"] = camera.distortion, np.cos(camera.angle_max)
+    struct["near"] = camera.near
     struct["size"] = camera.width, camera.height
     return struct
 

@@ -141,6 +141,20 @@ def test_reset_lowers_opacities_and_clears_their_moments() -> None:
     assert (edit.rows == np.arange(N)).all()
 
 
+def test_opacities_decay_in_the_place_of_resets() -> None:
+    config = replace(CONFIG, adc=replace(CONFIG.adc, reset_every=100, opacity_decay=0.1))
+    strategy, gaussians = observed(config, rows=slice(0, 0))
+    gaussians.logit_opacities[:16] = -200  # of opacity 0; the least number keeps them
+    gaussians.logit_opacities[16:] = [-300] * (N - 16)
+    edit = strategy.edit(100, gaussians, survey)
+    assert np.isfinite(edit.gaussians.logit_opacities).all()
+    strategy, gaussians = observed(config, rows=slice(0, 0))
+    edit = strategy.edit(100, gaussians, survey)
+    assert not edit.reset_opacities
+    np.testing.assert_allclose(edit.gaussians.opacities, 0.45, rtol=1e-5)
+    assert not strategy.due(150), "nothing resets between rounds"
+
+
 @pytest.mark.parametrize("background", ["black", "white"])
 def test_on_white_the_first_round_resets(background: str) -> None:
     config = replace(CONFIG, data=replace(CONFIG.data, background=background))

@@ -66,7 +66,9 @@ class Adc(Strategy):
             edit = self._prune(iteration, self._densify(iteration, gaussians))
             self._clear(len(edit.rows))
             if self.config.opacity_decay:
-                edit.gaussians.logit_opacities = logit(edit.gaussians.opacities * (1 - self.config.opacity_decay))
+                edit.gaussians.logit_opacities = logit(
+                    np.maximum(edit.gaussians.opacities * (1 - self.config.opacity_decay), np.finfo(np.float32).tiny)
+                )
         if self._resets(iteration):
             lowered = Gaussians(**edit.gaussians.arrays())
             lowered.logit_opacities = np.minimum(

@@ -21,7 +21,7 @@ def test_opacities_that_decay_make_no_dip(device):
     scene = small_scene(device)
     dip = {}
     for decay in (0.0, 0.05):
-        curve, _ = around_reset(replace(RESET_CONFIG.adc, stop_fraction=0.8, opacity_decay=decay), scene, device)
+        curve, _ = around_reset(replace(RESET_CONFIG.adc, opacity_decay=decay), scene, device)
         dip[decay] = curve[0] - min(curve)
     assert dip[0.0] > 3 > 1 > dip[0.05]
 
@@ -30,7 +30,7 @@ def test_opacities_that_decay_make_no_dip(device):
 def test_photos_that_nothing_explains_stay_under_the_cap(device, photos):
     """poison-splat (Lu et al. 2024): every iteration's gradients ask for more Gaussians."""
     scene = with_train(small_scene(device), photos)
-    config = replace(CONFIG, iterations=200, adc=replace(CONFIG.adc, every=25))
+    config = replace(CONFIG, iterations=150, adc=replace(CONFIG.adc, every=25))
     assert largest_number(scene, replace(config, max_gaussians=CAP), device) <= CAP
     assert largest_number(scene, replace(config, max_gaussians=None), device) > CAP
 

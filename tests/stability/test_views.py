@@ -1,14 +1,37 @@
 """What no photo shows: colours from other directions, needles."""
 
-from clsplat.bench.stability.views import ERANK_PENALTY, needles, unseen_colors
+import numpy as np
+import pytest
+
+from clsplat.bench.stability.views import FAR_ENOUGH, _effective_rank, unseen_side
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig
+from clsplat.render import render
+from clsplat.testing import synthetic_scene
 
 
 def test_unseen_sides_keep_their_colour(device):
     """Bands that four photos do not constrain take any colour on the other side."""
-    assert unseen_colors(3, device)[0] > 1.5 * unseen_colors(1, device)[0]
+    assert unseen_side(0, device) > unseen_side(3, device) + 0.6  # measured: 22.6 and 21.4 dB
 
 
-def test_the_regulariser_leaves_fewer_needles(device):
+@pytest.mark.slow
+@pytest.mark.shared
+def test_the_regulariser_leaves_fewer_needles(device, shared):
     """Effective rank, Hyung et al. 2024."""
-    plain, regular = (needles(p, device)[0] for p in (0.0, ERANK_PENALTY))
+    plain, regular, *_ = (figure.value for figure in _effective_rank(device, shared / "data").figures)
     assert plain > 2 * regular
+
+
+def test_what_a_camera_nearly_touches_stays_out_of_the_image(any_device):
+    """A ball of 0.1 beside the camera, 0.1 in front of its plane and 50 degrees above its axis: as found on
+    castle_p30, where it covered a held-out photo. The affine projection does not hold there."""
+    camera = Camera(np.eye(4), 95, 95, 48, 32, 96, 64)
+    ball = synthetic_scene(1, sh_degree=0)[0]
+    ball.means[:], ball.log_scales[:], ball.logit_opacities[:] = [0, -0.12, 0.1], np.log(0.1), 3
+    gaussians = ball.astype(any_device.real)
+    covered = {
+        near: render(gaussians, camera, RenderConfig(near=near), any_device, gradients=False).alpha.mean()
+        for near in (0.01, FAR_ENOUGH)
+    }
+    assert covered[0.01] > 0.3 and covered[FAR_ENOUGH] == 0

@@ -29,6 +29,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "exposure": photos.EXPOSURE,
     "poses": photos.POSES,
     "few-views": photos.FEW_VIEWS,
+    "floaters": views.FLOATERS,
     "dark-areas": photos.DARK_AREAS,
     "constants": gradients.CONSTANTS,
     "everything-pruned": densities.ALL_PRUNED,

@@ -16,7 +16,7 @@ from clsplat.scene import Scene, View
 from clsplat.train import train
 
 RESET_CONFIG = replace(
-    CONFIG, iterations=600, max_gaussians=None, adc=replace(CONFIG.adc, every=25, reset_every=150, start=50)
+    CONFIG, iterations=400, adc=replace(CONFIG.adc, every=25, reset_every=150, start=50, stop_fraction=0.8)
 )
 AFTER = (-1, 0, 5, 10, 20, 40)
 """Iterations from a reset at which the held-out photos are looked at; the rounds lie between 0 and 40."""
@@ -44,7 +44,7 @@ def around_reset(adc: AdcConfig, scene: Scene, device: Device) -> tuple[list[flo
 
 
 def _reset(device: Device, data: Path | None) -> Found:
-    scene, adc = small_scene(device), replace(RESET_CONFIG.adc, stop_fraction=0.8)
+    scene, adc = small_scene(device), RESET_CONFIG.adc
     variants = {
         "reset": adc,
         "--adc.opacity-decay 0.05": replace(adc, opacity_decay=0.05),
