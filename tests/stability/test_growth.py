@@ -22,7 +22,7 @@ def test_opacities_that_decay_make_no_dip(device):
     for decay in (0.0, 0.05):
         curve, _ = around_reset(replace(RESET_CONFIG.adc, opacity_decay=decay), scene, device)
         dip[decay] = curve[0] - min(curve)
-    # Measured: 17.8 dB and 2.8 dB, most of which are the round's own splits.
+    # Measured: 17.8 dB and 2.8 dB.
     assert dip[0.0] > 10 > 5 > dip[0.05]
 
 
