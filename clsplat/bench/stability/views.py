@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from clsplat.constants import NEAR
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.scene import Scene, View
+
+Degree = Literal[0, 1, 2, 3]
 
 NEEDLE = 1.1
 """Effective rank below which a Gaussian counts as a needle (Hyung et al. 2024): 1 is a line, 2 a disc."""
@@ -34,7 +37,7 @@ def one_side(scene: Scene) -> Scene:
     return replace(scene, train=scene.train[:4], test=scene.test[1:])
 
 
-def unseen_side(degree: int, device: Device) -> float:
+def unseen_side(degree: Degree, device: Device) -> float:
     """PSNR of photos of the unseen side after a training of so many bands, dB."""
     scene = one_side(small_scene(device))
     config = replace(CONFIG, init=replace(CONFIG.init, sh_degree=degree))
@@ -44,7 +47,7 @@ def unseen_side(degree: int, device: Device) -> float:
 
 
 def _extrapolation(device: Device, data: Path | None) -> Found:
-    degrees = {3: "degree 3", 1: "--few.sh-degree 1", 0: "--few.sh-degree 0"}
+    degrees: dict[Degree, str] = {3: "degree 3", 1: "--few.sh-degree 1", 0: "--few.sh-degree 0"}
     return Found([Figure(label, unseen_side(degree, device), "dB") for degree, label in degrees.items()])
 
 
