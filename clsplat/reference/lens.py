@@ -38,7 +38,10 @@ def lens(camera: Camera, points: Array) -> dict[str, Any]:
         slopes, slope_jacobian = points[:, :2], np.tile(np.eye(2, 3), (n, 1, 1))
     elif camera.model == "fisheye":
         depths = np.linalg.norm(points, axis=1)
-        onward, seen = points / depths[:, None], (depths > camera.near) & (np.arctan2(np.hypot(x, y), z) < camera.angle_max)
+        onward, seen = (
+            points / depths[:, None],
+            (depths > camera.near) & (np.arctan2(np.hypot(x, y), z) < camera.angle_max),
+        )
         s, gradient, second = _radial(camera, points)
         # (x s)_jk = e_j s_k + e_k s_j + x s_jk, and with y
         slopes = points[:, :2] * s[:, None]
