@@ -151,7 +151,7 @@ class Camera:
         return np.stack([a * across, b * across, np.cos(angle)], axis=-1)
 
     def _repr_html_(self) -> str:
-        rows = {"model": self.model} if self.model != "pinhole" else {}
+        rows: dict[str, str] = {"model": self.model} if self.model != "pinhole" else {}
         if self.model in ("pinhole", "fisheye"):
             middle = self.rays([0, self.width, self.cx, self.cx], [self.cy, self.cy, 0, self.height])
             angles = np.degrees(np.arctan2(np.hypot(middle[:, 0], middle[:, 1]), middle[:, 2]))
@@ -209,7 +209,9 @@ def _fisheye_radius(angle: ArrayLike, distortion: tuple[float, ...]) -> NDArray[
     return np.asarray(theta * np.polyval([*reversed(distortion), 1.0], theta**2))
 
 
-def _fisheye_angle(radius: ArrayLike, distortion: tuple[float, ...], most: float) -> NDArray[np.float64]:
+def _fisheye_angle(
+    radius: NDArray[np.float64] | np.float64, distortion: tuple[float, ...], most: float
+) -> NDArray[np.float64]:
     """theta of theta_d by bisection, between 0 and `most`, where the radius grows."""
     low = np.zeros(np.shape(radius))
     high = np.full(np.shape(radius), most)

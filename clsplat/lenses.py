@@ -1,5 +1,6 @@
 """COLMAP's camera models, through pycolmap: fisheyes as they are, other distorted cameras made pinholes."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,7 +34,7 @@ class Intrinsics:
 
 
 # How the parameters of COLMAP's fisheyes whose radius is a polynomial of the angle become OPENCV_FISHEYE's.
-_FISHEYES = {
+_FISHEYES: dict[str, Callable[..., tuple[float, ...]]] = {
     "OPENCV_FISHEYE": lambda *params: params,
     "FISHEYE": lambda fx, fy, cx, cy: (fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0),
     "SIMPLE_FISHEYE": lambda f, cx, cy: (f, f, cx, cy, 0.0, 0.0, 0.0, 0.0),
