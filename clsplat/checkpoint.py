@@ -6,13 +6,15 @@ import math
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat import exposure, poses
 from clsplat.config import TrainConfig
 from clsplat.densify import STRATEGIES, Strategy
 from clsplat.errors import InputError
@@ -20,10 +22,12 @@ from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
 from clsplat.optim import Moments
 from clsplat.perphoto import PerPhoto
-from clsplat.poses import refined
-from clsplat.render import download, fetch
-from clsplat.scene import Scene
+from clsplat.render import download, fetch, upload
+from clsplat.scene import Scene, View
 from clsplat.size import Kept, Point, Rival, Search, Trial
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
 
 
 @dataclass
@@ -46,6 +50,25 @@ class State:
     exposures: PerPhoto | None = None
     poses: PerPhoto | None = None
     pixels: Any = None
+
+
+def move(state: State, device: "Device | None") -> None:
+    """Parameters, moments and statistics to the device, or to the host for None."""
+    place = partial(upload, device) if device else fetch
+    state.gaussians = place(state.gaussians)
+    state.moments = Moments(place(state.moments.first), place(state.moments.second))
+    statistics = state.strategy.statistics
+    for name, array in statistics.items():
+        statistics[name] = device.upload(name, array, array.dtype) if device else download(array)
+
+
+def as_seen(views: list[View], state: State) -> list[View]:
+    """Photos as the scene itself would show them: without what was learned about each."""
+    if state.exposures:
+        views = [replace(v, image=exposure.neutral(v.image, state.exposures.of(v.name))) for v in views]
+    if state.poses:
+        views = [replace(v, camera=poses.refined(v.camera, state.poses.of(v.name))) for v in views]
+    return views
 
 
 def save_state(path: Path, state: State, config: TrainConfig) -> None:
@@ -87,7 +110,7 @@ def write_photos(path: Path, state: State, scene: Scene) -> None:
         if state.exposures:
             content[view.name]["colours"] = state.exposures.of(view.name).tolist()
         if state.poses:
-            camera = refined(view.camera, state.poses.of(view.name)).translated(-scene.offset)
+            camera = poses.refined(view.camera, state.poses.of(view.name)).translated(-scene.offset)
             content[view.name]["viewmat"] = camera.viewmat.tolist()
     with replacing(path) as file:
         file.write((json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())

@@ -3,21 +3,18 @@
 import time
 import warnings
 from collections.abc import Callable, Container
-from copy import copy, deepcopy
 from dataclasses import replace
 from functools import partial
-from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from clsplat import exposure, poses, pyramid, size
-from clsplat.checkpoint import State, load_state, log_file, save_state, write_photos
+from clsplat.checkpoint import State, as_seen, load_state, log_file, move, save_state, write_photos
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.constants import ALPHA_MIN
 from clsplat.densify import STRATEGIES, Contributions, Edit
-from clsplat.densify.schedule import TRIAL_GROWTH
 from clsplat.errors import ClsplatError, DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians, logit
 from clsplat.initialize import initialize
@@ -26,6 +23,7 @@ from clsplat.optim import Moments, adam_settings, sh_degree_at
 from clsplat.randomness import stream
 from clsplat.render import backward_to_splats, download, fetch, forward, stage_functions, upload
 from clsplat.scene import Scene, View
+from clsplat.seek import seek_size
 from clsplat.stages import Dropout, Image
 from clsplat.survey import contributions
 
@@ -285,15 +283,6 @@ def filtered(state: State, device: "Device") -> Gaussians:
     return shown
 
 
-def as_seen(views: list[View], state: State) -> list[View]:
-    """Photos as the scene itself would show them: without what was learned about each."""
-    if state.exposures:
-        views = [replace(v, image=exposure.neutral(v.image, state.exposures.of(v.name))) for v in views]
-    if state.poses:
-        views = [replace(v, camera=poses.refined(v.camera, state.poses.of(v.name))) for v in views]
-    return views
-
-
 def densify(state: State, views: list[View], config: TrainConfig, device: "Device") -> None:
     """The edit that is due after an iteration. Changes `state`.
 
@@ -326,102 +315,12 @@ def _edit(state: State, views: list[View], config: TrainConfig, device: "Device"
     return edit
 
 
-def seek_size(
-    state: State,
-    iteration: int,
-    views: list[View],
-    config: TrainConfig,
-    device: "Device",
-    go: Callable[[State, int], float],
-    tell: Callable[[State, float], None],
-) -> State:
-    """What `clsplat.size` does before an iteration: end a trial, begin the next, choose.
-
-    The state that is given stays whole until another is returned: whoever interrupts a trial loses that alone.
-    """
-    before, stops, looks = state.search, size.stops(config), size.looks(config)
-    if before is None or before.settled or iteration not in (looks if before.rival else stops):
-        return state
-    training, validation = (as_seen(part, state) for part in size.split(views))
-
-    def degree(state: State) -> int:
-        every = config.shortened(config.optim.sh_degree_every)
-        return sh_degree_at(state.iteration, every, state.gaussians.sh_degree)
-
-    def look(state: State) -> list[float]:
-        return size.validate(fetch(state.gaussians), validation, config, device, degree(state))
-
-    def point(at: int, state: State, seen: list[list[float]]) -> size.Point:
-        return size.point(at, len(state.gaussians), degree(state), seen, config)
-
-    seen = [*before.seen, look(state)] if before.rival else []
-    if iteration not in stops:
-        return replace(state, search=replace(before, seen=seen))
-    move(state, None)
-    search = replace(before, trials=[*before.trials], rival=None, seen=[])
-    state = replace(state, search=search, strategy=copy(state.strategy))
-    if before.rival:
-        grown = iteration < size.first_shrink(config)
-        search.trials.append(size.Trial(grown, before.rival.point, point(iteration, state, seen)))
-        if search.trials[-1].takes_smaller:
-            state.gaussians, state.moments, state.strategy.statistics = before.rival.kept
-    search.most = len(state.gaussians)
-    todo = size.next_trial(search, iteration, config)
-    if todo == "settle":
-        here = size.Kept(state.gaussians, state.moments, state.strategy.statistics)
-        kept = size.settle(search, iteration, here, validation, config, device, degree(state))
-        state.gaussians, state.moments, state.strategy.statistics = kept
-    elif todo != "rest":
-        end = stops[stops.index(iteration) + 1]
-        trial = smaller_side(state, training if todo == "shrink" else None, config, device)
-        seen = []
-        for i in range(iteration, end):
-            tell(trial, go(trial, i))
-            if i + 1 in looks:
-                seen.append(look(trial))
-        move(trial, None)
-        kept = size.Kept(trial.gaussians, trial.moments, trial.strategy.statistics)
-        search.rival = size.Rival(kept, point(end, trial, seen))
-        if todo == "grow":
-            search.most = ceil(TRIAL_GROWTH * search.most)
-    if config.optimizer == "device":
-        move(state, device)
-    return state
-
-
-def smaller_side(state: State, views: list[View] | None, config: TrainConfig, device: "Device") -> State:
-    """A state that shares nothing with this one and has its Gaussians or, given views, those that they would miss
-    most."""
-    rows = np.arange(len(state.gaussians))
-    if views:
-        rows = size.costliest_rows(state.gaussians, views, config, device)
-    here = size.Kept(state.gaussians, state.moments, state.strategy.statistics)
-    gaussians, moments, statistics = here.take(rows)
-    strategy, search = copy(state.strategy), state.search and replace(state.search, most=len(rows))
-    strategy.statistics = statistics
-    learned = {name: deepcopy(getattr(state, name)) for name in ("exposures", "poses")}
-    trial = replace(state, gaussians=gaussians, moments=moments, strategy=strategy, search=search, **learned)
-    if config.optimizer == "device":
-        move(trial, device)
-    return trial
-
-
 def _apply(edit: Edit, state: State) -> None:
     state.gaussians, state.moments = edit.gaussians, state.moments.take(edit.rows, edit.fresh)
     state.pixels = None  # of other rows
     if edit.reset_opacities:
         state.moments.first.logit_opacities[:] = 0
         state.moments.second.logit_opacities[:] = 0
-
-
-def move(state: State, device: "Device | None") -> None:
-    """Parameters, moments and statistics to the device, or to the host for None."""
-    place = partial(upload, device) if device else fetch
-    state.gaussians = place(state.gaussians)
-    state.moments = Moments(place(state.moments.first), place(state.moments.second))
-    statistics = state.strategy.statistics
-    for name, array in statistics.items():
-        statistics[name] = device.upload(name, array, array.dtype) if device else download(array)
 
 
 def initial_state(scene: Scene, config: TrainConfig) -> State:

@@ -31,6 +31,7 @@ LAYERS = """
     prune rasterization survey poses
     size
     checkpoint
+    seek
     train compact
     evaluate
     bench viewer

@@ -7,11 +7,11 @@ import pytest
 from test_train import CONFIG, same, scene  # noqa: F401  (a fixture)
 
 from clsplat import ops, reference
-from clsplat.checkpoint import load_state
+from clsplat.checkpoint import load_state, move
 from clsplat.constants import FILTER_VARIANCE
 from clsplat.errors import InputError
 from clsplat.render import fetch
-from clsplat.train import _apply, _edit, filtered, initial_state, move, train
+from clsplat.train import _apply, _edit, filtered, initial_state, train
 
 FILTERED = replace(CONFIG, filter_3d=True)
 
