@@ -178,7 +178,9 @@ class TestOneTraining:
     def test_time_stands_still_while_it_is_evaluated(self, trained, device, monkeypatch):
         cell, scene, _, _ = trained
         clock = SimpleNamespace(now=100.0)
-        monkeypatch.setattr(quality, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+        monkeypatch.setattr(
+            quality, "time", SimpleNamespace(perf_counter=lambda: clock.now, process_time=lambda: clock.now)
+        )
         monkeypatch.setattr(quality, "frames_per_second", lambda *_: 1.0)
         some = Gaussians(*(np.zeros(0) for _ in range(5)))
 
@@ -202,7 +204,9 @@ class TestOneTraining:
     def test_frames_per_second_is_of_the_median(self, trained, device, monkeypatch):
         cell, scene, _, _ = trained
         clock = SimpleNamespace(now=0.0)
-        monkeypatch.setattr(quality, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+        monkeypatch.setattr(
+            quality, "time", SimpleNamespace(perf_counter=lambda: clock.now, process_time=lambda: clock.now)
+        )
 
         def renderings(gaussians, cameras, *_, **__):
             for i, _ in enumerate(cameras):
