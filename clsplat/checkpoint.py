@@ -5,7 +5,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -231,10 +231,26 @@ def log_file(path: Path, iteration: int) -> Iterator[Callable[[dict[str, Any]], 
         ) from error
     with replacing(path) as file:
         file.writelines(f"{line}\n".encode() for line in kept)
-    with path.open("a") as log:
+    events = event_writer(path.parent / "tensorboard", iteration)
+    with path.open("a") as log, closing(events) if events else nullcontext():
 
         def append(record: dict[str, Any]) -> None:
             log.write(json.dumps(record) + "\n")
             log.flush()
+            if events:
+                for name in record.keys() - {"iteration"}:
+                    events.add_scalar(name, record[name], record["iteration"])
 
         yield append
+
+
+def event_writer(folder: Path, iteration: int) -> Any:
+    """What writes the log for TensorBoard as well, after an iteration; None where tensorboardX is not installed."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        return None
+    # The names of its files tell seconds apart, no more.
+    return SummaryWriter(
+        str(folder), purge_step=iteration + 1 if iteration else None, filename_suffix=f".{iteration}"
+    )

@@ -1,6 +1,8 @@
 """The command line: a command of `clsplat.commands` each; errors in one sentence."""
 
+import os
 import sys
+import traceback
 import warnings
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -8,14 +10,15 @@ from typing import Annotated
 import tyro
 
 from clsplat.bench.commands import Chart, Kernels, Knobs, Quality, Stability
+from clsplat.commands import console
 from clsplat.commands.compact import Compact
-from clsplat.commands.console import say
+from clsplat.commands.console import warn
 from clsplat.commands.files import Devices, Export, Frames, Sfm
 from clsplat.commands.info import Info
 from clsplat.commands.pictures import Eval, Render
 from clsplat.commands.training import Demo, Train
 from clsplat.commands.viewing import View
-from clsplat.errors import ClsplatError, driver_errors
+from clsplat.errors import ClsplatError, InputError, driver_errors
 
 BENCHMARKS = (
     Annotated[Kernels, tyro.conf.subcommand("kernels")]
@@ -38,29 +41,54 @@ class Bench:
         self.what.run()
 
 
+DESCRIPTION = """3D Gaussian Splatting on any OpenCL device.
+
+Every command takes -q (--quiet: nothing but warnings and errors) and -v (--verbose: also what structure from motion
+and the driver's compiler report, and where an error came from)."""
+
 COMMANDS = Devices | Frames | Sfm | Train | Eval | Render | View | Export | Compact | Info | Demo | Bench
+
+
+def set_loudness(arguments: list[str]) -> list[str]:
+    """Take -q and -v, which every command has, from the arguments: the rest."""
+    quiet, verbose = ({"-q", "--quiet"}.intersection(arguments), {"-v", "--verbose"}.intersection(arguments))
+    if quiet and verbose:
+        raise InputError("-q and -v: expected one of them, found both")
+    console.loudness = "quiet" if quiet else "verbose" if verbose else "normal"
+    if console.loudness == "quiet":
+        os.environ["TQDM_DISABLE"] = "1"  # read when tqdm is imported
+    if console.loudness == "verbose":
+        os.environ["PYOPENCL_COMPILER_OUTPUT"] = "1"
+    return [argument for argument in arguments if argument not in quiet | verbose]
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``clsplat``: errors that are the user's to mend print one sentence and exit with 2."""
-    warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
-    arguments = sys.argv[1:] if arguments is None else arguments
-    command = tyro.cli(
-        COMMANDS, prog="clsplat", args=arguments, description="3D Gaussian Splatting on any OpenCL device."
-    )
+    warnings.showwarning = lambda message, *_, **__: warn(f"warning: {message}")
+    if os.environ.get("NO_COLOR"):  # no-color.org
+        tyro._experimental_options["ansi_codes"] = False
     try:
-        if isinstance(command, Train) and (base := command.base()):
-            # Read again: flags are told from defaults by what they are put into.
-            start = replace(command, settings=base)
-            command = tyro.cli(Train, prog="clsplat train", args=arguments[1:], default=start)
-        with driver_errors():
-            command.run()
-    except ClsplatError as error:
-        say(f"clsplat: {error}")
-        sys.exit(2)
-    except OSError as error:  # what no reader or writer has put in words: a disk that fills up under a log, say
-        say(f"clsplat: {error.filename or 'input or output'}: {error.strerror or error}")
+        run(sys.argv[1:] if arguments is None else arguments)
+    except (ClsplatError, OSError) as error:
+        if console.loudness == "verbose":
+            traceback.print_exc()
+        if isinstance(error, ClsplatError):
+            warn(f"clsplat: {error}")
+        else:  # what no reader or writer has put in words: a disk that fills up under a log, say
+            warn(f"clsplat: {error.filename or 'input or output'}: {error.strerror or error}")
         sys.exit(2)
     except KeyboardInterrupt:
-        say("clsplat: interrupted")
+        warn("clsplat: interrupted")
         sys.exit(130)
+
+
+def run(arguments: list[str]) -> None:
+    """Run the command that the arguments name."""
+    arguments = set_loudness(arguments)
+    command = tyro.cli(COMMANDS, prog="clsplat", args=arguments, description=DESCRIPTION)
+    if isinstance(command, Train) and (base := command.base()):
+        # Read again: flags are told from defaults by what they are put into.
+        start = replace(command, settings=base)
+        command = tyro.cli(Train, prog="clsplat train", args=arguments[1:], default=start)
+    with driver_errors():
+        command.run()

@@ -5,13 +5,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.camera import Camera
+from clsplat.camera import Camera, CameraModel
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
 from clsplat.render import download, stage_functions, upload
 
 if TYPE_CHECKING:
     from clsplat.device import Device
+
+CAMERA_MODELS: dict[str, CameraModel] = {"pinhole": "pinhole", "ortho": "orthographic", "fisheye": "fisheye"}
+"""gsplat's names of camera models, and ours."""
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
@@ -32,6 +35,8 @@ def rasterization(
     backgrounds: ArrayLike | None = None,
     render_mode: RenderMode = "RGB",
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    camera_model: Literal["pinhole", "ortho", "fisheye"] = "pinhole",
+    radial_coeffs: ArrayLike | None = None,
     device: "Device | None" = None,
 ) -> tuple[NDArray[Any], NDArray[Any], dict[str, Any]]:
     """Render a batch of cameras from activated parameters, with gsplat's arguments.
@@ -64,6 +69,10 @@ def rasterization(
         Colours, accumulated depth, expected depth (accumulated depth / alpha), or colours and one of them.
     rasterize_mode : {"classic", "antialiased"}
         antialiased compensates opacities for the dilation of small splats.
+    camera_model : {"pinhole", "ortho", "fisheye"}
+        As `Camera` defines them.
+    radial_coeffs : (C, 4), optional
+        k1 to k4 of fisheyes; default 0.
     device : Device, optional
         None renders with the float64 twins.
 
@@ -83,7 +92,7 @@ def rasterization(
 
     Notes
     -----
-    For gradients see `clsplat.render`.
+    For gradients, of viewmats and intrinsics too, see `clsplat.render`.
     """
     means, viewmats, Ks = (np.asarray(a, dtype=np.float64) for a in (means, viewmats, Ks))
     colors = np.asarray(colors, dtype=np.float64)
@@ -111,6 +120,10 @@ def rasterization(
         raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree} (what colors hold), found {sh_degree}")
     if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
         raise InputError(f"render_mode: expected RGB, D, ED, RGB+D or RGB+ED, found {render_mode!r}")
+    if camera_model not in CAMERA_MODELS:
+        raise InputError(f"camera_model: expected {', '.join(CAMERA_MODELS)}, found {camera_model!r}")
+    distortions = np.zeros((cameras, 4)) if radial_coeffs is None else np.asarray(radial_coeffs, dtype=np.float64)
+    _check_shape("radial_coeffs", distortions, (cameras, 4))
     behind = np.zeros((cameras, channels)) if backgrounds is None else np.asarray(backgrounds, dtype=np.float64)
     _check_shape("backgrounds", behind, (cameras, channels))
 
@@ -118,7 +131,8 @@ def rasterization(
     parameters = upload(device, gaussians)
     renders, alphas, metas = [], [], []
     for i in range(cameras):
-        camera = Camera(viewmats[i], Ks[i, 0, 0], Ks[i, 1, 1], Ks[i, 0, 2], Ks[i, 1, 2], width, height)
+        intrinsics = Ks[i, 0, 0], Ks[i, 1, 1], Ks[i, 0, 2], Ks[i, 1, 2], width, height
+        camera = Camera(viewmats[i], *intrinsics, CAMERA_MODELS[camera_model], tuple(distortions[i].tolist()))
         splats = stage.project_fwd(parameters, camera, sh_degree or 0, antialiased=rasterize_mode == "antialiased")
         edge = max(width, height) if device is None else tile_size
         bins = stage.bin_splats(splats, width, height, edge, gradients=False)

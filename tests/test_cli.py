@@ -1,6 +1,7 @@
 """The command line end to end on a tiny dataset, and one clear sentence for each kind of bad input."""
 
 import json
+import os
 import re
 import shlex
 import signal
@@ -108,7 +109,7 @@ def test_train_writes_a_compact_file_beside_its_folder(dataset: Path, tmp_path: 
 
 
 def test_train_leaves_a_scene_and_says_how_good_it_is(trained: Path) -> None:
-    names = {p.name for p in trained.iterdir()}
+    names = {p.name for p in trained.iterdir()} - {"tensorboard"}  # where that is installed
     assert names == {"checkpoint.npz", "config.json", "eval", "log.jsonl", "scene.ply", "training_curve.png"}
     config = json.loads((trained / "config.json").read_text())
     assert config["iterations"] == 20
@@ -218,6 +219,43 @@ def test_shells_can_complete_every_command(shell: str, capsys: pytest.CaptureFix
     script = capsys.readouterr().out
     assert not exit_.value.code
     assert all(word in script for word in ("clsplat", "train", "info", "--max-gaussians", "--invert-masks"))
+
+
+def test_quiet_says_nothing_and_verbose_where_an_error_is_from(dataset: Path, tmp_path: Path) -> None:
+    """In processes of their own: the progress bar is told by the environment, before it is imported."""
+
+    def said(*arguments: object) -> str:
+        command = [sys.executable, "-m", "clsplat", *map(str, arguments)]
+        return subprocess.run(command, capture_output=True, text=True).stderr
+
+    missing = tmp_path / "no.ply"
+    train = "train", dataset, "--iterations", 3, "-o"
+    assert said(*train, tmp_path / "quiet", "-q") == ""
+    assert (tmp_path / "quiet" / "scene.ply").is_file()
+    for word in ("device: ", "3/3", "held-out photos"):
+        assert word in said(*train, tmp_path / f"normal {word[:2].strip('/')}"), word
+    assert said("--quiet", "info", missing).startswith(f"clsplat: {missing}")
+    assert "Traceback" in said("info", missing, "--verbose")
+    assert "expected one of them" in said("-q", "-v", "info", missing)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+@pytest.mark.parametrize("wanted", [True, False])
+def test_no_color(wanted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Help is coloured on a terminal, unless NO_COLOR is set (no-color.org)."""
+    import pty
+
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("NO_COLOR", "" if wanted else "1")
+    shown = bytearray()
+
+    def read(terminal: int) -> bytes:
+        shown.extend(part := os.read(terminal, 1024))
+        return part
+
+    monkeypatch.setattr(os, "write", lambda _, data: len(data))
+    pty.spawn([sys.executable, "-m", "clsplat", "devices", "--help"], read)
+    assert b"usage" in shown and (b"\x1b[" in shown) == wanted
 
 
 def test_devices_names_the_default(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """rasterization means what gsplat's function means, and agrees with render."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,29 @@ def test_it_agrees_with_render(scene: tuple[Gaussians, list[Camera]], device64: 
         np.testing.assert_allclose(image[i, :, :, :3], expected.rgb, atol=1e-10)
         np.testing.assert_allclose(image[i, :, :, 3], expected.depth, atol=1e-9)
         np.testing.assert_allclose(alpha[i, :, :, 0], expected.alpha, atol=1e-10)
+
+
+@pytest.mark.parametrize(("name", "model"), [("ortho", "orthographic"), ("fisheye", "fisheye")])
+def test_it_takes_camera_models(
+    scene: tuple[Gaussians, list[Camera]], device64: Device, name: Any, model: Any
+) -> None:
+    """By gsplat's names."""
+    gaussians, cameras = scene
+    coefficients = [[0.1, -0.02, 0.01, 0.0] if model == "fisheye" else [0.0] * 4] * 2
+    images, _, _ = rasterization(
+        **arguments(gaussians, cameras),
+        sh_degree=gaussians.sh_degree,
+        camera_model=name,
+        radial_coeffs=coefficients,
+        device=device64,
+    )
+    for image, camera in zip(images, cameras, strict=True):
+        camera = replace(camera, model=model, distortion=tuple(coefficients[0]))
+        expected = render(gaussians, camera, device=device64).rgb
+        np.testing.assert_allclose(image, expected, atol=1e-10)  # as above
+        assert (
+            np.abs(image - render(gaussians, replace(camera, model="pinhole", distortion=(0,) * 4)).rgb).max() > 0.1
+        )
 
 
 def test_lists_are_made_without_what_gradients_need(

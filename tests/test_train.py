@@ -403,6 +403,26 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
             pass
 
 
+def test_the_log_is_also_written_for_tensorboard(tmp_path: Path) -> None:
+    """A resumed run's first step says that what was there from it on no longer counts."""
+    event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
+    for begin, end in ((0, 20), (10, 30)):
+        with log_file(tmp_path / "log.jsonl", begin) as append:
+            for iteration in range(begin + 10, end + 1, 10):
+                append({"iteration": iteration, "loss": iteration / 100})
+    found = []
+    for path in sorted((tmp_path / "tensorboard").iterdir(), key=lambda p: int(p.suffix[1:])):
+        content, at = path.read_bytes(), 0
+        while at < len(content):  # length, its check, the event, its check
+            length = int.from_bytes(content[at : at + 8], "little")
+            event = event_pb2.Event.FromString(content[at + 12 : at + 12 + length])
+            at += 16 + length
+            found += [(value.tag, event.step, value.simple_value) for value in event.summary.value]
+            found += ["start"] * (event.session_log.status == event.session_log.START)
+    losses = [("loss", step, pytest.approx(step / 100)) for step in (10, 20, 20, 30)]
+    assert found == [*losses[:2], "start", *losses[2:]]
+
+
 def test_the_log_drops_what_a_resumed_run_repeats(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     path.write_text('{"iteration": 10}\n{"iteration": 20}\n{"iteration": 30}\n{"iter')

@@ -5,7 +5,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -17,12 +17,26 @@ if TYPE_CHECKING:
 
 STARTED = time.perf_counter()  # of the command, but for the 0.2 s that Python takes to get here
 
+loudness: Literal["quiet", "normal", "verbose"] = "normal"
+"""What the user asked for by -q or -v; the command line sets it before a command runs."""
+
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
 
 def say(text: str) -> None:
-    """Tell the user, beside the progress bars."""
-    print(text, file=sys.stderr, flush=True)
+    """Tell the user, unless quiet is asked for."""
+    if loudness != "quiet":
+        warn(text)
+
+
+def warn(text: str) -> None:
+    """Tell the user in any case, beside the progress bars."""
+    if "tqdm" not in sys.modules:  # what takes a while to import is imported once it is needed
+        print(text, file=sys.stderr, flush=True)
+        return
+    from tqdm import tqdm
+
+    tqdm.write(text, sys.stderr)
 
 
 def open_device(name: str | None, memory_limit: int | None = None) -> "Device":
@@ -64,7 +78,7 @@ def say_cameras(dataset: Path, picture: Path) -> None:
         return
     say(f"cameras: {found.summary()}")
     for warning in found.warnings():
-        say(f"warning: {warning}")
+        warn(f"warning: {warning}")
     draw_cameras(picture, found.model)
     say(f"cameras: {picture} shows them")
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from clsplat.commands import console
 from clsplat.commands.console import Out, moved, say, say_cameras
 from clsplat.config import DataConfig, Mode, SfmConfig
 from clsplat.errors import InputError
@@ -70,7 +71,7 @@ class Sfm:
         """Run the command."""
         from clsplat.sfm import reconstruct
 
-        model = reconstruct(self.photos, self.sfm, self.out)
+        model = reconstruct(self.photos, self.sfm, self.out, verbose=console.loudness == "verbose")
         say_cameras(self.out or self.photos, model.parent / "cameras.png")
         print(model)
 

@@ -12,7 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from clsplat.commands.console import STARTED, Out, new_folder, open_device, say, say_cameras, say_scores, write_json
+from clsplat.commands import console
+from clsplat.commands.console import (
+    STARTED,
+    Out,
+    new_folder,
+    open_device,
+    say,
+    say_cameras,
+    say_scores,
+    warn,
+    write_json,
+)
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
 from clsplat.presets import DATA_PATH, PRESETS, load_config, load_preset
@@ -75,7 +86,7 @@ class Train:
         if is_video(data):
             data = out / "frames"
             say(f"{data}: {extract_frames(self.data, data)} frames of {self.data.name}")
-        scene = load_scene(data, config.data)
+        scene = load_scene(data, config.data, verbose=console.loudness == "verbose")
         say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
         adapted = few_views.adapted(config, scene)
         if adapted != config:
@@ -96,7 +107,7 @@ class Train:
         except KeyboardInterrupt:
             if (out / "checkpoint.npz").is_file():
                 again = sys.argv[1:] + ([] if self.resume else ["--resume"])
-                say(f"to continue: {shlex.join(['clsplat', *again])}")
+                warn(f"to continue: {shlex.join(['clsplat', *again])}")
             raise
         if suffix:
             save_gaussians(self.out, gaussians, config.render.mode, scene.offset)
@@ -149,7 +160,7 @@ def train_and_report(
 
         def progress(record: dict[str, Any]) -> None:
             if bar.n == 0:
-                bar.write(f"first iteration: done {time.perf_counter() - STARTED:.1f} s after the start", sys.stderr)
+                say(f"first iteration: done {time.perf_counter() - STARTED:.1f} s after the start")
             bar.update(record["iteration"] - bar.n)
             bar.set_postfix_str(f"loss={record['loss']:.4f}, N={record['num_gaussians']}", refresh=False)
             if viewer:
@@ -158,7 +169,7 @@ def train_and_report(
                 viewer.tell(facts)
                 viewer.follow(record["gaussians"], interrupted.is_set)
             if interrupted.is_set():
-                say(f"\n{out}: stopped after iteration {record['iteration']}")
+                warn(f"{out}: stopped after iteration {record['iteration']}")
                 raise KeyboardInterrupt
 
         def held_out(gaussians: "Gaussians") -> dict[str, float]:
