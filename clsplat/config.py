@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from clsplat.constants import NEAR, TILE
+from clsplat.constants import TILE
 
 Mode = Literal["classic", "antialiased"]
 Background = Literal["black", "white"]
@@ -35,9 +35,10 @@ class RenderConfig:
     tiles (global), or within each tile afterwards (per_tile). Changes speed, not the image; auto takes global, the
     faster one where measured. pixel sorts anew in each pixel, by where its ray meets the Gaussians: nothing pops when
     the camera turns, but it is slower (StopThePop)."""
-    near: float = NEAR
-    """Depth in world units up to which nothing is drawn (the original: 0.2). Gaussians that a camera nearly touches,
-    of a wall beside the photographer for example, spread over the whole image: a view spoilt by one wants more."""
+    near: float | None = None
+    """Depth in world units up to which nothing is drawn; default: for a dataset's cameras a tenth of the depth of its
+    nearest points, 0.01 for others. Gaussians that a camera nearly touches, of a wall beside the photographer for
+    example, spread over its whole image."""
 
 
 @dataclass(frozen=True)

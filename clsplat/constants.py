@@ -34,7 +34,7 @@ FILTER_VARIANCE = 0.2
 """Of the 3D filter, in squared sizes of a pixel in the photo that samples a Gaussian most finely (Mip-Splatting)."""
 
 NEAR = 0.01
-"""Depth in world units at which Gaussians are culled (gsplat; the original's 0.2 cuts small scenes)."""
+"""Depth in world units at which Gaussians are culled unless a dataset says more (gsplat; the original: 0.2)."""
 
 FRUSTUM_MARGIN = 0.3
 """The Jacobian is evaluated inside the image enlarged by this fraction of its half width (original: the 1.3)."""

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from clsplat import display, panorama, reference
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
-from clsplat.constants import NEAR
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.scene import Color
@@ -90,7 +89,7 @@ def forward(
         Which splats are left out while training.
     """
     stage = stage_functions(device)
-    if config.near != NEAR:
+    if config.near is not None:
         camera = replace(camera, near=config.near)
     antialiased = config.mode == "antialiased"
     splats = stage.project_fwd(gaussians, camera, sh_degree, antialiased=antialiased, channels=len(background))

@@ -10,8 +10,10 @@ from PIL import Image
 from clsplat import sfm
 from clsplat.camera import Camera
 from clsplat.config import DataConfig, SfmConfig
+from clsplat.constants import NEAR
 from clsplat.errors import InputError
 from clsplat.io import load_scene
+from clsplat.io.dataset import near_plane
 
 
 def write_colmap(root, count=9, centre=(0.0, 0.0, 0.0)):
@@ -49,6 +51,20 @@ def test_every_nth_photo_by_name_is_held_out(tmp_path, every, test):
     for view in scene.train + scene.test:
         assert view.image[0, 0, 0] == int(view.name[:2])
         np.testing.assert_allclose(view.camera.position, [int(view.name[:2]), 0, 0], atol=1e-12)
+
+
+def test_nothing_is_drawn_long_before_the_nearest_points(tmp_path):
+    """By hand: 100 points at 3 to 3.99 in front of the first photos, one wrong point at 0.5; others see none of them.
+    Held-out photos draw as the others do."""
+    write_colmap(tmp_path)
+    rows = [f"{k} 0.3 0 {3 + k / 100} 0 0 0 0\n" for k in range(100)]
+    (tmp_path / "sparse" / "0" / "points3D.txt").write_text("".join([*rows, "100 0.3 0 0.5 0 0 0 0\n"]))
+    scene = load_scene(tmp_path, DataConfig())
+    assert {view.camera.near for view in scene.train + scene.test} == {near_plane(scene)}
+    assert near_plane(scene) == pytest.approx(0.1 * 3.0, abs=1e-3)
+    few = dataclasses.replace(scene, points=scene.points[:99])
+    assert near_plane(few) == NEAR, "too few to tell a wrong one"
+    assert near_plane(dataclasses.replace(scene, points=scene.points[:0])) == NEAR
 
 
 def test_nothing_left_to_train_on_is_an_error(tmp_path):

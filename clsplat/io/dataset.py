@@ -7,6 +7,7 @@ import numpy as np
 
 from clsplat import sfm
 from clsplat.config import DataConfig, SfmConfig
+from clsplat.constants import NEAR
 from clsplat.errors import InputError
 from clsplat.io import colmap, transforms
 from clsplat.io.images import Dataset, PhotosMissing, by_faces, load_views
@@ -16,6 +17,16 @@ from clsplat.scene import Scene, View
 OFFSET_EXTENTS = 1000
 """Scene extents that the cameras may lie from the origin before it is moved to them. There float32 still tells apart
 6e-5 extents; farther out positions would lose what training moves them by."""
+
+NEAR_SHARE = 0.1
+"""Of the depth of a scene's nearest points, before which nothing is drawn. In the scenes of the original, whose near
+plane is at 0.2, that is about as much; castle_p30 gains 4 dB (docs/stability.md)."""
+
+NEAR_QUANTILE = 0.01
+"""Of the depths of the points that a photo shows: the nearest of all may be a wrong one."""
+
+NEAR_POINTS = 10_000
+"""So many points are enough to find that out."""
 
 
 def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> Scene:
@@ -36,6 +47,7 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
     -------
     Scene
         Photos undistorted, sorted by name; every `config.test_every`-th held out unless the dataset says which.
+        Their cameras draw nothing before the `near_plane`.
 
     Raises
     ------
@@ -73,7 +85,7 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
         raise InputError(
             f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
         )
-    return _near_origin(Scene(train, test, dataset.points, dataset.colors))
+    return _with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
 
 
 def _find(path: Path, config: DataConfig, verbose: bool) -> Dataset:
@@ -112,3 +124,36 @@ def _near_origin(scene: Scene) -> Scene:
         return [replace(view, camera=view.camera.translated(centre)) for view in part]
 
     return Scene(moved(scene.train), moved(scene.test), scene.points - centre, scene.colors, centre)
+
+
+def near_plane(scene: Scene) -> float:
+    """A depth in world units before which the scene's points say that there is nothing.
+
+    Gaussians that a camera nearly touches, of a wall beside the photographer for example, spread over its whole
+    image: the photo next to it needs them, this one does not know them, and a held-out one is spoilt.
+
+    Returns
+    -------
+    float
+        `NEAR_SHARE` of the depth of the nearest points, by the training photo that comes nearest to them; `NEAR`
+        where no photo shows points enough.
+    """
+    points = scene.points[:: max(1, len(scene.points) // NEAR_POINTS)]
+    nearest = np.inf
+    for camera in (view.camera for view in scene.train):
+        points_camera = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        x, y, depths = points_camera[points_camera[:, 2] > 0].T
+        u, v = camera.fx * x / depths + camera.cx, camera.fy * y / depths + camera.cy
+        seen = depths[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)]
+        if len(seen) * NEAR_QUANTILE >= 1:  # of fewer it would be the nearest point, which may be a wrong one
+            nearest = min(nearest, float(np.quantile(seen, NEAR_QUANTILE)))
+    return NEAR_SHARE * nearest if np.isfinite(nearest) else NEAR
+
+
+def _with_near_planes(scene: Scene) -> Scene:
+    near = near_plane(scene)
+
+    def told(part: list[View]) -> list[View]:
+        return [replace(view, camera=replace(view.camera, near=near)) for view in part]
+
+    return replace(scene, train=told(scene.train), test=told(scene.test))
