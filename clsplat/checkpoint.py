@@ -22,7 +22,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.io.atomic import replacing
 from clsplat.optim import Moments
 from clsplat.perphoto import PerPhoto
-from clsplat.render import download, fetch, upload
+from clsplat.render import download, fetch, stage_functions, upload
 from clsplat.scene import Scene, View
 from clsplat.size import Kept, Point, Rival, Search, Trial
 
@@ -69,6 +69,26 @@ def as_seen(views: list[View], state: State) -> list[View]:
     if state.poses:
         views = [replace(v, camera=poses.refined(v.camera, state.poses.of(v.name))) for v in views]
     return views
+
+
+def on_device(gaussians: Gaussians, device: "Device") -> Gaussians:
+    """The Gaussians on the device, where they are with its optimiser."""
+    return upload(device, gaussians) if isinstance(gaussians.means, np.ndarray) else gaussians
+
+
+def measure_pixels(state: State, views: list[View], device: "Device") -> None:
+    """What the photos' cameras resolve at each Gaussian. Changes `state`."""
+    cameras = [view.camera for view in views]
+    state.pixels = stage_functions(device).pixel_sizes(on_device(state.gaussians, device), cameras)
+
+
+def filtered(state: State, device: "Device") -> Gaussians:
+    """The Gaussians on the device as they are shown and saved: under the 3D filter, if there is one."""
+    gaussians = on_device(state.gaussians, device)
+    if state.pixels is None:
+        return gaussians
+    shown: Gaussians = stage_functions(device).filter_fwd(gaussians, state.pixels)
+    return shown
 
 
 def save_state(path: Path, state: State, config: TrainConfig) -> None:

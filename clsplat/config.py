@@ -83,8 +83,9 @@ class DataConfig:
 class InitConfig:
     """The Gaussians that training starts from."""
 
-    random_points: int = 100_000
-    """Gaussians of a random start, where the scene has no points (the original's number)."""
+    random_points: int | None = None
+    """Gaussians of a random start, where the scene has no points; default: 100 000 (the original's number), 10 000
+    with --size auto, which adds where they are needed."""
     random_extent: float = 1 / 3
     """Half edge of the random start's box, as a fraction of the cameras' mean distance from the point they look
     at; for NeRF-synthetic scenes (distance 4) that is the original's box within 3 %."""
@@ -242,16 +243,16 @@ class TrainConfig:
     """Of the random start, the order of the photos and all that the strategy draws."""
     optimizer: Literal["device", "numpy"] = "device"
     """Where Adam runs: in a kernel, or in NumPy on the host (slower; the same to rounding)."""
-    strategy: str = "adc"
-    """Densification strategy: a name of clsplat.densify.STRATEGIES."""
-    size: Literal["auto", "fixed"] = "fixed"
-    """auto: the number of Gaussians and the degree of the spherical harmonics are chosen from the photos, some of
+    strategy: str = "error"
+    """Densification strategy: a name of clsplat.densify.STRATEGIES. adc is the paper's."""
+    size: Literal["auto", "fixed"] = "auto"
+    """auto: the number of Gaussians and the degree of the spherical harmonics are chosen from the photos, parts of
     which validate in the meantime (size.json explains the choice). fixed: what the strategy makes, up to the cap."""
-    size_price: float = 0.1
+    size_price: float = 0.05
     """Decibels of PSNR that twice as many Gaussians, or bytes, must gain; with --size auto."""
     max_gaussians: int | None = None
     """Hard cap, under every strategy: in no iteration are there more Gaussians. A start of more is thinned to it.
-    mcmc and error grow to it, and need it."""
+    mcmc and error grow to it, and need it with --size fixed."""
     dropout: float = 0.0
     """Share of the splats left out of each image at the end; it rises from 0 over the training."""
     exposure: bool = False

@@ -19,6 +19,9 @@ NEIGHBOURS = 3
 OPACITY = 0.1
 """A Gaussian's first opacity where the configuration says none (original)."""
 
+RANDOM_POINTS = 100_000
+"""Gaussians of a random start whose number nobody names (original)."""
+
 VARIANCE_MIN = 1e-7
 """Smallest such variance, in squared world units: duplicates would otherwise start with scale 0 (original)."""
 
@@ -60,8 +63,12 @@ def initialize(scene: Scene, config: InitConfig, seed: int, cap: int | None = No
 
 def start_size(scene: Scene, config: InitConfig, cap: int | None) -> int:
     """How many Gaussians `initialize` makes."""
-    wanted = len(scene.points) or config.random_points
+    wanted = len(scene.points) or _random_points(config)
     return wanted if cap is None else min(wanted, cap)
+
+
+def _random_points(config: InitConfig) -> int:
+    return RANDOM_POINTS if config.random_points is None else config.random_points
 
 
 def from_points(points: ArrayLike, colors: ArrayLike, config: InitConfig) -> Gaussians:
@@ -111,7 +118,7 @@ def random(cameras: list[Camera], config: InitConfig, seed: int) -> Gaussians:
     Returns
     -------
     Gaussians
-        `config.random_points` of them, float32, uniform in the cube around `focus_point` whose half edge is
+        So many, float32, uniform in the cube around `focus_point` whose half edge is
         `config.random_extent` times the cameras' mean distance from it; sized as by `from_points`.
 
     Raises
@@ -119,16 +126,16 @@ def random(cameras: list[Camera], config: InitConfig, seed: int) -> Gaussians:
     InputError
         If there is no camera, or the number or size is not positive.
     """
-    if config.random_points < 1 or not config.random_extent > 0:
+    n = _random_points(config)
+    if n < 1 or not config.random_extent > 0:
         raise InputError(
-            "random_points, random_extent: expected positive values, found "
-            f"{config.random_points} and {config.random_extent}"
+            f"random_points, random_extent: expected positive values, found {n} and {config.random_extent}"
         )
     focus = focus_point(cameras)
     distance = float(np.mean([np.linalg.norm(camera.position - focus) for camera in cameras]))
     half = config.random_extent * distance
     rng = stream(seed, "initial points")
-    means = focus + rng.uniform(-half, half, (config.random_points, 3))
+    means = focus + rng.uniform(-half, half, (n, 3))
     return _gaussians(means, _variances(means), rng.uniform(size=means.shape), config)
 
 

@@ -60,6 +60,8 @@ def price(
     config: RenderConfig = RenderConfig(),
     device: "Device | None" = None,
     background: Color = (0.0, 0.0, 0.0),
+    *,
+    bands: bool = True,
 ) -> Prices:
     """Price Gaussians by views.
 
@@ -99,7 +101,7 @@ def price(
         total.errors[:] += part.errors / pixels
         total.differences[:] += part.differences / pixels
         total.weights[:] += part.weights / pixels
-        if degree:
+        if degree and bands:
             seen = np.flatnonzero(part.weights > 0)
             change = _color_changes(gaussians.take(seen), view.camera.position)
             squares, pulls = part.squares[seen, None], part.pulls[seen]

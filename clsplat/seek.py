@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from clsplat import size
-from clsplat.checkpoint import State, as_seen, move
+from clsplat.checkpoint import State, as_seen, filtered, measure_pixels, move
 from clsplat.config import TrainConfig
 from clsplat.densify.schedule import TRIAL_GROWTH
 from clsplat.optim import sh_degree_at
@@ -46,7 +46,7 @@ def seek_size(
         return sh_degree_at(state.iteration, every, state.gaussians.sh_degree)
 
     def look(state: State) -> list[float]:
-        return size.validate(fetch(state.gaussians), validation, config, device, degree(state))
+        return size.validate(fetch(filtered(state, device)), validation, config, device, degree(state))
 
     def point(at: int, state: State, seen: list[list[float]]) -> size.Point:
         return size.point(at, len(state.gaussians), degree(state), seen, config)
@@ -62,13 +62,17 @@ def seek_size(
         search.trials.append(size.Trial(grown, before.rival.point, point(iteration, state, seen)))
         if search.trials[-1].takes_smaller:
             state.gaussians, state.moments, state.strategy.statistics = before.rival.kept
+            state.pixels = None  # of other rows
+    if config.filter_3d and state.pixels is None:
+        measure_pixels(state, training, device)
     search.most = len(state.gaussians)
     todo = size.next_trial(search, iteration, config)
     if todo == "settle":
         here = size.Kept(state.gaussians, state.moments, state.strategy.statistics)
-        kept = size.settle(search, iteration, here, validation, config, device, degree(state))
-        state.gaussians, state.moments, state.strategy.statistics = kept
-    elif todo != "rest":
+        shown = fetch(filtered(state, device))
+        chosen = size.settle(search, iteration, shown, validation, config, device, degree(state))
+        state.gaussians, state.moments, state.strategy.statistics = size.lower_degree(here, chosen)
+    elif todo in ("try", "shrink"):
         end = stops[stops.index(iteration) + 1]
         trial = smaller_side(state, training if todo == "shrink" else None, config, device)
         seen = []
@@ -79,8 +83,8 @@ def seek_size(
         move(trial, None)
         kept = size.Kept(trial.gaussians, trial.moments, trial.strategy.statistics)
         search.rival = size.Rival(kept, point(end, trial, seen))
-        if todo == "grow":
-            search.most = ceil(TRIAL_GROWTH * search.most)
+    if todo in ("grow", "try"):
+        search.most = ceil(TRIAL_GROWTH * search.most)
     if config.optimizer == "device":
         move(state, device)
     return state
@@ -91,13 +95,15 @@ def smaller_side(state: State, views: list[View] | None, config: TrainConfig, de
     most."""
     rows = np.arange(len(state.gaussians))
     if views:
-        rows = size.costliest_rows(state.gaussians, views, config, device)
+        rows = size.costliest_rows(fetch(filtered(state, device)), views, config, device)
     here = size.Kept(state.gaussians, state.moments, state.strategy.statistics)
     gaussians, moments, statistics = here.take(rows)
     strategy, search = copy(state.strategy), state.search and replace(state.search, most=len(rows))
     strategy.statistics = statistics
     learned = {name: deepcopy(getattr(state, name)) for name in ("exposures", "poses")}
-    trial = replace(state, gaussians=gaussians, moments=moments, strategy=strategy, search=search, **learned)
+    trial = replace(
+        state, gaussians=gaussians, moments=moments, strategy=strategy, search=search, pixels=None, **learned
+    )
     if config.optimizer == "device":
         move(trial, device)
     return trial

@@ -11,8 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clsplat import exposure, poses, pyramid, size
-from clsplat.checkpoint import State, as_seen, load_state, log_file, move, save_state, write_photos
-from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.checkpoint import (
+    State,
+    as_seen,
+    filtered,
+    load_state,
+    log_file,
+    measure_pixels,
+    move,
+    on_device,
+    save_state,
+    write_photos,
+)
+from clsplat.config import BACKGROUNDS, InitConfig, TrainConfig
 from clsplat.constants import ALPHA_MIN
 from clsplat.densify import STRATEGIES, Contributions, Edit
 from clsplat.errors import ClsplatError, DeviceError, InputError, driver_errors
@@ -21,7 +32,7 @@ from clsplat.initialize import initialize
 from clsplat.memory import INTERSECTIONS, Footprint, Photos
 from clsplat.optim import Moments, adam_settings, sh_degree_at
 from clsplat.randomness import stream
-from clsplat.render import backward_to_splats, download, fetch, forward, stage_functions, upload
+from clsplat.render import backward_to_splats, download, fetch, forward, stage_functions
 from clsplat.scene import Scene, View
 from clsplat.seek import seek_size
 from clsplat.stages import Dropout, Image
@@ -83,8 +94,7 @@ def train(
     Raises
     ------
     InputError
-        If the scene has no photos to train on, the checkpoint is of another configuration, or small photos are
-        asked for while the size is sought.
+        If the scene has no photos to train on, or the checkpoint is of another configuration.
     DeviceError
         If the device's memory, or its limit, is exceeded in spite of all.
     ClsplatError
@@ -97,14 +107,8 @@ def train(
     """
     if config.strategy not in STRATEGIES:
         raise InputError(f"--strategy: expected one of {', '.join(STRATEGIES)}, found {config.strategy!r}")
-    if config.filter_3d and config.size == "auto":
-        raise InputError("--filter-3d: expected --size fixed, found auto: its search does not know the filter")
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
-    if config.coarse.factor > 1 and config.size == "auto":
-        raise InputError(
-            f"--coarse.factor: expected 1 with --size auto, which validates full photos, found {config.coarse.factor}"
-        )
     state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
     if evaluate_after is None:
         evaluate_after = (
@@ -116,7 +120,7 @@ def train(
     if state.pixels is not None:
         state.pixels = device.upload("pixel sizes", state.pixels)
     losses: list[float] = []
-    training, factor = scene.train, 1
+    training, shown = scene.train, (1, False)
 
     def tell(shown: State, loss: float) -> None:
         about = {"iteration": state.iteration, "loss": loss, "num_gaussians": len(shown.gaussians)}
@@ -129,20 +133,18 @@ def train(
     with log_file(out / "log.jsonl", state.iteration) as log:
         started = time.perf_counter() - state.seconds
         for iteration in range(state.iteration + 1, config.iterations + 1):
-            if factor != pyramid.factor_at(iteration, config):
-                factor = pyramid.factor_at(iteration, config)
-                training, photos = [pyramid.shrunk(view, factor) for view in scene.train], Photos(device)
+            wanted = pyramid.factor_at(iteration, config), bool(state.search and not state.search.settled)
+            if shown != wanted:
+                shown = factor, seeking = wanted
+                views = size.split(scene.train)[0] if seeking else scene.train
+                training, photos = [pyramid.shrunk(view, factor) for view in views], Photos(device)
             intersections = state.intersections or INTERSECTIONS
             photos.keep_within(device.memory_limit - need.total(len(state.gaussians), intersections))
             go = partial(advance, views=training, photos=photos, need=need, config=config, device=device)
             try:
                 with driver_errors():
-                    if config.filter_3d and state.pixels is None:
-                        measure_pixels(state, scene, device)
                     state = seek_size(state, iteration, scene.train, config, device, go, tell)
                     loss = go(state, iteration)
-                    if config.filter_3d and (state.pixels is None or iteration % FILTER_EVERY == 0):
-                        measure_pixels(state, scene, device)
             except DeviceError as error:
                 raise DeviceError(
                     f"iteration {iteration}: {error}; the last checkpoint in {out}, if there is one, is intact: "
@@ -175,7 +177,7 @@ def train(
     if not state.search:
         return fetch(filtered(state, device))
     size.write_report(out / "size.json", state.search, config)
-    return size.without_useless_bands(fetch(state.gaussians), as_seen(scene.train, state), config, device)
+    return size.without_useless_bands(fetch(filtered(state, device)), as_seen(scene.train, state), config, device)
 
 
 def advance(
@@ -188,11 +190,14 @@ def advance(
     device: "Device",
 ) -> float:
     """One iteration and the edit that is due after it. Changes `state`, returns the loss."""
-    views = size.training_views(views, state.search)
+    if config.filter_3d and state.pixels is None:
+        measure_pixels(state, views, device)
     loss = step(state, iteration, view_at(iteration, views, config.seed), photos, config, device)
     if state.strategy.due(iteration):
         set_cap(state, config, need.most_gaussians(device.memory_limit, state.intersections))
         densify(state, views, config, device)
+    if config.filter_3d and (state.pixels is None or iteration % FILTER_EVERY == 0):
+        measure_pixels(state, views, device)
     return loss
 
 
@@ -221,7 +226,7 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
     optimizer = device if config.optimizer == "device" else None
     gaussians = filtered(state, device)
 
-    progress = size.progress(iteration, config, state.search)
+    progress = (iteration - 1) / max(config.iterations - 1, 1)
     dropout = Dropout(config.dropout * progress, config.seed, iteration) if config.dropout else None
     run = forward(device, gaussians, camera, config.render, background, sh_degree, dropout=dropout)
     state.intersections = max(state.intersections, run.bins.gauss_ids.shape[0] / len(gaussians))
@@ -261,26 +266,6 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
     state.strategy.perturb(stage_functions(optimizer), state.gaussians, iteration, settings.rates["means"])
     state.iteration = iteration
     return loss
-
-
-def on_device(gaussians: Gaussians, device: "Device") -> Gaussians:
-    """The Gaussians on the device, where they are with its optimiser."""
-    return upload(device, gaussians) if isinstance(gaussians.means, np.ndarray) else gaussians
-
-
-def measure_pixels(state: State, scene: Scene, device: "Device") -> None:
-    """What the training cameras resolve at each Gaussian. Changes `state`."""
-    cameras = [view.camera for view in scene.train]
-    state.pixels = stage_functions(device).pixel_sizes(on_device(state.gaussians, device), cameras)
-
-
-def filtered(state: State, device: "Device") -> Gaussians:
-    """The Gaussians on the device as they are shown and saved: under the 3D filter, if there is one."""
-    gaussians = on_device(state.gaussians, device)
-    if state.pixels is None:
-        return gaussians
-    shown: Gaussians = stage_functions(device).filter_fwd(gaussians, state.pixels)
-    return shown
 
 
 def densify(state: State, views: list[View], config: TrainConfig, device: "Device") -> None:
@@ -325,10 +310,7 @@ def _apply(edit: Edit, state: State) -> None:
 
 def initial_state(scene: Scene, config: TrainConfig) -> State:
     """The state before the first iteration."""
-    init = config.init
-    if init.opacity is None:
-        init = replace(init, opacity=STRATEGIES[config.strategy].start_opacity)
-    gaussians = initialize(scene, init, config.seed, config.max_gaussians)
+    gaussians = initialize(scene, start_config(config), config.seed, config.max_gaussians)
     strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
     search = size.Search(len(gaussians)) if config.size == "auto" and size.can_search(scene.train) else None
     state = State(0, 0.0, scene.extent, gaussians, Moments.zeros(gaussians), strategy, search=search)
@@ -336,3 +318,13 @@ def initial_state(scene: Scene, config: TrainConfig) -> State:
     state.exposures = exposure.start(names) if config.exposure else None
     state.poses = poses.start(names) if config.poses else None
     return state
+
+
+def start_config(config: TrainConfig) -> InitConfig:
+    """What the first Gaussians are like, where the configuration leaves it to strategy and search."""
+    init = config.init
+    if init.opacity is None:
+        init = replace(init, opacity=STRATEGIES[config.strategy].start_opacity)
+    if init.random_points is None and config.size == "auto":
+        init = replace(init, random_points=size.RANDOM_START)
+    return init

@@ -313,7 +313,7 @@ def run_cell(cell: Cell, scene: Scene, evaluator: Device, record: Callable[[Reco
         # Of what a file format cannot hold: once per cell would be too often.
         warnings.simplefilter("ignore")
         out = Path(folder)
-        train(scene, replace(config, iterations=WARM_UP, size="fixed"), device, out)
+        train(scene, replace(config, iterations=WARM_UP, strategy="adc", size="fixed"), device, out)
         clocks = time.perf_counter, time.process_time
         evaluating = np.zeros(2)
         pending = iter(at)

@@ -69,6 +69,7 @@ class Train:
         from clsplat.initialize import start_size
         from clsplat.io import load_scene, save_gaussians, suffix_of
         from clsplat.memory import Footprint, parse_size
+        from clsplat.train import start_config
         from clsplat.video import extract_frames, is_video
 
         suffix = "" if self.out.is_dir() else suffix_of(self.out)
@@ -96,7 +97,7 @@ class Train:
                 "left out of each image (--few.below 0 trains as with many)"
             )
         need = Footprint.of(scene, config, device)
-        start = start_size(scene, config.init, config.max_gaussians)
+        start = start_size(scene, start_config(config), config.max_gaussians)
         say(need.describe(start, config.max_gaussians, device.memory_limit))
         new_folder(out)
         write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})

@@ -19,6 +19,11 @@ CHILD_SCALE = 0.6
 CHILD_OFFSET = 0.8
 CHILD_OPACITY = 1 / (2 * CHILD_SCALE)
 
+HARM = 0.2
+"""Gaussians go while others grow if the error would fall by this part of an even share of it. None of them would
+leave the fog of a random start (lego, 200x200: 28.7 dB in the place of 30.8); all whose removal would lower the error
+at all cost fern 0.2 dB."""
+
 
 class ErrorGuided(Strategy):
     """Splits the Gaussians to which most of the squared error of photos falls.
@@ -47,11 +52,12 @@ class ErrorGuided(Strategy):
         weights, errors, prices = survey(self.config.views)
         target = self.schedule.size_after(iteration, n, self.max_gaussians)
         doomed = gaussians.opacities <= self.config.opacity_min
-        if target >= self.max_gaussians:
-            # What no photo of the survey shows may be needed by the others.
-            seen = np.flatnonzero(weights > 0)
-            count = np.clip((prices[seen] <= 0).sum(), self.config.replaced * n, self.config.replaced_most * n)
-            doomed[seen[np.argsort(prices[seen], kind="stable")[: int(count)]]] = True
+        # What no photo of the survey shows may be needed by the others.
+        seen = np.flatnonzero(weights > 0)
+        full = target >= self.max_gaussians
+        harmful = (prices[seen] <= (0 if full else -HARM * errors.sum() / n)).sum()
+        count = np.clip(harmful, self.config.replaced * n if full else 0, self.config.replaced_most * n)
+        doomed[seen[np.argsort(prices[seen], kind="stable")[: int(count)]]] = True
         live = np.flatnonzero(~doomed)
         if len(live) == 0:
             return Edit(gaussians, np.arange(n), np.zeros(n, bool))

@@ -13,8 +13,11 @@ GROWTH_SHORTEST = 100
 """Iterations of a trial of growth at least: the strategies' rounds are so far apart."""
 
 TRIAL_GROWTH = sqrt(2)
-"""Factor by which the Gaussians grow in a trial. Twice as many in one round are a split of each, wherever it is:
-fox_pinhole at 135x240 then ended 0.8 dB below a growth to the same number by parts."""
+"""Factor by which the Gaussians grow in a window of growth, if that has rounds enough for `MOST_GROWTH`."""
+
+MOST_GROWTH = 1.25
+"""Factor by which they grow in a round at most. Twice as many in one round are a split of each, wherever it is: 1.41
+ended 0.4 dB, 2 ended 0.8 dB below a growth to the same number by parts (fox_pinhole, 135x240, 2000 iterations)."""
 
 
 def growth_window(config: TrainConfig) -> int:
@@ -42,7 +45,8 @@ class Schedule:
         self.start = config.shortened(settings.start)
         self.full = round(settings.full_fraction * config.iterations)
         self.stop = round(settings.stop_fraction * config.iterations)
-        self.factor = TRIAL_GROWTH ** min(1, self.every / growth_window(config)) if config.size == "auto" else 0
+        steady = TRIAL_GROWTH ** (self.every / growth_window(config))
+        self.factor = min(MOST_GROWTH, steady) if config.size == "auto" else 0
 
     def due(self, iteration: int) -> bool:
         """Whether a round is due after an iteration, counted from 1."""
