@@ -244,10 +244,10 @@ def surely_short(grown: list[Trial], price: float) -> float:
     if not grown:
         return 0
     smaller, larger = grown[-1].smaller, grown[-1].larger
-    if larger.n == smaller.n:
+    if larger.psnr <= smaller.psnr:
         return 0
     gain = (larger.psnr - smaller.psnr) / log2(larger.n / smaller.n)
-    return larger.n * sqrt(max(gain / max(price, 1e-9), 1))
+    return larger.n * sqrt(gain / price) if gain > price else 0
 
 
 def costliest_rows(

@@ -15,7 +15,7 @@ from clsplat.gaussians import Gaussians, logit
 from clsplat.testing import synthetic_scene
 
 N = 200
-CONFIG = TrainConfig(iterations=2000, adc=AdcConfig(start=350))
+CONFIG = TrainConfig(strategy="adc", size="fixed", iterations=2000, adc=AdcConfig(start=350))
 SIZE = (64, 48)
 
 

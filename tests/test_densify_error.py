@@ -13,7 +13,7 @@ from clsplat.reference.project import rotations
 from clsplat.testing import synthetic_scene
 
 N = 100
-CONFIG = TrainConfig(iterations=2000, strategy="error", max_gaussians=N)
+CONFIG = TrainConfig(size="fixed", iterations=2000, strategy="error", max_gaussians=N)
 
 
 def scene() -> Gaussians:

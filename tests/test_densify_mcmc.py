@@ -15,7 +15,7 @@ from clsplat.reference.adam import adam_step
 from clsplat.testing import synthetic_scene
 
 N = 300
-CONFIG = TrainConfig(iterations=2000, strategy="mcmc", max_gaussians=N)
+CONFIG = TrainConfig(size="fixed", iterations=2000, strategy="mcmc", max_gaussians=N)
 
 
 def survey(views: int) -> Contributions:

@@ -62,7 +62,15 @@ def test_what_is_predicted_is_allocated(
     if gpu:
         device.is_cpu = False  # type: ignore[misc]  # shadows the cached property
     scene = make_scene(n, width, height)
-    config = TrainConfig(iterations=6, eval_every=3, adc=FIXED_N, render=RenderConfig(sort=sort), exposure=gpu)
+    config = TrainConfig(
+        strategy="adc",
+        size="fixed",
+        iterations=6,
+        eval_every=3,
+        adc=FIXED_N,
+        render=RenderConfig(sort=sort),
+        exposure=gpu,
+    )
 
     def evaluate(gaussians: Gaussians) -> dict[str, float]:
         return {"mean": float(np.mean([r.rgb.mean() for r in render_views(gaussians, cameras, device=device)]))}
@@ -96,7 +104,7 @@ def test_the_steady_state_allocates_nothing(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(Device, "_allocate", counted)
     still = OptimConfig(1e-9, 1e-9, log_scales_lr=0, quats_lr=0, logit_opacities_lr=0)  # lists stay as they are
-    config = TrainConfig(iterations=30, adc=FIXED_N, optim=still)
+    config = TrainConfig(strategy="adc", size="fixed", iterations=30, adc=FIXED_N, optim=still)
     train(make_scene(2000, 96, 64, 6), config, device, tmp_path, progress=lambda _: done.append(1))
     # Each of the 6 views comes for the first time, with lists of its own length.
     assert set(new) > {0} and max(new) < 6
@@ -126,6 +134,7 @@ def test_growth_stops_where_memory_ends(tmp_path: Path, strategy: str) -> None:
     scene = make_scene(1500, 96, 64)
     adc = AdcConfig(start=1, every=5, grad_threshold=1e-7, stop_fraction=1)
     config = TrainConfig(
+        size="fixed",
         iterations=30,
         strategy=strategy,
         max_gaussians=12_000,
@@ -170,7 +179,7 @@ def test_masks_count_too(device: Device) -> None:
 
 def test_running_out_of_memory_leaves_the_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, device = make_scene(300, 48, 32), Device()
-    config = TrainConfig(iterations=12, checkpoint_every=5, adc=FIXED_N)
+    config = TrainConfig(strategy="adc", size="fixed", iterations=12, checkpoint_every=5, adc=FIXED_N)
     done: list[int] = []
     allocate = Device._allocate
 
@@ -192,7 +201,7 @@ def test_running_out_of_memory_leaves_the_checkpoint(tmp_path: Path, monkeypatch
 
 
 def test_a_limit_does_not_change_the_result_where_it_holds_nothing_back(tmp_path: Path) -> None:
-    scene, config = make_scene(300, 48, 32), TrainConfig(iterations=8, adc=FIXED_N)
+    scene, config = make_scene(300, 48, 32), TrainConfig(strategy="adc", size="fixed", iterations=8, adc=FIXED_N)
     free = Device()
     expected = train(scene, config, free, tmp_path)
     with warnings.catch_warnings():

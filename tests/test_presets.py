@@ -28,8 +28,8 @@ def test_the_presets_are_those_that_are_promised():
 def test_a_preset_sets_what_it_holds_and_nothing_else(name):
     config = load_preset(name)
     assert config.strategy in STRATEGIES
-    # mcmc and error need a cap.
-    assert config.strategy == "adc" or config.max_gaussians
+    # mcmc and error need a cap, or a search for one.
+    assert config.strategy == "adc" or config.max_gaussians or config.size == "auto"
     held = dict(leaves(read_settings(FOLDER / f"{name}.json")))
     for path, value in leaves(asdict(config)):
         default = asdict(TrainConfig())
@@ -38,10 +38,14 @@ def test_a_preset_sets_what_it_holds_and_nothing_else(name):
         assert value == held.get(path, default), path
 
 
-def test_the_papers_presets_are_its_iterations_and_the_defaults():
-    assert load_preset("paper-7k") == replace(TrainConfig(), iterations=7000)
-    assert load_preset("paper-30k") == replace(TrainConfig(), iterations=30_000)
-    assert TrainConfig().strategy == "adc"
+def test_the_papers_presets_are_its_strategy_and_iterations():
+    paper = TrainConfig(strategy="adc", size="fixed")
+    assert load_preset("paper-7k") == replace(paper, iterations=7000)
+    assert load_preset("paper-30k") == replace(paper, iterations=30_000)
+
+
+def test_the_size_is_sought_by_default():
+    assert load_preset("auto") == TrainConfig()
 
 
 def test_what_was_saved_is_read_back(tmp_path):

@@ -26,7 +26,7 @@ def test_held_out_quality(
     shared: Path, device: Device, tmp_path: Path, name: str, data: DataConfig, iterations: int, psnr: float
 ) -> None:
     scene = load_scene(shared / "data" / name, data)
-    config = TrainConfig(iterations=iterations, data=data)
+    config = TrainConfig(strategy="adc", size="fixed", iterations=iterations, data=data)
     gaussians = train(scene, config, device, tmp_path)
     figures = mean_metrics(gaussians, scene.test, config.render, device, BACKGROUNDS[data.background])
     print(name, figures, len(gaussians))

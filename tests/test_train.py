@@ -28,6 +28,8 @@ from clsplat.train import _apply, initial_state, step, train, view_at
 SIZE = (40, 32)
 EACH_STRATEGY = pytest.mark.parametrize("strategy", STRATEGIES)
 CONFIG = TrainConfig(
+    strategy="adc",
+    size="fixed",
     iterations=60,
     checkpoint_every=25,
     init=InitConfig(sh_degree=1),
@@ -266,10 +268,19 @@ def test_training_goes_from_small_photos_to_whole_ones(
     assert widths == 15 * [20] + 12 * [40]
 
 
-def test_small_photos_while_the_size_is_sought_are_refused(scene: Scene, device: Device, tmp_path: Path) -> None:
-    config = replace(CONFIG, size="auto", coarse=CoarseConfig(factor=2))
-    with pytest.raises(InputError, match=r"--coarse\.factor: expected 1 with --size auto, .* found 2"):
-        train(scene, config, device, tmp_path)
+def test_small_photos_train_while_the_size_is_sought(
+    scene: Scene, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without what validates in them, at every size."""
+    seen: list[tuple[int, bool]] = []
+
+    def recorded(state: State, iteration: int, view: View, *rest: Any) -> float:
+        seen.append((view.camera.width, view.mask is not None))
+        return step(state, iteration, view, *rest)
+
+    monkeypatch.setattr(sys.modules["clsplat.train"], "step", recorded)
+    train(scene, replace(CONFIG, size="auto", coarse=CoarseConfig(factor=2)), device, tmp_path)
+    assert set(seen) == {(20, True), (40, True), (40, False)}
 
 
 def test_each_round_surveys_photos_of_its_own(

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from test_train import CONFIG, same, scene  # noqa: F401  (a fixture)
 
-from clsplat import ops, reference
+from clsplat import ops, reference, size
 from clsplat.checkpoint import load_state, move
 from clsplat.constants import FILTER_VARIANCE
-from clsplat.errors import InputError
 from clsplat.render import fetch
 from clsplat.train import _apply, _edit, filtered, initial_state, train
 
@@ -90,6 +89,27 @@ def test_a_reset_lowers_what_is_shown(needles, device, tmp_path):
     np.testing.assert_allclose(after, np.minimum(before, config.adc.reset_opacity), rtol=1e-3)
 
 
-def test_a_search_for_the_size_is_refused(needles, device, tmp_path):
-    with pytest.raises(InputError, match="--filter-3d: expected --size fixed"):
-        train(needles, replace(FILTERED, size="auto"), device, tmp_path)
+def test_the_search_for_the_size_sees_what_is_shown(needles, device, tmp_path):
+    """What is validated, and what the run ends with, is under the filter; resumed, to the same bits."""
+    config = replace(FILTERED, size="auto", iterations=100, size_price=8.0, checkpoint_every=1000)
+    cameras = [view.camera for view in needles.train]
+    validated = []
+    validate = size.validate
+
+    def spy(gaussians, *rest):
+        validated.append(thinnest(gaussians, cameras))
+        return validate(gaussians, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(size, "validate", spy)
+        whole = train(needles, config, device, tmp_path / "whole")
+    assert len(validated) > 4 and min(validated) > 0.99
+    assert len(whole) < len(needles.points) and thinnest(whole, cameras) > 0.99
+
+    def stop(record):
+        if record["iteration"] == 67:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(needles, config, device, tmp_path / "cut", progress=stop)
+    assert same(train(needles, config, device, tmp_path / "cut", resume=True), whole)

@@ -13,7 +13,7 @@ import pytest
 from browser import browser, wait_for
 
 from clsplat.camera import Camera
-from clsplat.config import OptimConfig, RenderConfig, TrainConfig
+from clsplat.config import RenderConfig, TrainConfig
 from clsplat.errors import DeviceError, InputError
 from clsplat.metrics import psnr, to_uint8
 from clsplat.ops import count_pairs
@@ -209,7 +209,7 @@ def small_training(device, out, progress=lambda record: None, **options):
     photos = [View(f"{i}.png", c, to_uint8(render(gaussians, c, device=device).rgb)) for i, c in enumerate(cams)]
     points = gaussians.means[:100].astype(np.float64)
     scene = Scene(photos, [], points, np.full((100, 3), 128, np.uint8))
-    config = TrainConfig(iterations=12, max_gaussians=150, eval_every=0, optim=OptimConfig(), **options)
+    config = TrainConfig(strategy="adc", size="fixed", iterations=12, max_gaussians=150, eval_every=0, **options)
     return train(scene, config, device, out, progress=progress)
 
 

@@ -111,7 +111,7 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
         CPU time over the number of cores.
     """
     gaussians, view = workload.gaussians, workload.view
-    config = TrainConfig(render=render, optim=STILL)
+    config = TrainConfig(strategy="adc", size="fixed", render=render, optim=STILL)
     background = BACKGROUNDS[config.data.background]
     run = forward(device, upload(device, gaussians), view.camera, render, background, gaussians.sh_degree)
     evaluated, accepted = (int(a.get().sum(dtype=np.uint64)) for a in ops.count_pairs(device, run.splats, run.bins))

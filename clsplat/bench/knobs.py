@@ -93,7 +93,9 @@ class _Run:
         self.config, self.camera, self.degree = setting.render, workload.view.camera, gaussians.sh_degree
         self.gaussians = upload(self.device, gaussians)
         if setting.trains:
-            config = TrainConfig(render=setting.render, optim=STILL, optimizer=setting.optimizer)
+            config = TrainConfig(
+                strategy="adc", size="fixed", render=setting.render, optim=STILL, optimizer=setting.optimizer
+            )
             self.step = training_step(replace(workload, gaussians=gaussians), config, self.device)
 
     def render(self) -> Any:

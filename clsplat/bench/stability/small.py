@@ -17,6 +17,8 @@ from clsplat.testing import synthetic_scene
 SIZE = (40, 32)
 
 CONFIG = TrainConfig(
+    strategy="adc",
+    size="fixed",
     iterations=300,
     eval_every=0,
     checkpoint_every=100,

@@ -14,19 +14,15 @@ from clsplat.gaussians import Gaussians
 from clsplat.io import load_scene
 from clsplat.scene import Scene
 
-SCENES = {
-    "fern": TrainConfig(iterations=500, eval_every=0, data=DataConfig(downscale=8)),
-    "fox_pinhole": TrainConfig(iterations=500, eval_every=0, data=DataConfig(downscale=8)),
-    "castle_p30": TrainConfig(iterations=500, eval_every=0, data=DataConfig(downscale=8)),
-}
-"""Folder of the scene -> how it is trained: fern at 120x90, fox_pinhole at 67x120, castle_p30 at 96x64."""
+SHORT = TrainConfig(strategy="adc", size="fixed", iterations=500, eval_every=0, data=DataConfig(downscale=8))
+"""Of fern at 120x90, fox_pinhole at 67x120, castle_p30 at 96x64."""
 
 
 def load(data: Path | None, name: str) -> tuple[Scene, TrainConfig]:
     """A real scene and the configuration it is trained with."""
     if data is None:
         raise InputError("data: expected the folder of real scenes, found none")
-    return load_scene(data / name, SCENES[name].data), SCENES[name]
+    return load_scene(data / name, SHORT.data), SHORT
 
 
 def trained(scene: Scene, config: TrainConfig, device: Device) -> Gaussians:
