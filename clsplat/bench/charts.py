@@ -15,6 +15,7 @@ from clsplat.bench.summary import (
     COSTS,
     MEAN,
     METRICS,
+    TIMES,
     Quantity,
     Run,
     best_settings,
@@ -101,7 +102,7 @@ def _panel(axes: "Axes", of_panel: list[Run], cost: str, metric: str, colors: di
             continue
         color = colors[run.method]
         x, y = run.last[cost], run.last[metric]
-        if cost == "seconds":
+        if cost in TIMES:
             path = [(s[cost], s[metric]) for s in run.samples if coordinates(s, cost, metric) is not None]
             axes.plot(*zip(*path, strict=True), color=color, linewidth=1, alpha=0.6, zorder=2)
             axes.plot(*zip(*path, strict=True), ".", color=color, markersize=3.5, alpha=0.6, zorder=2)
@@ -114,7 +115,7 @@ def _panel(axes: "Axes", of_panel: list[Run], cost: str, metric: str, colors: di
     best = [(run.last[cost], run.last[metric]) for run in best_settings(of_panel, cost, metric)]
     _dashes(axes, best, COSTS[cost].less_is_better)
     _dress(axes, COSTS[cost], METRICS[metric])
-    _limits(axes, ends, SHOWN_BELOW[metric] if cost == "seconds" else 0.0, METRICS[metric].less_is_better)
+    _limits(axes, ends, SHOWN_BELOW[metric] if cost in TIMES else 0.0, METRICS[metric].less_is_better)
     return labels
 
 
@@ -122,7 +123,7 @@ def _method_lines(of_method: list[Run], cost: str, metric: str) -> list[list[tup
     """For the time, the front of all samples of several settings; otherwise, the ends of those of unlike caps."""
     if len(of_method) < 2:
         return []
-    if cost == "seconds":
+    if cost in TIMES:
         points = [p for run in of_method for s in run.samples if (p := coordinates(s, cost, metric)) is not None]
         sign = 1 if METRICS[metric].less_is_better else -1
         return [_steps([(points[i][0], sign * points[i][1]) for i in front(points)], post=True)]

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 NAMES = {
     "seconds": "time",
+    "cpu_seconds": "processor-time",
     "num_gaussians": "gaussians",
     "spz_bytes": "bytes",
     "memory_bytes": "memory",
@@ -26,6 +27,8 @@ NAMES = {
 NOTES = {
     "seconds": "Wall time of training, from its start to its end: without evaluation, without reading the photos and "
     "building the kernels. On the way, learning rates are those of a training that goes on.",
+    "cpu_seconds": "The same in seconds of all the host's cores: beside other work wall times are longer, these "
+    "hardly. Where a GPU trains, it is the host's part.",
     "num_gaussians": "At the end of training.",
     "spz_bytes": "Written as .spz, at the end of training; a .ply has up to ten times as many.",
     "memory_bytes": "The most that buffers took on the device while it trained, photos included.",

@@ -51,12 +51,16 @@ METRICS = {
 
 COSTS = {
     "seconds": Quantity("training time", "s", _two_digits),
+    "cpu_seconds": Quantity("processor time", "s", _two_digits),
     "num_gaussians": Quantity("Gaussians", "", short),
     "spz_bytes": Quantity("file (.spz)", "MB", _megabytes),
     "memory_bytes": Quantity("device memory", "MB", _megabytes),
     "fps": Quantity("rendering speed", "frames/s", _two_digits, less_is_better=False),
 }
 """What quality is charted against."""
+
+TIMES = ("seconds", "cpu_seconds")
+"""Those that a training spends as it goes on: every sample has its own."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +208,7 @@ def table(finished: list[Run], cost: str) -> list[list[str]]:
                 row.append("")
                 continue
             figures = " / ".join(METRICS[name].text(found[name]) for name in metrics if found[name] is not None)
-            row.append(f"{COSTS[cost].written(found[cost])}: {figures}")
+            row.append(f"{COSTS[cost].written(found.get(cost))}: {figures}")
         rows.append(row)
     return rows
 
