@@ -10,7 +10,7 @@ from clsplat.config import DataConfig
 from clsplat.errors import InputError
 from clsplat.io import load_scene
 from clsplat.io.colmap import FOLDERS, MODELS, find_model, read_dataset, read_model
-from clsplat.io.images import PhotosMissing
+from clsplat.io.files import PhotosMissing
 from clsplat.lenses import Intrinsics
 
 CAMERAS = [(1, "PINHOLE", 64, 48, (50.0, 60.0, 32.0, 24.0)), (7, "SIMPLE_RADIAL", 40, 30, (45.0, 20.0, 15.0, 0.0))]

@@ -9,17 +9,8 @@ from PIL import Image
 from clsplat.camera import Camera
 from clsplat.config import DataConfig
 from clsplat.errors import InputError
-from clsplat.io.images import (
-    Dataset,
-    PhotosMissing,
-    PosedPhoto,
-    _positions,
-    checked_name,
-    find_mask,
-    load_views,
-    locate,
-    mask_folder,
-)
+from clsplat.io.files import PhotosMissing, checked_name, find_mask, locate, mask_folder
+from clsplat.io.images import Dataset, PosedPhoto, _positions, load_views
 from clsplat.lenses import Intrinsics, project, undistorted
 
 RNG = np.random.default_rng(11)

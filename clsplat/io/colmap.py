@@ -11,17 +11,8 @@ from numpy.typing import NDArray
 
 from clsplat.config import DataConfig
 from clsplat.errors import InputError
-from clsplat.io.images import (
-    SIZE_MAX,
-    Dataset,
-    PhotosMissing,
-    PosedPhoto,
-    checked_name,
-    find_mask,
-    locate,
-    mask_folder,
-    warn_of_missing,
-)
+from clsplat.io.files import PhotosMissing, checked_name, find_mask, locate, mask_folder, warn_of_missing
+from clsplat.io.images import SIZE_MAX, Dataset, PosedPhoto
 from clsplat.lenses import Intrinsics
 
 MODELS: tuple[tuple[str, int], ...] = (

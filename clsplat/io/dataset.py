@@ -10,7 +10,8 @@ from clsplat.config import DataConfig, SfmConfig
 from clsplat.constants import NEAR
 from clsplat.errors import InputError
 from clsplat.io import colmap, transforms
-from clsplat.io.images import Dataset, PhotosMissing, by_faces, load_views
+from clsplat.io.files import PhotosMissing
+from clsplat.io.images import Dataset, by_faces, load_views
 from clsplat.photos import list_photos
 from clsplat.scene import Scene, View
 

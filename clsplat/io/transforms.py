@@ -14,16 +14,8 @@ from numpy.typing import NDArray
 
 from clsplat.config import DataConfig
 from clsplat.errors import InputError
-from clsplat.io.images import (
-    SIZE_MAX,
-    Dataset,
-    PosedPhoto,
-    checked_name,
-    find_mask,
-    locate,
-    mask_folder,
-    warn_of_missing,
-)
+from clsplat.io.files import checked_name, find_mask, locate, mask_folder, warn_of_missing
+from clsplat.io.images import SIZE_MAX, Dataset, PosedPhoto
 from clsplat.io.ply import read_points
 from clsplat.lenses import Intrinsics
 from clsplat.photos import photo_size
