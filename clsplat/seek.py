@@ -66,7 +66,8 @@ def seek_size(
     if config.filter_3d and state.pixels is None:
         measure_pixels(state, training, device)
     search.most = len(state.gaussians)
-    todo = size.next_trial(search, iteration, config)
+    most = size.most_identifiable(views, config)
+    todo = size.next_trial(search, iteration, config, most)
     if todo == "settle":
         here = size.Kept(state.gaussians, state.moments, state.strategy.statistics)
         shown = fetch(filtered(state, device))
@@ -84,7 +85,7 @@ def seek_size(
         kept = size.Kept(trial.gaussians, trial.moments, trial.strategy.statistics)
         search.rival = size.Rival(kept, point(end, trial, seen))
     if todo in ("grow", "try"):
-        search.most = ceil(TRIAL_GROWTH * search.most)
+        search.most = min(most, ceil(TRIAL_GROWTH * search.most))
     if config.optimizer == "device":
         move(state, device)
     return state

@@ -162,6 +162,10 @@ def can_search(views: list[View]) -> bool:
     return len(views) >= FEWEST_PHOTOS
 
 
+BAND_SHARES = (1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
+"""Of the bands that seem useless one by one. All of them together cost fox_pinhole 0.2 dB (135x240, 7000
+iterations)."""
+
 RANDOM_START = 10_000
 """Gaussians of a random start: fog, which the photos dissolve before it grows to what they show."""
 
@@ -218,15 +222,22 @@ def point(iteration: int, n: int, sh_degree: int, seen: list[list[float]], confi
     return Point(iteration, n, sh_degree, mean, views, mean - config.size_price * log2(n * sh_bytes(sh_degree)))
 
 
+def most_identifiable(views: list[View], config: TrainConfig) -> int:
+    """The number of Gaussians that have as many parameters as the photos have values; more cannot be told apart."""
+    values = 3 * sum(v.image[:, :, 0].size if v.mask is None else int(v.mask.sum()) for v in views)
+    return min(config.max_gaussians or MOST_GAUSSIANS, max(1, values * 4 // sh_bytes(config.init.sh_degree)))
+
+
 def next_trial(
-    search: Search, iteration: int, config: TrainConfig
+    search: Search, iteration: int, config: TrainConfig, most: int
 ) -> Literal["grow", "try", "rest", "shrink", "settle"]:
-    """What follows at one of the `stops`: growth with or without a trial, pruning in one, nothing, or the end."""
+    """What follows at one of the `stops`: growth with or without a trial, up to `most` Gaussians, pruning in one,
+    nothing, or the end."""
     grown = [trial for trial in search.trials if trial.grows]
     if iteration < first_shrink(config):
         lost = [trial.takes_smaller for trial in grown[-LOST_GROWTH:]]
         ended = (len(lost) == LOST_GROWTH and all(lost)) or iteration >= round(GROWTH_END * config.iterations)
-        if ended or search.most >= (config.max_gaussians or MOST_GAUSSIANS):
+        if ended or search.most >= most:
             return "rest"
         return "try" if search.most >= surely_short(grown, config.size_price) else "grow"
     shrunk = [trial for trial in search.trials if not trial.grows]
@@ -283,9 +294,20 @@ def settle(
 def without_useless_bands(
     gaussians: Gaussians, views: list[View], config: TrainConfig, device: "Device"
 ) -> Gaussians:
-    """Zero, per Gaussian, the bands of the spherical harmonics without which the error is no larger."""
-    prices = price(gaussians, views, config.render, device, BACKGROUNDS[config.data.background])
-    return without_bands(gaussians, prices.bands, 0.0)
+    """Zero, per Gaussian, the bands of the spherical harmonics without which the photos are rendered no worse.
+
+    Each is priced alone; of many together the cheapest are taken, half as many until the photos agree.
+    """
+    some = views[:: -(-len(views) // PRICING)]
+    bands = price(gaussians, some, config.render, device, BACKGROUNDS[config.data.background]).bands
+    degree = gaussians.sh_degree
+    before = np.mean(validate(gaussians, some, config, device, degree))
+    useless = bands[bands <= 0]
+    for share in BAND_SHARES if len(useless) else ():
+        fewer = without_bands(gaussians, bands - np.quantile(useless, share), 0.0)
+        if np.mean(validate(fewer, some, config, device, degree)) >= before:
+            return fewer
+    return gaussians
 
 
 def lower_degree(kept: Kept, degree: int) -> Kept:

@@ -23,6 +23,7 @@ from clsplat.size import (
     can_search,
     costliest_rows,
     looks,
+    most_identifiable,
     next_trial,
     point,
     sh_bytes,
@@ -135,7 +136,7 @@ def test_growth_that_pays_many_times_needs_no_trial() -> None:
     assert surely_short(grown(0.09), 0.1) == surely_short(grown(-3.0), 0.1) == 0, "at once"
     config = replace(CONFIG, iterations=2000, size_price=0.1)
     for most, todo in ((5500, "grow"), (5700, "try")):
-        assert next_trial(Search(most, grown(1.6)), 600, config) == todo
+        assert next_trial(Search(most, grown(1.6)), 600, config, 10**6) == todo
     same = point(1, 100, 3, [[30.0, 31.0]], CONFIG)
     assert surely_short([Trial(True, same, same)], 0.1) == 0, "nothing has grown"
 
@@ -158,9 +159,9 @@ def test_trials_follow_each_other() -> None:
         ([True, False, True], "try"),
         ([False, True, True], "rest"),
     ):
-        assert next_trial(Search(100, trials_of(True, *lost)), 600, config) == todo, lost
-    assert next_trial(Search(100), 1000, config) == "rest", "in the middle of the run"
-    assert next_trial(Search(100), 200, replace(config, max_gaussians=100)) == "rest", "at the cap"
+        assert next_trial(Search(100, trials_of(True, *lost)), 600, config, 1000) == todo, lost
+    assert next_trial(Search(100), 1000, config, 1000) == "rest", "in the middle of the run"
+    assert next_trial(Search(100), 200, config, 100) == "rest", "at the cap"
     # What growth came to does not matter to pruning.
     grown = trials_of(True, False, False)
     cases: tuple[tuple[list[bool], int, str], ...] = (
@@ -170,7 +171,18 @@ def test_trials_follow_each_other() -> None:
         ([True] * 5, 1700, "settle"),
     )
     for pruned, iteration, todo in cases:
-        assert next_trial(Search(100, [*grown, *trials_of(False, *pruned)]), iteration, config) == todo, pruned
+        assert next_trial(Search(100, [*grown, *trials_of(False, *pruned)]), iteration, config, 1000) == todo, pruned
+
+
+def test_parameters_are_no_more_than_values() -> None:
+    """By hand: 2 photos of 40x30 pixels, of which one shows its left half only, have 3 * 1800 values; a Gaussian of
+    degree 0 has 14 parameters."""
+    camera = Camera(np.eye(4), 30, 30, 20, 15, 40, 30)
+    half = np.arange(40)[None] < np.full((30, 1), 20)
+    views = [View(str(mask is None), camera, np.zeros((30, 40, 3), np.uint8), mask) for mask in (None, half)]
+    config = replace(CONFIG, init=InitConfig(sh_degree=0))
+    assert most_identifiable(views, config) == 3 * 1800 // 14
+    assert most_identifiable(views, replace(config, max_gaussians=7)) == 7
 
 
 def test_worth_counts_doublings_of_bytes() -> None:

@@ -44,6 +44,8 @@ def test_what_changes_where_photos_are_few(scene):
     assert (few.init.sh_degree, few.max_gaussians, few.dropout) == (1, 2 * len(scene.points), 0.2)
     assert few_views.adapted(few, scene) == few, "a resumed run, and one from its config.json, continue"
     assert few_views.adapted(replace(config, max_gaussians=7), scene).max_gaussians == 7
+    sought = few_views.adapted(replace(config, strategy="error", size="auto"), scene)
+    assert sought == few, "there are too few photos to seek the size by"
     # A random start grows as it is told.
     assert few_views.adapted(config, replace(scene, points=scene.points[:0])).max_gaussians is None
     assert few_views.adapted(config, replace(scene, train=scene.train * 3)) == config
