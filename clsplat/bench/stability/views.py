@@ -78,8 +78,8 @@ def _floaters(device: Device, data: Path | None) -> Found:
     figures = []
     for label, trains, draws in (
         (f"--near {NEAR}", NEAR, NEAR),
-        (f"--near {NEAR}, drawn without it", NEAR, None),
-        ("by itself", None, None),
+        (f"trained with --near {NEAR}, drawn by itself", NEAR, None),
+        ("trained and drawn by itself", None, None),
     ):
         asked = replace(config, render=replace(config.render, near=trains))
         figures.append(Figure(label, worst_view(trained(scene, asked, device), scene, config, draws, device), "dB"))
