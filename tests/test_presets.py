@@ -107,7 +107,7 @@ def test_wrong_settings_are_named(tmp_path, settings, expected):
         (b"", "expected JSON"),
         (b"{", "expected JSON"),
         (b"\xff\xfe", "expected JSON"),
-        (b"[1]", "expected a JSON object"),
+        (b"[1]", "expected an object of settings"),
         (b'{"seed": 1, "seed": 2}', "seed: expected it once, found it 2 times"),
     ],
 )
@@ -124,3 +124,28 @@ def test_missing_files_and_presets(tmp_path: Path):
         load_config(tmp_path / "nothing.json")
     with pytest.raises(InputError, match=r"--preset: expected one of auto, .*found 'slow'"):
         load_preset("slow")
+
+
+def test_yaml_says_the_same(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("iterations: 12  # few\nstrategy: adc\nmax_gaussians: null\noptim:\n  means_lr: 1.0e-3\n")
+    expected = replace(TrainConfig(), iterations=12, strategy="adc", optim=OptimConfig(means_lr=1e-3))
+    assert load_config(path) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("iterations: 12\niterations: 13\n", "iterations: expected it once, found it 2 times"),
+        ("a: [1\n", "expected YAML, found: while parsing"),
+        ("!!python/object/apply:os.system [ls]\n", "expected YAML, found: could not determine a constructor"),
+        ("- 1\n", "expected an object of settings"),
+        ("optim: {means_lr: fast}\n", "optim.means_lr: expected a finite number, found 'fast'"),
+        ("", "expected an object of settings, found None"),
+    ],
+)
+def test_yaml_that_means_nothing_is_refused(tmp_path, text, message):
+    path = tmp_path / "mine.yml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=f"^{path}: .*{message}"):
+        load_config(path)

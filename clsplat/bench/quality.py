@@ -24,7 +24,7 @@ from clsplat.evaluate import mean_metrics
 from clsplat.gaussians import Gaussians
 from clsplat.io import load_scene, save_gaussians
 from clsplat.metrics import flip, psnr, ssim
-from clsplat.presets import load_config, load_preset, with_settings
+from clsplat.presets import YAML, load_config, load_preset, with_settings
 from clsplat.render import render_views
 from clsplat.scene import Scene, View
 from clsplat.train import train
@@ -107,8 +107,10 @@ def _value(text: str) -> Any:
 
 
 def parse_method(text: str) -> tuple[str, TrainConfig]:
-    """A method's name and settings: a preset, or a JSON file as ``train --config`` takes it."""
-    return (Path(text).stem, load_config(Path(text))) if text.endswith(".json") else (text, load_preset(text))
+    """A method's name and settings: a preset, or a file as ``train --config`` takes it."""
+    return (
+        (Path(text).stem, load_config(Path(text))) if text.endswith((".json", *YAML)) else (text, load_preset(text))
+    )
 
 
 def parse_budget(text: str, own: int | None) -> int | None:

@@ -7,6 +7,8 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+import yaml
+
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 
@@ -14,6 +16,9 @@ FOLDER = Path(__file__).parent
 
 PRESETS = tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
 """Names that `load_preset` knows."""
+
+YAML = (".yaml", ".yml")
+"""Suffixes of files that are read as such."""
 
 DATA_PATH = "data_path"
 """What config.json says besides the configuration: where the dataset was."""
@@ -37,7 +42,7 @@ def load_preset(name: str) -> TrainConfig:
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Read a configuration from a JSON file: the config.json of a run, or a part of one.
+    """Read a configuration from a JSON or YAML file: the config.json of a run, or a part of one.
 
     Parameters
     ----------
@@ -47,8 +52,8 @@ def load_config(path: Path) -> TrainConfig:
     Raises
     ------
     InputError
-        If the file cannot be read or is no JSON object, if `TrainConfig` has no such setting, or if a value is not of
-        its type or none of its choices; the message names file and setting.
+        If the file cannot be read or is no object of settings, if `TrainConfig` has no such setting, or if a value is
+        not of its type or none of its choices; the message names file and setting.
     """
     settings = read_settings(path)
     settings.pop(DATA_PATH, None)
@@ -56,7 +61,7 @@ def load_config(path: Path) -> TrainConfig:
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """The JSON object in a file, each key of which stands there once."""
+    """The object in a file of JSON or, by its suffix, YAML, each key of which stands there once."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         names = [name for name, _ in pairs]
@@ -65,14 +70,28 @@ def read_settings(path: Path) -> dict[str, Any]:
                 raise InputError(f"{path}: {name}: expected it once, found it {names.count(name)} times")
         return dict(pairs)
 
+    class Loader(yaml.SafeLoader):
+        """Whose objects are as those of JSON."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            return once(
+                [(str(self.construct_object(key)), self.construct_object(value, True)) for key, value in node.value]
+            )
+
     try:
-        settings = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=once)
+        text = path.read_text(encoding="utf-8")
+        if path.suffix in YAML:
+            settings = yaml.load(text, Loader)
+        else:
+            settings = json.loads(text, object_pairs_hook=once)
     except OSError as error:
         raise InputError(f"{path}: expected a configuration that can be read, found: {error.strerror}") from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise InputError(f"{path}: expected JSON, found: {error}") from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise InputError(f"{path}: expected YAML, found: {' '.join(str(error).split())}") from error
     if not isinstance(settings, dict):
-        raise InputError(f"{path}: expected a JSON object of settings, found {settings!r:.60}")
+        raise InputError(f"{path}: expected an object of settings, found {settings!r:.60}")
     return settings
 
 
