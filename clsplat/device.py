@@ -341,5 +341,6 @@ class Device:
         ]
         with warnings.catch_warnings():
             # Some drivers report on every success, for example which kernels they vectorised.
-            warnings.simplefilter("ignore", cl.CompilerWarning)
+            if not os.environ.get("PYOPENCL_COMPILER_OUTPUT"):
+                warnings.simplefilter("ignore", cl.CompilerWarning)
             return cl.Program(self.context, inline_includes(f"{stage}.cl", kernel_folder())).build(options)

@@ -118,8 +118,9 @@ def random(cameras: list[Camera], config: InitConfig, seed: int) -> Gaussians:
     Returns
     -------
     Gaussians
-        So many, float32, uniform in the cube around `focus_point` whose half edge is
-        `config.random_extent` times the cameras' mean distance from it; sized as by `from_points`.
+        `config.random_points` of them, RANDOM_POINTS where that is None, float32, uniform in the cube around
+        `focus_point` whose half edge is `config.random_extent` times the cameras' mean distance from it; sized as by
+        `from_points`.
 
     Raises
     ------

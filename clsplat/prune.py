@@ -147,7 +147,7 @@ def removal_order(
     kept = np.arange(len(gaussians))
     gone: list[NDArray[np.intp]] = []
     while True:
-        prices = price(gaussians.take(kept), views, config, device, background)
+        prices = price(gaussians.take(kept), views, config, device, background, bands=False)
         kept = kept[np.argsort(-prices.costs, kind="stable")]
         left = int(ROUND * len(kept))
         if left == 0 or until(gaussians.take(np.sort(kept[:left]))):

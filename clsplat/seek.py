@@ -75,7 +75,7 @@ def seek_size(
         state.gaussians, state.moments, state.strategy.statistics = size.lower_degree(here, chosen)
     elif todo in ("try", "shrink"):
         end = stops[stops.index(iteration) + 1]
-        trial = smaller_side(state, training if todo == "shrink" else None, config, device)
+        trial = smaller_side(state, as_seen(views, state) if todo == "shrink" else None, config, device)
         seen = []
         for i in range(iteration, end):
             tell(trial, go(trial, i))
@@ -95,8 +95,9 @@ def smaller_side(state: State, views: list[View] | None, config: TrainConfig, de
     """A state that shares nothing with this one and has its Gaussians or, given views, those that they would miss
     most."""
     rows = np.arange(len(state.gaussians))
-    if views:
-        rows = size.costliest_rows(fetch(filtered(state, device)), views, config, device)
+    if views and state.search:
+        left = 2 ** -size.halvings(state.search.trials)
+        rows = size.costliest_rows(fetch(filtered(state, device)), left, views, config, device)
     here = size.Kept(state.gaussians, state.moments, state.strategy.statistics)
     gaussians, moments, statistics = here.take(rows)
     strategy, search = copy(state.strategy), state.search and replace(state.search, most=len(rows))

@@ -1,17 +1,15 @@
 """How many Gaussians a scene needs: chosen from its photos (docs/size.md).
 
-Of the training photos some validate. A size is worth its PSNR on them less a price for each doubling of the
+Parts of some training photos validate. A size is worth its PSNR on them less a price for each doubling of the
 Gaussians, and sizes are compared in trials: two copies of the scene that differ in nothing but their size train for
 the same iterations, and the one that is worth more goes on. In the first half of a run the trials are of growth,
 then of Gaussians removed by price. The degree of the spherical harmonics is chosen by the same price on bytes. At the
-end all photos train.
+end all pixels train.
 """
 
-import json
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from math import log, log2, sqrt
-from pathlib import Path
+from math import inf, log2, sqrt
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,10 +19,9 @@ from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.densify.schedule import TRIAL_LENGTH, growth_window
 from clsplat.densify.strategy import MOST_GAUSSIANS
 from clsplat.gaussians import Gaussians
-from clsplat.io.atomic import replacing
 from clsplat.metrics import psnr, to_uint8
 from clsplat.optim import Moments
-from clsplat.prune import price, with_degree, without_bands
+from clsplat.prune import price, removal_order, with_degree, without_bands
 from clsplat.render import render_views
 from clsplat.scene import View
 
@@ -32,8 +29,11 @@ if TYPE_CHECKING:
     from clsplat.device import Device
 
 VALIDATING = 12
-"""Training photos, evenly spaced, of which parts validate while the size is sought. Whole photos in their place were
-missed: with every eighth held back for three quarters of a run fox_pinhole ended 0.2 dB lower."""
+"""Training photos, evenly spaced, of which parts validate while the size is sought: no viewpoint is missing, as it is
+where whole photos are held back, and an error of the mean is that of so many."""
+
+FEWEST_VALIDATING = 2
+"""At least so many must have pixels that validate: a difference of one has no error that can be told."""
 
 BLOCKS = 8
 """Blocks along each edge of such a photo."""
@@ -53,13 +53,16 @@ show nothing of what they are worth in the end: on fox_pinhole at 135x240 trials
 down to 24 600 Gaussians, 0.4 dB below 64 000."""
 
 PRUNING_END = 0.85
-"""Fraction by which they end: all photos train for the rest."""
+"""Fraction by which they end: all pixels train for the rest."""
 
 GROWTH_START = 500
 """Iterations before the first trial of growth, fewer in short runs, as before the strategies' first rounds."""
 
 SURE = 3.0
-"""Standard errors."""
+"""Standard errors by which growth must lose: in the fog of a random start (lego) it lost by two and a half."""
+
+OUTLIERS = 0.25
+"""Fraction of the photos at either end that do not count."""
 
 LOST_GROWTH = 2
 """After so many trials in turn that the smaller side has won, growth has ended."""
@@ -68,15 +71,28 @@ LOOKS = 2
 """Validations of each side of a trial, averaged: PSNR goes up and down while the learning rates are high. From single
 looks at five photos of fox_pinhole the differences of sides had standard errors of 0.1 to 0.4 dB."""
 
-TRIAL = sqrt(0.5)
-"""Fraction of the Gaussians that a trial leaves: two are a halving."""
+FIRST_PRUNING = 0.5
+"""Halvings of the Gaussians that the first trial of pruning is about."""
+
+LAST_PRUNING = 0.125
+"""Halvings below which no trial is made: 8 % of the Gaussians, and 6 thousandths of a dB at the default price."""
+
+BAND_SHARES = (1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
+"""Of the bands that seem useless one by one. All of them together cost fox_pinhole 0.2 dB (135x240, 7000
+iterations)."""
+
+RANDOM_START = 10_000
+"""Gaussians of a random start: fog, which the photos dissolve before it grows to what they show."""
+
+PRICING = 24
+"""Photos, at most, by which Gaussians are priced."""
 
 
 class Point(NamedTuple):
     """A size that was validated.
 
     iteration: before which; n Gaussians of a degree of the spherical harmonics; psnr: dB, the mean over the
-    validation photos; views: of each. worth: psnr less the price.
+    validation photos; views: of each. cost: the price of its bytes.
     """
 
     iteration: int
@@ -84,7 +100,12 @@ class Point(NamedTuple):
     sh_degree: int
     psnr: float
     views: list[float]
-    worth: float
+    cost: float
+
+    @property
+    def worth(self) -> float:
+        """What the degrees of one scene are compared by."""
+        return self.psnr - self.cost
 
 
 class Trial(NamedTuple):
@@ -96,13 +117,38 @@ class Trial(NamedTuple):
     larger: Point
 
     @property
+    def gain(self) -> float:
+        """Of the larger side in dB, in the middle half of the photos. Now and then one is lucky by half a dB on one
+        side, in a block that few others show: by the mean over all, 1024 Gaussians stayed where 128 are enough
+        (tests/test_size.py)."""
+        gains, out = self._gains()
+        return float(gains[out : len(gains) - out].mean())
+
+    @property
+    def standard_error(self) -> float:
+        """Of the gain, photo by photo since photos differ more than sizes do: that of a trimmed mean (Tukey and
+        McLaughlin 1963)."""
+        gains, out = self._gains()
+        n = len(gains)
+        return float(gains.clip(gains[out], gains[n - 1 - out]).std(ddof=1) / (1 - 2 * out / n) / sqrt(n))
+
+    def _gains(self) -> tuple[NDArray[np.float64], int]:
+        """The photos' gains from the least on, and how many of them do not count at either end."""
+        gains = np.sort(np.array(self.larger.views) - np.array(self.smaller.views))
+        return gains, int(OUTLIERS * len(gains))
+
+    @property
+    def price(self) -> float:
+        """What the gain is measured against, in dB."""
+        return self.larger.cost - self.smaller.cost
+
+    @property
     def takes_smaller(self) -> bool:
-        """Whether the smaller goes on: pruned, if it is worth more by a standard error; against growth, which pays
+        """Whether the smaller goes on: pruned, if the price saves more than it loses; against growth, which pays
         late, only if the larger is worse by more than chance."""
-        error = standard_error(self.larger, self.smaller)
         if self.grows:
-            return self.larger.n == self.smaller.n or self.smaller.psnr - self.larger.psnr > SURE * error
-        return self.smaller.worth - error >= self.larger.worth
+            return self.larger.n <= self.smaller.n or -self.gain > SURE * self.standard_error
+        return self.gain <= self.price
 
 
 class Kept(NamedTuple):
@@ -159,18 +205,7 @@ def split(views: list[View]) -> tuple[list[View], list[View]]:
 
 def can_search(views: list[View]) -> bool:
     """Whether there are photos enough."""
-    return len(views) >= FEWEST_PHOTOS
-
-
-BAND_SHARES = (1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
-"""Of the bands that seem useless one by one. All of them together cost fox_pinhole 0.2 dB (135x240, 7000
-iterations)."""
-
-RANDOM_START = 10_000
-"""Gaussians of a random start: fog, which the photos dissolve before it grows to what they show."""
-
-PRICING = 24
-"""Photos, at most, by which Gaussians are priced."""
+    return len(views) >= FEWEST_PHOTOS and len(split(views)[1]) >= FEWEST_VALIDATING
 
 
 def sh_bytes(sh_degree: int) -> int:
@@ -218,8 +253,8 @@ def validate(
 def point(iteration: int, n: int, sh_degree: int, seen: list[list[float]], config: TrainConfig) -> Point:
     """What a size is worth by the PSNR of each photo at each look."""
     views = [float(view) for view in np.mean(seen, axis=0)]
-    mean = float(np.mean(views))
-    return Point(iteration, n, sh_degree, mean, views, mean - config.size_price * log2(n * sh_bytes(sh_degree)))
+    cost = config.size_price * log2(n * sh_bytes(sh_degree))
+    return Point(iteration, n, sh_degree, float(np.mean(views)), views, cost)
 
 
 def most_identifiable(views: list[View], config: TrainConfig) -> int:
@@ -240,10 +275,17 @@ def next_trial(
         if ended or search.most >= most:
             return "rest"
         return "try" if search.most >= surely_short(grown, config.size_price) else "grow"
-    shrunk = [trial for trial in search.trials if not trial.grows]
-    if iteration == stops(config)[-1] or (shrunk and not shrunk[-1].takes_smaller):
-        return "settle"
-    return "shrink"
+    late = iteration == stops(config)[-1]
+    return "settle" if late or halvings(search.trials) < LAST_PRUNING else "shrink"
+
+
+def halvings(trials: list[Trial]) -> float:
+    """How much the next trial of pruning removes: twice as much as the last one if that was taken, else half."""
+    result = FIRST_PRUNING
+    for trial in trials:
+        if not trial.grows:
+            result *= 2 if trial.takes_smaller else 0.5
+    return result
 
 
 def surely_short(grown: list[Trial], price: float) -> float:
@@ -255,23 +297,45 @@ def surely_short(grown: list[Trial], price: float) -> float:
     if not grown:
         return 0
     smaller, larger = grown[-1].smaller, grown[-1].larger
-    if larger.psnr <= smaller.psnr:
+    if larger.n <= smaller.n:  # nothing has grown
         return 0
-    gain = (larger.psnr - smaller.psnr) / log2(larger.n / smaller.n)
-    return larger.n * sqrt(gain / price) if gain > price else 0
+    gain = grown[-1].gain / log2(larger.n / smaller.n)
+    if gain <= price:
+        return 0
+    return larger.n * sqrt(gain / price) if price else inf
+
+
+def _some(views: list[Any]) -> list[Any]:
+    return views[:: -(-len(views) // PRICING)]
 
 
 def costliest_rows(
-    gaussians: Gaussians, views: list[View], config: TrainConfig, device: "Device"
+    gaussians: Gaussians, left: float, views: list[View], config: TrainConfig, device: "Device"
 ) -> NDArray[np.intp]:
-    """The rows that a trial leaves, in their order: those whose removal costs most.
+    """A fraction of the rows, in their order: those that are removed last."""
+    n = max(1, int(left * len(gaussians)))
+    background = BACKGROUNDS[config.data.background]
+    shown = unvalidated(gaussians, views, config, device)
+    order = removal_order(gaussians, shown, lambda g: len(g) <= n, config.render, device, background)
+    return np.sort(order[:n])
 
-    In the order of `clsplat.prune.removal_order`, but priced once: its rounds took as long as the refit.
+
+def unvalidated(gaussians: Gaussians, views: list[View], config: TrainConfig, device: "Device") -> list[View]:
+    """Some photos to price Gaussians by, that show what is rendered in the blocks that validate.
+
+    What is seen there alone has a price then, and no photo's block has a say in it.
     """
-    some = views[:: -(-len(views) // PRICING)]
-    prices = price(gaussians, some, config.render, device, BACKGROUNDS[config.data.background], bands=False)
-    left = max(1, int(TRIAL * len(gaussians)))
-    return np.sort(np.argsort(-prices.costs, kind="stable")[:left])
+    pairs = _some(list(zip(views, split(views)[0], strict=True)))
+    cameras = [whole.camera for whole, _ in pairs]
+    renderings = render_views(
+        gaussians, cameras, config.render, device, background=BACKGROUNDS[config.data.background]
+    )
+    return [
+        replace(whole, image=np.where(training.mask[:, :, None], whole.image, to_uint8(rendering.rgb)))
+        if training.mask is not None
+        else whole
+        for (whole, training), rendering in zip(pairs, renderings, strict=True)
+    ]
 
 
 def settle(
@@ -298,7 +362,7 @@ def without_useless_bands(
 
     Each is priced alone; of many together the cheapest are taken, half as many until the photos agree.
     """
-    some = views[:: -(-len(views) // PRICING)]
+    some = _some(views)
     bands = price(gaussians, some, config.render, device, BACKGROUNDS[config.data.background]).bands
     degree = gaussians.sh_degree
     before = np.mean(validate(gaussians, some, config, device, degree))
@@ -314,101 +378,3 @@ def lower_degree(kept: Kept, degree: int) -> Kept:
     """Without the bands of spherical harmonics above a degree."""
     moments = Moments(with_degree(kept.moments.first, degree), with_degree(kept.moments.second, degree))
     return Kept(with_degree(kept.gaussians, degree), moments, kept.statistics)
-
-
-def write_report(path: Path, search: Search, config: TrainConfig) -> None:
-    """size.json: every point with what it was worth, the rule and the choice.
-
-    least_share: the price as that of one Gaussian. A doubling that gains p dB lowers the squared error by the
-    fraction p ln(10)/10, and is ln(2) on the natural scale of N: the last Gaussian must lower it by this part of a
-    Gaussian's even share.
-    """
-    chosen = max(search.degrees, key=lambda p: p.worth)
-    content = {
-        "rule": "growth unless it loses more than twice the standard error; pruning if worth = psnr - price "
-        "log2(bytes) is as large; then the degree with the largest worth",
-        "price": config.size_price,
-        "least_share": config.size_price * log(10) / (10 * log(2)),
-        "chosen": {"n": chosen.n, "sh_degree": chosen.sh_degree},
-        "trials": [
-            {
-                "iteration": trial.larger.iteration,
-                "kind": "growth" if trial.grows else "pruning",
-                "n": [trial.smaller.n, trial.larger.n],
-                "psnr": [trial.smaller.psnr, trial.larger.psnr],
-                "gain": trial.larger.psnr - trial.smaller.psnr,
-                "standard_error": standard_error(trial.larger, trial.smaller),
-                "price": config.size_price * log2(trial.larger.n / trial.smaller.n),
-                "taken": trial.smaller.n if trial.takes_smaller else trial.larger.n,
-            }
-            for trial in search.trials
-        ],
-        "degrees": [
-            {"sh_degree": p.sh_degree, "bytes": p.n * sh_bytes(p.sh_degree), "psnr": p.psnr, "worth": p.worth}
-            for p in search.degrees
-        ],
-    }
-    with replacing(path) as file:
-        file.write(json.dumps(content, indent=1).encode())
-
-
-def standard_error(a: Point, b: Point) -> float:
-    """Of the difference of two points' PSNR: photo by photo, since photos differ more than sizes do."""
-    differences = np.array(a.views) - np.array(b.views)
-    return float(differences.std(ddof=1) / sqrt(len(differences)))
-
-
-def size_chart(report: Path, path: Path) -> None:
-    """Draw how the size of a scene was chosen, as a PNG.
-
-    Left, the validation PSNR against the number of Gaussians: the two sides of each trial joined; right, against the
-    bytes, of each degree of the spherical harmonics.
-
-    Parameters
-    ----------
-    report : Path
-        size.json of a training run.
-    path : Path
-        The PNG.
-    """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter
-
-    content = json.loads(report.read_text())
-    chosen, degrees = content["chosen"], content["degrees"]
-    figure = Figure(figsize=(9, 4.2), dpi=150, layout="constrained")
-    by_n, by_bytes = figure.subplots(1, 2, width_ratios=[3, 2])
-    grey, blue, orange, green = "0.55", "#0072b2", "#d55e00", "#009e73"
-    labelled: set[str] = set()
-    for trial in content["trials"]:
-        color, label = (grey, "growth") if trial["kind"] == "growth" else (blue, "pruning")
-        by_n.plot(trial["n"], trial["psnr"], "-", color=color, label=None if label in labelled else label)
-        labelled.add(label)
-        for n, quality in zip(trial["n"], trial["psnr"], strict=True):
-            by_n.plot(n, quality, "o", color=color, markerfacecolor=color if n == trial["taken"] else "white")
-        price = [trial["psnr"][0], trial["psnr"][0] + trial["price"]]
-        name = f"price: {content['price']:g} dB per doubling"
-        by_n.plot(trial["n"], price, "--", color=orange, linewidth=1, label=None if name in labelled else name)
-        labelled.add(name)
-    best = max(degrees, key=lambda p: p["worth"])
-    by_n.axvline(chosen["n"], color=orange, linewidth=0.8, label=f"chosen: {chosen['n']:,}")
-    by_n.set_xlabel("Gaussians; two sides of a trial joined, the full one goes on")
-    by_n.set_ylabel("PSNR of the validation photos, dB")
-    by_bytes.plot([p["bytes"] / 1e6 for p in degrees], [p["psnr"] for p in degrees], "o-", color=green)
-    by_bytes.plot(best["bytes"] / 1e6, best["psnr"], "*", color=orange, markersize=15, zorder=4)
-    for p in degrees:
-        marker = ", chosen" if p is best else ""
-        by_bytes.annotate(
-            f"degree {p['sh_degree']}{marker}", (p["bytes"] / 1e6, p["psnr"]), (4, -11), textcoords="offset points"
-        )
-    by_bytes.set_xlabel("MB, without refitting")
-    by_bytes.margins(x=0.3)
-    for axes in (by_n, by_bytes):
-        axes.set_xscale("log", base=2)
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.3g}" if x < 1000 else f"{x / 1000:,.3g}k"))
-        axes.grid(color="0.9")
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
-    by_n.legend(frameon=False)
-    with replacing(path) as file:
-        figure.savefig(file, format="png", metadata={"Software": None})

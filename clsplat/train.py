@@ -35,6 +35,7 @@ from clsplat.randomness import stream
 from clsplat.render import backward_to_splats, download, fetch, forward, stage_functions
 from clsplat.scene import Scene, View
 from clsplat.seek import seek_size
+from clsplat.size_report import write_report
 from clsplat.stages import Dropout, Image
 from clsplat.survey import contributions
 
@@ -94,7 +95,8 @@ def train(
     Raises
     ------
     InputError
-        If the scene has no photos to train on, or the checkpoint is of another configuration.
+        If the scene has no photos to train on, the strategy is unknown, the price is negative, or the checkpoint is
+        of another configuration.
     DeviceError
         If the device's memory, or its limit, is exceeded in spite of all.
     ClsplatError
@@ -107,6 +109,8 @@ def train(
     """
     if config.strategy not in STRATEGIES:
         raise InputError(f"--strategy: expected one of {', '.join(STRATEGIES)}, found {config.strategy!r}")
+    if not config.size_price >= 0:
+        raise InputError(f"--size-price: expected 0 or more, found {config.size_price}")
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
     state = load_state(out / "checkpoint.npz", scene.extent, config) if resume else initial_state(scene, config)
@@ -120,7 +124,7 @@ def train(
     if state.pixels is not None:
         state.pixels = device.upload("pixel sizes", state.pixels)
     losses: list[float] = []
-    training, shown = scene.train, (1, False)
+    training, trained_on = scene.train, (1, False)  # the photos' size, and whether parts validate
 
     def tell(shown: State, loss: float) -> None:
         about = {"iteration": state.iteration, "loss": loss, "num_gaussians": len(shown.gaussians)}
@@ -134,8 +138,8 @@ def train(
         started = time.perf_counter() - state.seconds
         for iteration in range(state.iteration + 1, config.iterations + 1):
             wanted = pyramid.factor_at(iteration, config), bool(state.search and not state.search.settled)
-            if shown != wanted:
-                shown = factor, seeking = wanted
+            if trained_on != wanted:
+                trained_on = factor, seeking = wanted
                 views = size.split(scene.train)[0] if seeking else scene.train
                 training, photos = [pyramid.shrunk(view, factor) for view in views], Photos(device)
             intersections = state.intersections or INTERSECTIONS
@@ -176,7 +180,7 @@ def train(
         write_photos(out / "photos.json", state, scene)
     if not state.search:
         return fetch(filtered(state, device))
-    size.write_report(out / "size.json", state.search, config)
+    write_report(out / "size.json", state.search, config)
     return size.without_useless_bands(fetch(filtered(state, device)), as_seen(scene.train, state), config, device)
 
 

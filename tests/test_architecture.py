@@ -30,7 +30,7 @@ LAYERS = """
     page render optim densify initialize exposure few_views report demo preview
     prune rasterization survey poses
     size
-    checkpoint
+    checkpoint size_report
     seek
     train compact
     evaluate

@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.config import ErrorConfig, TrainConfig
 from clsplat.densify import Contributions, Survey
-from clsplat.densify.error import ErrorGuided, split
+from clsplat.densify.error import HARM, ErrorGuided, split
 from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations
 from clsplat.testing import synthetic_scene
@@ -92,6 +92,20 @@ def test_at_the_cap_those_of_least_price_make_room(harmful: int, gone: int) -> N
     assert np.setdiff1d(np.arange(N), edit.rows).tolist() == sorted([*order[:gone], order[70]])
     split_most = [i for i in order[::-1] if i != order[70]][: gone + 1]
     assert np.unique(edit.rows[edit.fresh]).tolist() == sorted(split_most)
+
+
+def test_while_there_is_room_only_real_harm_goes() -> None:
+    """Not what would lower the error a little by going, and no more than 5 % at once."""
+    share = 2.0
+    prices, errors = np.full(N, 1.0), np.full(N, share)
+    prices[:5] = -HARM * share * np.array([0.9, 0.5, 0.1, 1.1, 3])
+    strategy = ErrorGuided(replace(CONFIG, max_gaussians=2 * N), 1.0, N)
+    strategy.max_gaussians = 2 * N
+    gone = np.setdiff1d(np.arange(N), strategy.edit(200, scene(), seeing(np.ones(N), errors, prices)).rows)
+    assert gone.tolist() == [3, 4]
+    prices[:] = -share
+    edit = strategy.edit(200, scene(), seeing(np.ones(N), errors, prices))
+    assert len(np.setdiff1d(np.arange(N), edit.rows)) == CONFIG.error.replaced_most * N
 
 
 def test_what_has_no_error_is_not_split() -> None:

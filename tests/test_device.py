@@ -1,6 +1,7 @@
 """Device: selection, buffers, programs, and errors that a user can act on."""
 
 import shutil
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -216,6 +217,25 @@ class TestPrograms:
         (kernels / "broken.cl").write_text('#include "common.h"\n#include "linalg.h"\n\n__kernel void k() { x; }\n')
         with pytest.raises(cl.RuntimeError, match=r"cl/broken\.cl:4"):
             device.program("broken", {})
+
+    @pytest.mark.parametrize("shown", [True, False])
+    def test_what_the_compiler_says_is_shown_on_demand(self, device, kernels, monkeypatch, recwarn, shown):
+        """By ``-v``, which sets pyopencl's variable. PoCL has nothing to say of a kernel that is right."""
+        (kernels / "quiet.cl").write_text("__kernel void k() { }\n")
+        monkeypatch.delenv("PYOPENCL_COMPILER_OUTPUT", raising=False)
+        if shown:
+            monkeypatch.setenv("PYOPENCL_COMPILER_OUTPUT", "1")
+
+        class Talkative:
+            def __init__(self, *_):
+                pass
+
+            def build(self, _):
+                warnings.warn("vectorised", cl.CompilerWarning, stacklevel=1)
+
+        monkeypatch.setattr(cl, "Program", Talkative)
+        device.program("quiet", {"SHOWN": int(shown)})
+        assert [str(w.message) for w in recwarn] == ["vectorised"] * shown
 
     def test_includes_are_inlined(self, kernels):
         (kernels / "inner.h").write_text("inner\n")

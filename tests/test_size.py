@@ -22,16 +22,18 @@ from clsplat.size import (
     Trial,
     can_search,
     costliest_rows,
+    halvings,
     looks,
     most_identifiable,
     next_trial,
     point,
     sh_bytes,
-    size_chart,
     split,
     stops,
     surely_short,
+    unvalidated,
 )
+from clsplat.size_report import size_chart
 from clsplat.testing import synthetic_scene
 from clsplat.train import train
 
@@ -100,13 +102,27 @@ def test_blocks_of_some_photos_validate() -> None:
     assert can_search(views[:8]) and not can_search(views[:7])
 
 
-@pytest.mark.parametrize(("larger", "pays"), [(30.01, True), (30.03, False)])
+@pytest.mark.parametrize(("larger", "pays"), [(30.04, True), (30.06, False)])
 def test_half_the_gaussians_pay_if_they_lose_less_than_half_a_price(larger: float, pays: bool) -> None:
-    """At 0.1 dB per doubling a loss of 0.05 dB pays for 1 / sqrt(2) of the Gaussians, 0.03 is the standard error."""
+    """At 0.1 dB per doubling a loss of 0.05 dB pays for 1 / sqrt(2) of the Gaussians."""
     config = replace(CONFIG, size_price=0.1)
     smaller = point(1, 362, 3, [[30.0, 31.0, 35.0]], config)
-    photos = np.array([30.0, 31.0, 35.0]) + larger - 30 + 0.03 * np.sqrt(3) * np.array([-1, 0, 1])
-    assert Trial(False, smaller, point(1, 512, 3, [photos.tolist()], config)).takes_smaller == pays
+    photos = np.array([30.0, 31.0, 35.0]) + larger - 30 + 0.03 * np.array([-1, 0, 1])
+    trial = Trial(False, smaller, point(1, 512, 3, [photos.tolist()], config))
+    assert trial.gain == pytest.approx(larger - 30) and trial.price == pytest.approx(0.05, rel=1e-3)
+    assert trial.takes_smaller == pays
+
+
+def test_the_photos_in_the_middle_tell_the_gain() -> None:
+    """Of twelve the three luckiest and the three unluckiest do not; the error is a trimmed mean's (Tukey and
+    McLaughlin 1963): that of the winsorised differences, over the half that counts."""
+    differences = np.array([9.0, 0.5, 0.3, 0.1, 0.2, 0.0, -0.1, -0.2, 0.05, -0.3, -0.6, -7.0])
+    views = np.linspace(25, 30, 12)
+    sides = (point(1, n, 3, [v.tolist()], CONFIG) for n, v in ((100, views), (141, views + differences)))
+    trial = Trial(False, *sides)
+    assert trial.gain == pytest.approx(np.mean([0.1, 0.2, 0.0, -0.1, -0.2, 0.05]))
+    winsorised = np.clip(differences, -0.2, 0.2)
+    assert trial.standard_error == pytest.approx(winsorised.std(ddof=1) / (0.5 * np.sqrt(12)))
 
 
 def test_growth_goes_on_unless_it_surely_hurts() -> None:
@@ -150,7 +166,7 @@ def trials_of(grows: bool, *takes_smaller: bool) -> list[Trial]:
 
 
 def test_trials_follow_each_other() -> None:
-    """Growth until two trials in turn have lost or it is late; then pruning, until it loses once."""
+    """Growth until two trials in turn have lost or it is late; then pruning, until there is little to gain."""
     config = replace(CONFIG, iterations=2000)
     for lost, todo in (
         ([], "try"),
@@ -167,11 +183,27 @@ def test_trials_follow_each_other() -> None:
     cases: tuple[tuple[list[bool], int, str], ...] = (
         ([], 1200, "shrink"),
         ([True], 1300, "shrink"),
-        ([True, False], 1400, "settle"),
+        ([True, False], 1400, "shrink"),
+        ([False, False], 1400, "shrink"),
+        ([False, False, False], 1500, "settle"),
         ([True] * 5, 1700, "settle"),
     )
     for pruned, iteration, todo in cases:
         assert next_trial(Search(100, [*grown, *trials_of(False, *pruned)]), iteration, config, 1000) == todo, pruned
+
+
+def test_steps_of_pruning_grow_while_they_pay() -> None:
+    """As halvings: growth has no say; what is taken doubles the next step, what is lost halves it."""
+    grown = trials_of(True, False, True)
+    for taken, step in (
+        ([], 0.5),
+        ([True], 1.0),
+        ([True, True], 2.0),
+        ([True, False], 0.5),
+        ([False], 0.25),
+        ([False, True], 0.5),
+    ):
+        assert halvings([*grown, *trials_of(False, *taken)]) == step, taken
 
 
 def test_parameters_are_no_more_than_values() -> None:
@@ -216,12 +248,12 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     whole = train(scene, config, device, tmp_path / "whole", progress=lambda r: sizes.append(r["num_gaussians"]))
     report = json.loads((tmp_path / "whole" / "size.json").read_text())
     trials = report["trials"]
-    assert [trial["n"] for trial in trials][:2] == [[56, 80], [39, 56]] and max(sizes) == 80
+    assert [trial["n"] for trial in trials][:2] == [[56, 80], [28, 56]] and max(sizes) == 80
     for trial in trials:
-        assert (trial["taken"] == trial["n"][0]) == (trial["gain"] + trial["standard_error"] <= trial["price"]), trial
+        assert (trial["taken"] == trial["n"][0]) == (trial["gain"] <= trial["price"]), trial
         assert trial["price"] == pytest.approx(8 * np.log2(trial["n"][1] / trial["n"][0]))
-    # Each begins with what the one before it came to; the first that is not paid is the last.
-    assert all(b["n"][1] == a["taken"] == a["n"][0] for a, b in pairwise(trials))
+    # Each begins with what the one before it came to.
+    assert all(b["n"][1] == a["taken"] for a, b in pairwise(trials))
     assert report["chosen"]["n"] == trials[-1]["taken"] == len(whole) == sizes[-1]
     degrees = report["degrees"]
     assert report["chosen"]["sh_degree"] == max(degrees, key=lambda p: p["worth"])["sh_degree"] == whole.sh_degree
@@ -255,8 +287,25 @@ def test_a_step_leaves_what_the_photos_would_miss(device: Device) -> None:
     gaussians.means[:20] = scene.points
     gaussians.logit_opacities[:] = 2
     gaussians.logit_opacities[20:] = -5
-    rows = costliest_rows(gaussians, scene.train, CONFIG, device)
+    rows = costliest_rows(gaussians, 0.7, scene.train, CONFIG, device)
     assert len(rows) == 19 and set(rows) <= set(range(20))
+
+
+def test_blocks_that_validate_have_no_say_in_prices(device: Device) -> None:
+    """They show what is rendered, and the rest what the photos show."""
+    scene = known_scene(5, device, copies=1, views=20)
+    gaussians = synthetic_scene(9, 4)[0].astype(np.float32)
+    training, _ = split(scene.train)
+    shown = unvalidated(gaussians, scene.train, CONFIG, device)
+    assert [view.name for view in shown] == [view.name for view in scene.train]
+    for part, view, whole in zip(training, shown, scene.train, strict=True):
+        if part is whole:
+            assert view is whole
+            continue
+        assert part.mask is not None and view.mask is None
+        np.testing.assert_array_equal(view.image[part.mask], whole.image[part.mask])
+        drawn = to_uint8(render(gaussians, view.camera, device=device).rgb)
+        np.testing.assert_array_equal(view.image[~part.mask], drawn[~part.mask])
 
 
 def test_too_few_photos_to_validate(device: Device, tmp_path: Path) -> None:
@@ -270,19 +319,17 @@ def test_too_few_photos_to_validate(device: Device, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "count",
-    [
-        64,
-        pytest.param(128, marks=pytest.mark.xfail(strict=True, reason="the first trial loses by chance: 1024 stay")),
-    ],
-)
-def test_it_finds_the_size_of_known_scenes(device: Device, tmp_path: Path, count: int) -> None:
-    """From eight times as many Gaussians as the photos show, at the quality that the photos' noise allows, and
-    without a view dependence that is not there. Measured: 127 Gaussians, 31.6 dB."""
+@pytest.mark.parametrize(("count", "plateau", "best"), [(64, 128, 31.64), (128, 256, 31.12), (256, 512, 30.62)])
+def test_it_finds_the_size_of_known_scenes(
+    device: Device, tmp_path: Path, count: int, plateau: int, best: float
+) -> None:
+    """From eight times as many Gaussians as the photos show, a size within 1.5 of the smallest that reaches the
+    plateau, at its quality within 0.2 dB.
+
+    `plateau`, `best`: of fixed sizes, factors of sqrt(2) apart, the smallest within 0.2 dB of the best and that one's
+    quality (tests/measure_known.py). Measured: 127, 255 and 511 Gaussians, 31.6, 31.0 and 30.4 dB.
+    """
     scene = known_scene(count, device, copies=8)
     gaussians = train(scene, CONFIG, device, tmp_path)
-    assert count / 1.5 <= len(gaussians) <= 2 * count
-    assert gaussians.sh_degree == 0
-    # Noise of 0.03, clipped at black and white, leaves 30.5 to 32 dB.
-    assert held_out(gaussians, scene, device) > 30.5
+    assert plateau / 1.5 <= len(gaussians) <= 1.5 * plateau
+    assert held_out(gaussians, scene, device) > best - 0.2

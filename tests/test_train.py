@@ -23,7 +23,7 @@ from clsplat.render import render
 from clsplat.scene import Scene, View
 from clsplat.survey import contributions
 from clsplat.testing import synthetic_scene
-from clsplat.train import _apply, initial_state, step, train, view_at
+from clsplat.train import _apply, initial_state, start_config, step, train, view_at
 
 SIZE = (40, 32)
 EACH_STRATEGY = pytest.mark.parametrize("strategy", STRATEGIES)
@@ -305,6 +305,19 @@ def test_each_round_surveys_photos_of_its_own(
 def test_an_unknown_strategy_is_refused(scene: Scene, device: Device, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--strategy: expected one of adc, mcmc, error, found 'best'"):
         train(scene, replace(CONFIG, strategy="best"), device, tmp_path)
+
+
+@pytest.mark.parametrize("price", [-1.0, float("nan")])
+def test_a_price_that_is_none_is_refused(price: float, scene: Scene, device: Device, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"--size-price: expected 0 or more, found {price}"):
+        train(scene, replace(CONFIG, size_price=price), device, tmp_path)
+
+
+def test_a_search_starts_from_a_thin_fog() -> None:
+    """Of a random start; not where a number is given, or nothing is sought."""
+    for size, given, expected in (("auto", None, 10_000), ("auto", 7, 7), ("fixed", None, None)):
+        config = replace(CONFIG, size=size, init=replace(CONFIG.init, random_points=given))
+        assert start_config(config).random_points == expected
 
 
 def test_the_strategy_says_how_opaque_the_start_is(scene: Scene) -> None:

@@ -145,7 +145,8 @@ def train_and_report(
     from clsplat.poses import aligned
     from clsplat.prune import without_invisible
     from clsplat.report import training_curve
-    from clsplat.size import can_search, size_chart, split
+    from clsplat.size import can_search, split
+    from clsplat.size_report import size_chart
     from clsplat.train import train
 
     background = BACKGROUNDS[config.data.background]
