@@ -9,7 +9,7 @@ end all pixels train.
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from math import inf, log2, sqrt
+from math import inf, log2, log10, sqrt
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -60,6 +60,10 @@ GROWTH_START = 500
 
 SURE = 3.0
 """Standard errors by which growth must lose: in the fog of a random start (lego) it lost by two and a half."""
+
+PERFECT = 20 * log10(255)
+"""PSNR of an error of one level in 255: photos that are rendered better are rendered as well, or flat walls would be
+given Gaussians for what nobody sees."""
 
 OUTLIERS = 0.25
 """Fraction of the photos at either end that do not count."""
@@ -236,7 +240,7 @@ def first_shrink(config: TrainConfig) -> int:
 def validate(
     gaussians: Gaussians, views: list[View], config: TrainConfig, device: "Device", sh_degree: int
 ) -> list[float]:
-    """PSNR of each view, in dB, of renders rounded to 8 bits."""
+    """PSNR of each view, in dB and up to `PERFECT`, of renders rounded to 8 bits."""
     cameras = [view.camera for view in views]
     background = BACKGROUNDS[config.data.background]
     renderings = render_views(
@@ -247,7 +251,8 @@ def validate(
         background=background,
         sh_degree=min(sh_degree, gaussians.sh_degree),
     )
-    return [psnr(to_uint8(r.rgb), view.image, view.mask) for r, view in zip(renderings, views, strict=True)]
+    pairs = zip(renderings, views, strict=True)
+    return [min(PERFECT, psnr(to_uint8(rendering.rgb), view.image, view.mask)) for rendering, view in pairs]
 
 
 def point(iteration: int, n: int, sh_degree: int, seen: list[list[float]], config: TrainConfig) -> Point:
