@@ -69,11 +69,13 @@ def size_chart(report: Path, path: Path) -> None:
     labelled: set[str] = set()
     for trial in content["trials"]:
         color, label = (grey, "growth") if trial["kind"] == "growth" else (blue, "pruning")
-        by_n.plot(trial["n"], trial["psnr"], "-", color=color, label=None if label in labelled else label)
+        larger = trial["psnr"][1]
+        sides = [larger - trial["gain"], larger]  # means of all photos would belie what the middle half decided
+        by_n.plot(trial["n"], sides, "-", color=color, label=None if label in labelled else label)
         labelled.add(label)
-        for n, quality in zip(trial["n"], trial["psnr"], strict=True):
+        for n, quality in zip(trial["n"], sides, strict=True):
             by_n.plot(n, quality, "o", color=color, markerfacecolor=color if n == trial["taken"] else "white")
-        price = [trial["psnr"][0], trial["psnr"][0] + trial["price"]]
+        price = [sides[0], sides[0] + trial["price"]]
         name = f"price: {content['price']:g} dB per doubling"
         by_n.plot(trial["n"], price, "--", color=orange, linewidth=1, label=None if name in labelled else name)
         labelled.add(name)
@@ -85,9 +87,10 @@ def size_chart(report: Path, path: Path) -> None:
     by_bytes.plot(best["bytes"] / 1e6, best["psnr"], "*", color=orange, markersize=15, zorder=4)
     for p in degrees:
         marker = ", chosen" if p is best else ""
-        by_bytes.annotate(
-            f"degree {p['sh_degree']}{marker}", (p["bytes"] / 1e6, p["psnr"]), (4, -11), textcoords="offset points"
-        )
+        right = p is degrees[0]  # the curve is to the right of the first, to the left of the others
+        place = {"xytext": (8 if right else -10, -4), "ha": "left" if right else "right"}
+        at = p["bytes"] / 1e6, p["psnr"]
+        by_bytes.annotate(f"degree {p['sh_degree']}{marker}", at, textcoords="offset points", **place)
     by_bytes.set_xlabel("MB, without refitting")
     by_bytes.margins(x=0.3)
     for axes in (by_n, by_bytes):
