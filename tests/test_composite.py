@@ -70,16 +70,24 @@ def random_grads(image, seed=0):
     return Image(rng.normal(size=image.image.shape), rng.normal(size=image.alpha.shape))
 
 
-def brute_force(splats, width, height, background):
-    """Equation 3, pixel by pixel as it is written: no tiles, no boxes, no arrays of pixels."""
+def brute_force(splats, width, height, background, disparities=None):
+    """Equation 3, pixel by pixel as it is written: no tiles, no boxes, no arrays of pixels.
+
+    In the order of the centres' depths, or, given `disparities`, of what these are in the pixel.
+    """
     image, alphas = np.zeros((height, width, len(background))), np.zeros((height, width))
     shown = [g for g in np.argsort(splats.depths, kind="stable") if splats.extents[g, 0] > 0]
     for i in range(height):
         for j in range(width):
             transmittance = 1.0
-            for g in shown:
-                d = np.array([j + 0.5, i + 0.5]) - splats.means2d[g]
+            offsets = np.array([j + 0.5, i + 0.5]) - splats.means2d
+            order = shown
+            if disparities is not None:
+                here = disparities[:, 0] + (disparities[:, 1:] * offsets).sum(axis=1)
+                order = sorted(shown, key=lambda g: -here[g])
+            for g in order:
                 a, b, c = splats.conics[g]
+                d = offsets[g]
                 alpha = min(ALPHA_MAX, splats.opacities[g] * np.exp(-0.5 * d @ [[a, b], [b, c]] @ d))
                 if alpha < ALPHA_MIN:
                     continue

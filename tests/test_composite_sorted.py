@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from test_composite import (
     BACKGROUND,
+    brute_force,
     clear_of_thresholds,
     handmade,
     make_splats,
@@ -14,7 +15,7 @@ from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.config import RenderConfig
-from clsplat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from clsplat.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 from clsplat.ops import composite
 from clsplat.render import render
 from clsplat.stages import Image, SplatGrads, Splats
@@ -43,34 +44,10 @@ def backward(device, splats, bins, image, v_image, disparities):
     return SplatGrads(*(a.get() for a in v))
 
 
-def brute_force(splats, disparities, width, height, background):
-    """Equation 3, pixel by pixel as it is written, over the splats in the order of their disparities there."""
-    image, alphas = np.zeros((height, width, len(background))), np.zeros((height, width))
-    by_depth = [g for g in np.argsort(splats.depths, kind="stable") if splats.extents[g, 0] > 0]
-    for i in range(height):
-        for j in range(width):
-            transmittance = 1.0
-            offsets = np.array([j + 0.5, i + 0.5]) - splats.means2d
-            here = disparities[:, 0] + (disparities[:, 1:] * offsets).sum(axis=1)
-            for g in sorted(by_depth, key=lambda g: -here[g]):
-                d = offsets[g]
-                a, b, c = splats.conics[g]
-                alpha = min(ALPHA_MAX, splats.opacities[g] * np.exp(-0.5 * d @ [[a, b], [b, c]] @ d))
-                if alpha < ALPHA_MIN:
-                    continue
-                if transmittance * (1 - alpha) <= TRANSMITTANCE_MIN:
-                    break
-                image[i, j] += splats.colors[g] * alpha * transmittance
-                transmittance *= 1 - alpha
-            image[i, j] += transmittance * np.array(background)
-            alphas[i, j] = 1 - transmittance
-    return Image(image, alphas)
-
-
 def test_twin_matches_brute_force():
     splats, width, height = make_splats(80, 1, width=19, height=13)
     disparities = planes(splats)
-    expected = brute_force(splats, disparities, width, height, BACKGROUND)
+    expected = brute_force(splats, width, height, BACKGROUND, disparities)
     for tile_size in (8, 19):
         bins = reference.bin_splats(splats, width, height, tile_size)
         image = reference.composite_fwd(splats, bins, BACKGROUND, disparities=disparities)
