@@ -47,11 +47,19 @@ __kernel void composite_sum(const uint n, const __global uint *order, const __gl
     }
     const uint g = order[i];
     const real3 conic = load3(conics, g);
-    store2(v_means2d, g, -(real2)(conic.x * total[1] + conic.y * total[2], conic.y * total[1] + conic.z * total[2]));
-    store3(v_conics, g, (real3)((real)0.5 * total[3], total[4], (real)0.5 * total[5]));
-    v_opacities[g] = begin < end ? -total[0] / opacities[g] : 0;
+    const real2 v_mean = -(real2)(conic.x * total[1] + conic.y * total[2], conic.y * total[1] + conic.z * total[2]);
+    const real3 v_conic = (real3)((real)0.5 * total[3], total[4], (real)0.5 * total[5]);
+    const real v_opacity = begin < end ? -total[0] / opacities[g] : 0;
+    // A splat whose gradients overflow gets none: they would stay in the statistics of densification.
+    real any = v_mean.x + v_mean.y + v_conic.x + v_conic.y + v_conic.z + v_opacity;
     for (int k = 0; k < CHANNELS; ++k)
-        v_colors[CHANNELS * g + k] = total[6 + k];
+        any += total[6 + k];
+    const bool finite = 0 * any == 0;
+    store2(v_means2d, g, finite ? v_mean : (real2)0);
+    store3(v_conics, g, finite ? v_conic : (real3)0);
+    v_opacities[g] = finite ? v_opacity : 0;
+    for (int k = 0; k < CHANNELS; ++k)
+        v_colors[CHANNELS * g + k] = finite ? total[6 + k] : 0;
 }
 
 #endif

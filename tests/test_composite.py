@@ -335,6 +335,26 @@ def test_same_bits_twice_and_for_every_tiling(device, compositor):
         np.testing.assert_array_equal(getattr(v[0], name), getattr(v[1], name), err_msg=name)
 
 
+def test_what_overflows_has_no_gradient(any_device, compositor):
+    """Found by fuzzing: the gradient of one centre was NaN, and so would have been the statistics of densification.
+
+    Two splats beside each other: the brightness of one overflows.
+    """
+    bright = 3e38 if any_device.real == np.float32 else 1e308
+    colors = np.array([[bright] * 3, [0.5] * 3])
+    splats = handmade([(8, 8), (28, 8)], 2 * np.eye(2), [0.5, 0.5], colors)
+    width, height = 36, 16
+    bins = reference.bin_splats(splats, width, height, 16)
+    v_image = Image(np.full((height, width, 3), 100.0), np.zeros((height, width)))
+    image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
+    assert np.isfinite(image.image).all()
+    with np.errstate(all="ignore"):
+        twin = reference.composite_bwd(splats, bins, image, v_image)
+    for first, second in backward(any_device, compositor, splats, bins, image, v_image):
+        assert (first == 0).all() and np.isfinite(second).all()
+    assert all(np.isfinite(array).all() for array in twin) and twin.colors[1].min() > 0
+
+
 def test_lists_without_slots_have_no_gradients(device):
     splats, width, height = make_splats(3)
     bins = reference.bin_splats(splats, width, height, 16, gradients=False)

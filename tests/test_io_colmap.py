@@ -198,6 +198,7 @@ def test_unknown_camera_models_are_refused(tmp_path):
         ("images", "1 1 0 0 0 0 0", r"images\.txt, line 8.*QW"),
         ("points3D", "1 2 3", r"points3D\.txt, line 4.*X Y Z"),
         ("points3D", "1 0 0 0 300 0 0 1", r"points3D\.txt"),
+        ("points3D", f"1 0 0 0 {10**400} 0 0 1", r"points3D\.txt, line 4"),
     ],
 )
 def test_bad_lines_are_refused_with_their_number(tmp_path, name, line, message):

@@ -341,11 +341,17 @@ def test_points_declared_but_not_there_take_no_memory(root, kind):
 
 @pytest.mark.parametrize(
     "change",
-    [{"mask_path": None}, {"fl_x": 10**400}, {"w": 1e300, "h": 7.5e299}, {"transform_matrix": [[10**400] * 4] * 4}],
-    ids=["mask", "focal length", "size", "pose"],
+    [
+        {"mask_path": None},
+        {"fl_x": 10**400},
+        {"w": 1e300, "h": 7.5e299},
+        {"transform_matrix": [[10**400] * 4] * 4},
+        {"transform_matrix": [[1, 0, 0, 0], [1e308, -1, 0, 1e308], [0, 0, -1, 0], [0, 0, 0, 1]]},
+    ],
+    ids=["mask", "focal length", "size", "pose", "product of a pose"],
 )
 def test_values_that_broke_the_reader(root, change):
-    """Found by fuzzing: TypeError, OverflowError, and lists of 1e300 pixels."""
+    """Found by fuzzing: TypeError, OverflowError, a warning of NumPy's, and lists of 1e300 pixels."""
     first, *others = frames()
     (root / "transforms.json").write_text(
         json.dumps({"frames": [first | {"fl_x": 50} | change, *others], "fl_x": 50})

@@ -277,7 +277,7 @@ def _points_txt(path: Path) -> Iterator[tuple[float, ...]]:
             words = line.split(maxsplit=7)
             try:
                 x, y, z, r, g, b = words[1:7]
-                row = float(x), float(y), float(z), int(r), int(g), int(b)
-            except ValueError as error:
+                row = float(x), float(y), float(z), float(int(r)), float(int(g)), float(int(b))
+            except (OverflowError, ValueError) as error:
                 raise _damaged(path, number, "POINT3D_ID X Y Z R G B", line) from error
             yield row

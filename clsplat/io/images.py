@@ -263,7 +263,8 @@ def _positions(intrinsics: Intrinsics, size: tuple[int, int], shape: tuple[int, 
     positions = np.empty((2, *shape), dtype=np.float32)
     for row in range(shape[0]):
         rays = np.stack([x, np.full_like(x, y[row]), np.ones_like(x)], axis=-1)
-        positions[1, row], positions[0, row] = (project(intrinsics, rays) * (sx, sy)).T
+        with np.errstate(over="ignore"):  # what overflows is outside
+            positions[1, row], positions[0, row] = (project(intrinsics, rays) * (sx, sy)).T
     # COLMAP looks at the photo's border alone; a pixel outside is more than the half that rounding may cost.
     inside = (positions > -1) & (positions < np.array(size[::-1]).reshape(2, 1, 1) + 1)
     if not inside.all():

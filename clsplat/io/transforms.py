@@ -185,12 +185,16 @@ def _viewmat(frame: Json, path: Path, name: str) -> NDArray[np.float64]:
         matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
     except (OverflowError, TypeError, ValueError):
         matrix = np.empty(0)
-    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
-        raise InputError(f"{path}: expected a finite 4x4 transform_matrix for frame {name}, found another or none")
-    rotation = matrix[:3, :3] * (1.0, -1.0, -1.0)
     viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ matrix[:3, 3]
+    if matrix.shape in ((4, 4), (3, 4)):
+        rotation = matrix[:3, :3] * (1.0, -1.0, -1.0)
+        viewmat[:3, :3] = rotation.T
+        with np.errstate(over="ignore", invalid="ignore"):  # of a damaged file; refused below
+            viewmat[:3, 3] = -rotation.T @ matrix[:3, 3]
+    else:
+        viewmat[:] = np.nan
+    if not np.isfinite(viewmat).all():
+        raise InputError(f"{path}: expected a finite 4x4 transform_matrix for frame {name}, found another or none")
     return viewmat
 
 

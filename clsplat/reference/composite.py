@@ -149,6 +149,10 @@ def composite_bwd(
             np.add.at(v.conics, many, (v_sigma * [0.5 * dx**2, dx * dy, 0.5 * dy**2]).T)
             np.subtract.at(v.opacities, many, v_sigma / splats.opacities[many])
             np.add.at(v.colors, many, weight[:, None] * v_pixels)
+    # A splat whose gradients overflow gets none: they would stay in the statistics of densification.
+    finite = np.all([np.isfinite(a.reshape(len(a), -1)).all(axis=1) for a in v], axis=0)
+    for gradients in v:
+        gradients[~finite] = 0
     return v
 
 
