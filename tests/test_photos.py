@@ -194,17 +194,14 @@ def test_pillow_still_writes_once_pycolmap_is_loaded(tmp_path):
 
 
 def test_chunks_take_no_more_memory_than_the_file_has(tmp_path):
-    """Found by fuzzing: decoders make room for the 256 MiB that a flipped bit announces."""
+    """Found by fuzzing: decoders made room for the 256 MiB that a flipped bit announces."""
     path = tmp_path / "photo.png"
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.fromarray(np.zeros((12, 16, 3), np.uint8)).save(path, exif=exif)
+    Image.fromarray(RGB).save(path)
     content = bytearray(path.read_bytes())
-    content[content.index(b"eXIf") - 4] = 0x10
+    content[content.index(b"IDAT") - 4] = 0x10
     path.write_bytes(content)
     tracemalloc.start()
-    with pytest.raises(InputError, match=r"photo\.png"):
-        read_photo(path, (0.0, 0.0, 0.0), upright=True)
+    read_photo(path, BLACK, upright=True)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 1 << 24
