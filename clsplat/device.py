@@ -339,8 +339,11 @@ class Device:
             f"-D{name}={value!r}" if isinstance(value, float) else f"-D{name}={value}"
             for name, value in values.items()
         ]
+        shown = bool(os.environ.get("PYOPENCL_COMPILER_OUTPUT"))
         with warnings.catch_warnings():
-            # Some drivers report on every success, for example which kernels they vectorised.
-            if not os.environ.get("PYOPENCL_COMPILER_OUTPUT"):
+            # Drivers report on every success, for example which kernels they vectorised; PoCL's compiler counts its
+            # warnings on stderr.
+            if not shown:
                 warnings.simplefilter("ignore", cl.CompilerWarning)
+                options.append("-w")
             return cl.Program(self.context, inline_includes(f"{stage}.cl", kernel_folder())).build(options)

@@ -391,6 +391,7 @@ def test_beyond_a_fisheyes_image_nothing_counts(tmp_path):
         (Intrinsics("OPENCV", (64.0, 48.0), 64, 48), "8 parameters"),
         (Intrinsics("DIVISION", (48.0, 48.0, 32.0, 24.0, 30.0), 64, 48), r"DIVISION.*undone"),  # NaN
         (Intrinsics("SIMPLE_RADIAL", (48.0, 1e19, 24.0, 0.01), 64, 48), r"SIMPLE_RADIAL.*undone"),  # overflow
+        (Intrinsics("SIMPLE_RADIAL", (1e-320, 32.0, 24.0, 0.01), 64, 48), r"expected|undone"),  # overflow
         (
             Intrinsics("FULL_OPENCV", (48.0, 48.0, 32.0, 24.0, *5 * [0.0], -10.0, 0.0, 0.0), 64, 48),
             "undone",

@@ -258,12 +258,12 @@ def _positions(intrinsics: Intrinsics, size: tuple[int, int], shape: tuple[int, 
     """
     sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
     fx, fy, cx, cy = undistorted(intrinsics).params
-    x = ((np.arange(shape[1]) + 0.5) / sx - cx) / fx
-    y = ((np.arange(shape[0]) + 0.5) / sy - cy) / fy
     positions = np.empty((2, *shape), dtype=np.float32)
-    for row in range(shape[0]):
-        rays = np.stack([x, np.full_like(x, y[row]), np.ones_like(x)], axis=-1)
-        with np.errstate(over="ignore"):  # what overflows is outside
+    with np.errstate(all="ignore"):  # what overflows is outside
+        x = ((np.arange(shape[1]) + 0.5) / sx - cx) / fx
+        y = ((np.arange(shape[0]) + 0.5) / sy - cy) / fy
+        for row in range(shape[0]):
+            rays = np.stack([x, np.full_like(x, y[row]), np.ones_like(x)], axis=-1)
             positions[1, row], positions[0, row] = (project(intrinsics, rays) * (sx, sy)).T
     # COLMAP looks at the photo's border alone; a pixel outside is more than the half that rounding may cost.
     inside = (positions > -1) & (positions < np.array(size[::-1]).reshape(2, 1, 1) + 1)
