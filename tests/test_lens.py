@@ -16,12 +16,17 @@ from test_project import (
 from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
+from clsplat.bench.stability.small import CONFIG, known_gaussians, small_scene
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
+from clsplat.evaluate import mean_metrics
+from clsplat.initialize import initialize
+from clsplat.metrics import to_uint8
 from clsplat.render import render, upload
 from clsplat.stages import Splats
 from clsplat.testing import assert_matches, synthetic_scene, threshold_distances
+from clsplat.train import train
 
 WIDE = (0.05, -0.01, 0.003, -0.0004)
 MODELS = pytest.mark.parametrize("model", ["orthographic", "fisheye"])
@@ -240,3 +245,20 @@ def test_invalid_cameras_are_refused(device):
         arguments = (device, upload(device, gaussians)) if where else (gaussians,)
         with pytest.raises(InputError, match="found an equirectangular one"):
             function(*arguments, Camera.panorama(np.eye(4), 32), 0)
+
+
+@MODELS
+def test_scenes_train_on_every_model(device, tmp_path, model):
+    """From points 0.05 off, on photos of that model alone. Measured: orthographic ones from 17.9 to
+    31.2 dB, fisheyes from 26.9 to 40.1."""
+    scene = small_scene(device)
+
+    def through(views):
+        cameras = [as_model(view.camera, model) for view in views]
+        photos = [to_uint8(render(known_gaussians(), camera, device=device).rgb) for camera in cameras]
+        return [replace(v, camera=c, image=p) for v, c, p in zip(views, cameras, photos, strict=True)]
+
+    scene = replace(scene, train=through(scene.train), test=through(scene.test))
+    start = mean_metrics(initialize(scene, CONFIG.init, 0), scene.test, device=device)["psnr"]
+    found = mean_metrics(train(scene, CONFIG, device, tmp_path), scene.test, device=device)["psnr"]
+    assert found > max(30, start + 5), (start, found)
