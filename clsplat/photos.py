@@ -1,6 +1,7 @@
 """Photos as files: which there are, how large they are, and their pixels as 8-bit RGB."""
 
-import mmap
+import io
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -59,6 +60,14 @@ def heif_is_read() -> bool:
     return True
 
 
+class _Bounded(io.BufferedReader):
+    """A file that makes room for no more bytes than it has: decoders ask for as many as damaged headers announce."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        rest = max(0, os.fstat(self.fileno()).st_size - self.tell())
+        return super().read(rest if size is None or size < 0 else min(size, rest))
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     if path.suffix.lower() in HEIF and not heif_is_read():
@@ -67,12 +76,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             "'clsplat[heic]', or convert the photos to JPEG"
         )
     try:
-        # Mapped, a file has no more bytes than it has: decoders would make room for what damaged headers announce.
-        with (
-            path.open("rb") as file,
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
-            Image.open(content) as image,  # type: ignore[arg-type]  # a file but for what Pillow does not call
-        ):
+        with _Bounded(io.FileIO(path)) as file, Image.open(file) as image:
             yield image
     except InputError:
         raise

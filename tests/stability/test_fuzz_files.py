@@ -37,7 +37,7 @@ MEMORY_MAX = 3 * EXPANSION_FREE
 
 PHOTO_MEMORY_MAX = 8 * 2 * Image.MAX_IMAGE_PIXELS
 """The same for photos: a mask of one colour takes a byte of PNG for a thousand pixels, so that nothing but the number
-of pixels bounds them. Pillow refuses twice MAX_IMAGE_PIXELS; two copies of their colours, and a byte for what else."""
+of pixels bounds them. Pillow refuses twice MAX_IMAGE_PIXELS; two copies of their colours, and a byte."""
 
 EXTREMES = [
     *(struct.pack("<Q", n) for n in (0, 1, 255, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**53, 2**63 - 1, 2**64 - 1)),
