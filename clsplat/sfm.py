@@ -8,12 +8,13 @@ import hashlib
 import json
 import os
 import shutil
-import sqlite3
+import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,22 @@ RECORD = "clsplat_sfm.json"
 SEED = 0
 """Of RANSAC and of the mapper. The same photos then give the same bytes on one machine, provided that the mapper runs
 on one thread and photos enter the database in their order."""
+
+FOLLOWER = """
+import sqlite3, sys, time
+while True:
+    time.sleep(0.5)
+    try:
+        rows = sqlite3.connect(sys.argv[1], uri=True)
+        print(rows.execute(f"SELECT COUNT(*) FROM {sys.argv[2]}").fetchone()[0], flush=True)
+        rows.close()
+    except sqlite3.Error:
+        pass
+"""
+"""Program that prints how many rows a table of a database has, again and again. In a process of its own: locks on
+files belong to processes, so that within one Python's SQLite and pycolmap's do not see each other's, and the memory
+that they share was cut short under COLMAP (two of six runs on a busy machine ended with a bus error). Between
+processes, and with the database in WAL mode, COLMAP never waits for this."""
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
@@ -343,24 +360,22 @@ def _progress(database: Path, table: str, total: int | None, label: str, unit: s
     """Progress bar that counts the rows of a table of COLMAP's database while COLMAP fills it and says nothing."""
     from tqdm import tqdm
 
-    ended = threading.Event()
+    command = [sys.executable, "-c", FOLLOWER, f"{database.resolve().as_uri()}?mode=ro", table]
+    with (
+        tqdm(total=total, desc=label, unit=unit, dynamic_ncols=True) as bar,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as follower,
+    ):
 
-    def follow() -> None:
-        while not ended.wait(0.5):
-            # Read-only, and the database is in WAL mode: COLMAP never waits for this.
-            with (
-                suppress(sqlite3.Error),
-                closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as rows,
-            ):
-                bar.n = rows.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
+        def follow() -> None:
+            for line in follower.stdout or ():
+                bar.n = int(line)
                 bar.refresh()
 
-    with tqdm(total=total, desc=label, unit=unit, dynamic_ncols=True) as bar:
         thread = threading.Thread(target=follow, daemon=True)
         thread.start()
         try:
             yield
-            bar.n = total or bar.n
         finally:
-            ended.set()
+            follower.kill()
             thread.join()
+        bar.n = total or bar.n

@@ -52,6 +52,7 @@ ONLY_IN = {
     "viser": {"viewer"},
     "av": {"video"},
     "pillow_heif": {"photos"},
+    "sqlite3": set(),  # beside pycolmap's in one process it ends in a bus error, see clsplat.sfm.FOLLOWER
 }
 
 
