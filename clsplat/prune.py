@@ -76,6 +76,8 @@ def price(
         None prices with the float64 twins.
     background : (3,) floats
         RGB behind the Gaussians.
+    bands : bool
+        Whether the bands of the spherical harmonics are priced; their prices are 0 otherwise.
 
     Returns
     -------

@@ -360,7 +360,7 @@ def _progress(database: Path, table: str, total: int | None, label: str, unit: s
     """Progress bar that counts the rows of a table of COLMAP's database while COLMAP fills it and says nothing."""
     from tqdm import tqdm
 
-    command = [sys.executable, "-c", FOLLOWER, f"{database.resolve().as_uri()}?mode=ro", table]
+    command = [sys.executable, "-I", "-c", FOLLOWER, f"{database.resolve().as_uri()}?mode=ro", table]
     with (
         tqdm(total=total, desc=label, unit=unit, dynamic_ncols=True) as bar,
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as follower,
