@@ -83,9 +83,11 @@ class DataConfig:
 class InitConfig:
     """The Gaussians that training starts from."""
 
+    triangulate: bool = True
+    """Where the dataset has poses but no points, find points by its photos; without it the start is random."""
     random_points: int | None = None
-    """Gaussians of a random start, where the scene has no points; default: 100 000 (the original's number), 10 000
-    with --size auto, which adds where they are needed."""
+    """Gaussians of a random start, where there are no points; default: 100 000 (the original's number), 10 000 with
+    --size auto, which adds where they are needed."""
     random_extent: float = 1 / 3
     """Half edge of the random start's box, as a fraction of the cameras' mean distance from the point they look
     at; for NeRF-synthetic scenes (distance 4) that is the original's box within 3 %."""

@@ -14,6 +14,7 @@ PURPOSES = (
     "sources of new Gaussians",
     "surveyed views",
     "backgrounds",
+    "points between points",
 )
 
 

@@ -191,7 +191,7 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
             _check_registered(record["registered"], len(names), photos, config)
             return model
 
-    with _workspace(output) as work, _quiet(verbose):
+    with _workspace(output) as work, quiet(verbose):
         found = _largest_model(_readable(folder, names, work), names, work, _matched(config, folder))
         registered = 0 if found is None else int(found.num_reg_images())
         _check_registered(registered, len(names), photos, config)
@@ -251,7 +251,8 @@ def _workspace(output: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _quiet(verbose: bool) -> Iterator[None]:
+def quiet(verbose: bool) -> Iterator[None]:
+    """Without COLMAP's messages, unless `verbose`."""
     from pycolmap import logging
 
     before = logging.minloglevel
@@ -304,7 +305,7 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
     mode = pycolmap.CameraMode.SINGLE if config.single_camera else pycolmap.CameraMode.PER_IMAGE
     for group in by_size.values():  # COLMAP's single camera has one size, and it skips photos of another
         pycolmap.import_images(database, folder, image_names=group, camera_mode=mode, options=reader)
-    with _progress(database, "keypoints", len(names), "features", "photo"):
+    with progress(database, "keypoints", len(names), "features", "photo"):
         pycolmap.set_random_seed(SEED)
         pycolmap.extract_features(
             database, folder, image_names=names, extraction_options=extraction, device=pycolmap.Device.cpu
@@ -315,7 +316,7 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     pairs = len(names) * (len(names) - 1) // 2 if exhaustive else None
-    with _progress(database, "two_view_geometries", pairs, "matches", "pair"):
+    with progress(database, "two_view_geometries", pairs, "matches", "pair"):
         pycolmap.set_random_seed(SEED)
         match(database, verification_options=verification, device=pycolmap.Device.cpu)
 
@@ -356,7 +357,7 @@ def _turn_upright(model: Any) -> None:
 
 
 @contextmanager
-def _progress(database: Path, table: str, total: int | None, label: str, unit: str) -> Iterator[None]:
+def progress(database: Path, table: str, total: int | None, label: str, unit: str) -> Iterator[None]:
     """Progress bar that counts the rows of a table of COLMAP's database while COLMAP fills it and says nothing."""
     from tqdm import tqdm
 

@@ -26,6 +26,7 @@ LAYERS = """
     camera gaussians lenses video
     sfm panorama
     scene structs device reference perphoto metrics raytrace orbit
+    triangulate
     ops io testing still_life memory pyramid
     page render optim densify initialize exposure few_views report demo preview
     prune rasterization survey poses
@@ -48,7 +49,7 @@ BENCH_KERNELS = {"roof"}
 # Where a foreign package may be imported at all, whose absence or weight the rest must not feel.
 ONLY_IN = {
     "pyopencl": {"device", "ops"},
-    "pycolmap": {"sfm", "lenses"},
+    "pycolmap": {"sfm", "lenses", "triangulate"},
     "viser": {"viewer"},
     "av": {"video"},
     "pillow_heif": {"photos"},

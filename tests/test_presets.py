@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.config import AdcConfig, DataConfig, OptimConfig, SfmConfig, TrainConfig
+from clsplat.config import AdcConfig, DataConfig, InitConfig, OptimConfig, SfmConfig, TrainConfig
 from clsplat.densify import STRATEGIES
 from clsplat.errors import InputError
 from clsplat.presets import FOLDER, PRESETS, load_config, load_preset, read_settings, with_settings
@@ -39,7 +39,7 @@ def test_a_preset_sets_what_it_holds_and_nothing_else(name):
 
 
 def test_the_papers_presets_are_its_strategy_and_iterations():
-    paper = TrainConfig(strategy="adc", size="fixed")
+    paper = TrainConfig(strategy="adc", size="fixed", init=InitConfig(triangulate=False))
     assert load_preset("paper-7k") == replace(paper, iterations=7000)
     assert load_preset("paper-30k") == replace(paper, iterations=30_000)
 

@@ -33,8 +33,7 @@ def cameras():
 def corner(camera, textures):
     """Photo of the three planes x = 0, y = 0, z = 0, each with a texture of 160 pixels per unit."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
-    rays = rays @ camera.viewmat[:3, :3]
+    rays = camera.rays(x, y) @ camera.viewmat[:3, :3]
     reach = np.where(rays < 0, -camera.position / rays, np.inf)
     plane, hit = reach.argmin(axis=-1), camera.position + rays * reach.min(axis=-1)[..., None]
     photo = np.zeros((*x.shape, 3))
@@ -46,14 +45,14 @@ def corner(camera, textures):
     return np.rint(photo).astype(np.uint8)
 
 
-def take_photos(seed):
-    """What the four cameras see of a corner with textures of its own."""
+def take_photos(seed, seen_by=None):
+    """What the four cameras, or others, see of a corner with textures of its own."""
     rng = np.random.default_rng(seed)
     textures = []
     for _ in range(3):
         layers = [s * gaussian_filter(rng.normal(size=(512, 512, 3)), (s, s, 0), mode="wrap") for s in (1.5, 4, 12)]
         textures.append(np.clip(127 + 60 * sum(layers) / np.std(sum(layers)), 0, 255))
-    return [corner(camera, textures) for camera in cameras()]
+    return [corner(camera, textures) for camera in seen_by or cameras()]
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ from clsplat.device import Device
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluate import mean_metrics
 from clsplat.gaussians import Gaussians
-from clsplat.io import load_scene, save_gaussians
+from clsplat.io import load_scene, save_gaussians, with_points
 from clsplat.metrics import flip, psnr, ssim
 from clsplat.presets import YAML, load_config, load_preset, with_settings
 from clsplat.render import render_views
@@ -240,8 +240,7 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
     source: Source | None = None
     scene: Scene | ClsplatError | None = None
     for number, cell in enumerate(missing, start=1):
-        start = f"[{number}/{len(missing)}] {cell.label}"
-        say(start)
+        say(f"[{number}/{len(missing)}] {cell.label}")
 
         def record(values: Record, cell: Cell = cell) -> None:
             now = datetime.now(timezone.utc).isoformat(timespec="seconds")
@@ -254,7 +253,8 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
                 scene = _load(source)
             if not isinstance(scene, Scene):
                 raise scene or ClsplatError(f"{cell.source.path}: could not be read, see above")
-            last = run_cell(cell, scene, device, record)
+            start = with_points(scene, source.path, source.data) if cell.config.init.triangulate else scene
+            last = run_cell(cell, start, device, record)
             flips = "" if last["flip"] is None else f", FLIP {last['flip']:.3f}"
             say(
                 f"    {last['psnr']:.2f} dB, SSIM {last['ssim']:.3f}{flips}; {last['seconds']:.0f} s, "

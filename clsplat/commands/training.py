@@ -67,7 +67,7 @@ class Train:
         """Run the command."""
         from clsplat import few_views
         from clsplat.initialize import start_size
-        from clsplat.io import load_scene, save_gaussians, suffix_of
+        from clsplat.io import load_scene, save_gaussians, suffix_of, with_points
         from clsplat.memory import Footprint, parse_size
         from clsplat.train import start_config
         from clsplat.video import extract_frames, is_video
@@ -87,8 +87,13 @@ class Train:
         if is_video(data):
             data = out / "frames"
             say(f"{data}: {extract_frames(self.data, data)} frames of {self.data.name}")
-        scene = load_scene(data, config.data, verbose=console.loudness == "verbose")
+        verbose = console.loudness == "verbose"
+        scene = load_scene(data, config.data, verbose)
         say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
+        if config.init.triangulate and not len(scene.points) and not (out / "checkpoint.npz").exists():
+            scene = with_points(scene, data, config.data, verbose)
+            found = f"{len(scene.points)} points, from photos and poses" if len(scene.points) else "random"
+            say(f"start: {found} (--init.no-triangulate: random)")
         adapted = few_views.adapted(config, scene)
         if adapted != config:
             config = adapted

@@ -10,13 +10,13 @@ from clsplat.config import Mode
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.io.compressed_ply import load_compressed_ply, save_compressed_ply
-from clsplat.io.dataset import load_scene
+from clsplat.io.dataset import load_scene, with_points
 from clsplat.io.ply import load_ply, save_ply
 from clsplat.io.sog import META, load_sog, save_sog
 from clsplat.io.splat import load_splat, save_splat
 from clsplat.io.spz import load_spz, save_spz
 
-__all__ = ["FORMATS", "load_gaussians", "load_scene", "save_gaussians"]
+__all__ = ["FORMATS", "load_gaussians", "load_scene", "save_gaussians", "with_points"]
 
 Loader = Callable[[str | Path], tuple[Gaussians, Mode, NDArray[np.float64]]]
 Saver = Callable[[str | Path, Gaussians, Mode, ArrayLike | None], None]

@@ -1,5 +1,6 @@
 """From a folder to a `Scene`: what kind of dataset it is, which photos are held out, where the origin lies."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +12,10 @@ from clsplat.constants import NEAR
 from clsplat.errors import InputError
 from clsplat.io import colmap, transforms
 from clsplat.io.files import PhotosMissing
-from clsplat.io.images import Dataset, by_faces, load_views
+from clsplat.io.images import Dataset, by_faces, load_view, load_views
 from clsplat.photos import list_photos
 from clsplat.scene import Scene, View
+from clsplat.triangulate import filled, triangulate
 
 OFFSET_EXTENTS = 1000
 """Scene extents that the cameras may lie from the origin before it is moved to them. There float32 still tells apart
@@ -87,6 +89,57 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
             f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
         )
     return _with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
+
+
+def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: bool = False) -> Scene:
+    """The scene with points triangulated from the photos to train on, where it has none, and filled up.
+
+    Training would start from random points, which cost 3 to 7 dB in short runs (docs/stability.md).
+
+    Parameters
+    ----------
+    scene : Scene
+        From `load_scene`.
+    path : str or Path
+        The dataset that it was loaded from: features come from the photos as large as they are there, up to
+        `clsplat.triangulate.EDGE_MAX`.
+    config : DataConfig
+        That it was loaded with.
+    verbose : bool
+        Show COLMAP's own messages.
+
+    Returns
+    -------
+    Scene
+        Without points as before where the photos show too few.
+
+    Raises
+    ------
+    InputError
+        If a photo can no longer be read.
+    """
+    if len(scene.points):
+        return scene
+    cameras = {view.name for view in scene.train}
+    dataset = _full_size(Path(path), config)
+    photos = sorted((photo for photo in dataset.photos if photo.name in cameras), key=lambda photo: photo.name)
+    views = (load_view(photo, dataset, config) for photo in photos)
+    near = (replace(view, camera=view.camera.translated(scene.offset)) for view in views)
+    points, colors = triangulate(near, verbose)
+    if len(points):
+        points, colors = filled(points, colors)
+    return replace(scene, points=points, colors=colors)
+
+
+def _full_size(path: Path, config: DataConfig) -> Dataset:
+    """The dataset with its photos' own size; that of `config` where only smaller copies are here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is missing has been told
+        try:
+            dataset = _find(path, replace(config, downscale=1), verbose=False)
+        except InputError:
+            dataset = _find(path, config, verbose=False)
+    return replace(dataset, photos=by_faces(dataset.photos))
 
 
 def _find(path: Path, config: DataConfig, verbose: bool) -> Dataset:

@@ -138,6 +138,11 @@ def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
         return list(tqdm(views, "photos", len(plans), unit="photo", dynamic_ncols=True, leave=False))
 
 
+def load_view(photo: PosedPhoto, dataset: Dataset, config: DataConfig) -> View:
+    """Decode one of a dataset's photos, as `load_views` does, with its errors."""
+    return _view(_plan(photo, dataset, config.invert_masks), dataset.reduce, config)
+
+
 def _plan(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> _Plan:
     declared = photo.intrinsics
     width, height = photo_size(photo.path)

@@ -5,12 +5,13 @@ from dataclasses import replace
 import pytest
 
 from clsplat.bench.stability.growth import (
+    LONGER,
     RESET_CONFIG,
-    _random_start,
     around_reset,
     checkerboard,
     largest_number,
     noise,
+    points_lost,
 )
 from clsplat.bench.stability.small import CONFIG, small_scene, with_train
 
@@ -37,7 +38,9 @@ def test_photos_that_nothing_explains_stay_under_the_cap(device, photos):
 
 @pytest.mark.slow
 @pytest.mark.shared
-def test_a_random_start_costs_little(device, shared):
-    """Kheradmand et al. 2024: 3DGS loses 5 dB, strategies that move Gaussians next to nothing."""
-    losses = {figure.label: figure.value for figure in _random_start(device, shared / "data").figures}
-    assert min(losses["error, box 1x"], losses["mcmc, box 1x"]) < losses["adc, box 3x"]
+@pytest.mark.parametrize("name", ["fox_pinhole", "fern"])
+def test_points_found_by_the_poses_are_as_good_as_given_ones(device, shared, name):
+    """Kheradmand et al. 2024: from random points 3DGS loses 5 dB."""
+    lost = points_lost(shared / "data", name, LONGER, device)
+    # The issue's bound; measured: FILL.
+    assert lost["triangulated"] < 0.5 < 2 < lost["random"]

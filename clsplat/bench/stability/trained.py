@@ -18,11 +18,11 @@ SHORT = TrainConfig(strategy="adc", size="fixed", iterations=500, eval_every=0, 
 """Of fern at 120x90, fox_pinhole at 67x120, castle_p30 at 96x64."""
 
 
-def load(data: Path | None, name: str) -> tuple[Scene, TrainConfig]:
+def load(data: Path | None, name: str, config: TrainConfig = SHORT) -> tuple[Scene, TrainConfig]:
     """A real scene and the configuration it is trained with."""
     if data is None:
         raise InputError("data: expected the folder of real scenes, found none")
-    return load_scene(data / name, SHORT.data), SHORT
+    return load_scene(data / name, config.data), config
 
 
 def trained(scene: Scene, config: TrainConfig, device: Device) -> Gaussians:
