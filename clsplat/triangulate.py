@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from clsplat.camera import Camera
+from clsplat.errors import InputError
 from clsplat.randomness import stream
 from clsplat.scene import View
 from clsplat.sfm import SEED, progress, quiet
@@ -81,6 +82,11 @@ def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[n
         In world units; P is 0 where fewer than `FEWEST` were found.
     colors : (P, 3) uint8
         Means of the photos'.
+
+    Raises
+    ------
+    InputError
+        If a camera is neither.
     """
     import pycolmap
 
@@ -148,6 +154,8 @@ def _database(views: Iterable[View], database: Path, work: Path) -> dict[str, Ca
     (work / "masks").mkdir()
     for number, view in enumerate(views):
         name, camera = f"{number:06}.png", view.camera
+        if camera.model not in ("pinhole", "fisheye"):
+            raise InputError(f"{view.name}: expected a pinhole or fisheye camera, found {camera.model}")
         # Read once, then deleted: speed before size.
         Image.fromarray(view.image).save(work / name, compress_level=1)
         counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask

@@ -11,6 +11,7 @@ from test_sfm import cameras, take_photos
 from clsplat.camera import Camera
 from clsplat.cli import main
 from clsplat.config import DataConfig
+from clsplat.errors import InputError
 from clsplat.io import load_gaussians, load_scene, with_points
 from clsplat.scene import View
 from clsplat.triangulate import FEWEST, NEIGHBOURS, START, filled, pairs, triangulate
@@ -96,6 +97,12 @@ def test_photos_that_show_nothing_make_no_points(posed):
     for photos in (posed[:1], [replace(v, image=np.full_like(v.image, 90)) for v in posed]):
         points, colors = triangulate(photos)
         assert points.shape == colors.shape == (0, 3)
+
+
+def test_only_cameras_that_colmap_knows_are_taken(posed):
+    flat = replace(posed[0], camera=replace(posed[0].camera, model="orthographic"))
+    with pytest.raises(InputError, match=r"0\.png: expected a pinhole or fisheye camera.*orthographic"):
+        triangulate([flat, *posed[1:]])
 
 
 def test_photos_are_matched_with_the_nearest_that_look_the_same_way():
