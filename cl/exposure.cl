@@ -3,36 +3,55 @@
 //   y = A x + b per pixel   (Rematas et al. 2022, "Urban radiance fields", section 3.2; Kerbl et al. 2024, "A hierarchical
 //                            3D Gaussian representation", has the same 3x4 matrix per photo)
 //   v_x = A^T v_y,  v_A = sum of v_y x^T,  v_b = sum of v_y
+// A camera clips: where the photo is 255, y counts as 1 at most, where it is 0, as 0 at least, and there v_y is 0.
 // docs/stages/exposure.md; clsplat/reference/exposure.py is the twin.
 //
 // Mapping: exposure_fwd has one work-item per pixel. In exposure_bwd work-item i has the pixels i first, i first + step,
 // ..., `count` of them at most: neighbours on a CPU (step 1), on a GPU as far apart as there are work-items, so that
 // those touch neighbours together. Sums have a fixed order: within a work-item, then over `parts`, on the host.
 //
-// Buffers, P pixels: in image[P,3] (x); out adjusted[P,3] (y); in and out v_image[P,3], v_y before and v_x after;
-//   out parts[work-items,12], the gradient of (A, b) row by row.
+// Buffers, P pixels: in image[P,3] (x), photo[P,3] uchar; out adjusted[P,3] (y); in and out v_image[P,3], v_y before and
+//   v_x after; out parts[work-items,12], the gradient of (A, b) row by row.
 // affine holds the rows of (A, b), four values each, and four that are not read.
 #include "common.h"
 
+static inline real3 mapped(const real16 affine, const real3 x) {
+    return affine.s048 * x.x + affine.s159 * x.y + affine.s26a * x.z + affine.s37b;
+}
+
+// A channel beyond the end of the range at which the camera has clipped it.
+static inline int beyond(const real y, const uchar photo) {
+    return (photo == 255 && y > 1) || (photo == 0 && y < 0);
+}
+
 __kernel void exposure_fwd(const uint pixels, const real16 affine, const __global real *image,
-                           __global real *adjusted) {
+                           const __global uchar *photo, __global real *adjusted) {
     const size_t i = get_global_id(0);
     if (i >= pixels)
         return;
-    const real3 x = load3(image, i);
-    store3(adjusted, i, affine.s048 * x.x + affine.s159 * x.y + affine.s26a * x.z + affine.s37b);
+    real3 y = mapped(affine, load3(image, i));
+    const uchar3 seen = vload3(i, photo);
+    y.x = beyond(y.x, seen.x) ? clamp(y.x, (real)0, (real)1) : y.x;
+    y.y = beyond(y.y, seen.y) ? clamp(y.y, (real)0, (real)1) : y.y;
+    y.z = beyond(y.z, seen.z) ? clamp(y.z, (real)0, (real)1) : y.z;
+    store3(adjusted, i, y);
 }
 
 __kernel void exposure_bwd(const uint pixels, const uint items, const uint first, const uint step, const uint count,
-                           const real16 affine, const __global real *image, __global real *v_image,
-                           __global real *parts) {
+                           const real16 affine, const __global real *image, const __global uchar *photo,
+                           __global real *v_image, __global real *parts) {
     const size_t item = get_global_id(0);
     if (item >= items)
         return;
     real3 by_x = 0, by_y = 0, by_z = 0, by_1 = 0; // columns of the gradient of (A, b)
     size_t i = item * first;
     for (uint k = 0; k < count && i < pixels; ++k, i += step) {
-        const real3 x = load3(image, i), v = load3(v_image, i);
+        const real3 x = load3(image, i), y = mapped(affine, x);
+        const uchar3 seen = vload3(i, photo);
+        real3 v = load3(v_image, i);
+        v.x = beyond(y.x, seen.x) ? 0 : v.x;
+        v.y = beyond(y.y, seen.y) ? 0 : v.y;
+        v.z = beyond(y.z, seen.z) ? 0 : v.z;
         by_x += v * x.x;
         by_y += v * x.y;
         by_z += v * x.z;

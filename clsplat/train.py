@@ -237,10 +237,10 @@ def step(state: State, iteration: int, view: View, photos: Photos, config: Train
     stage, image = stage_functions(device), run.image.image
     if state.exposures:
         affine = state.exposures.of(view.name)
-        image = stage.exposure_fwd(image, affine)
+        image = stage.exposure_fwd(image, affine, photo)
     loss, v_image = stage.l1_ssim(image, photo, config.optim.ssim_weight, mask)
     if state.exposures:
-        v_affine = stage.exposure_bwd(run.image.image, affine, v_image)
+        v_affine = stage.exposure_bwd(run.image.image, affine, photo, v_image)
         exposure.update(state.exposures, view.name, v_affine, progress, config.optim)
     # No kernel writes this buffer: the loss does not depend on alpha.
     v_alpha = device.scratch("v_alpha", camera.height * camera.width)

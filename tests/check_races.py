@@ -127,12 +127,14 @@ def exposure(device):
         device.is_cpu = is_cpu
         for height, width in ((5, 7), (65, 64)):
             image, v = rng.uniform(0, 1, (height, width, 3)), rng.normal(size=(height, width, 3))
-            on_device = device.upload("image", image), device.upload("v", v)
-            adjusted = ops.exposure_fwd(device, on_device[0], affine)
-            v_affine = ops.exposure_bwd(device, on_device[0], affine, on_device[1])
-            np.testing.assert_allclose(adjusted.get(), reference.exposure_fwd(image, affine), atol=1e-12)
-            np.testing.assert_allclose(v_affine, reference.exposure_bwd(image, affine, v), rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(on_device[1].get(), v, atol=1e-12)
+            photo = rng.choice([0, 128, 255], image.shape).astype(np.uint8)
+            x, p, g = device.upload("image", image), device.upload("photo", photo, np.uint8), device.upload("v", v)
+            adjusted = ops.exposure_fwd(device, x, affine, p)
+            v_affine = ops.exposure_bwd(device, x, affine, p, g)
+            np.testing.assert_allclose(adjusted.get(), reference.exposure_fwd(image, affine, photo), atol=1e-12)
+            expected = reference.exposure_bwd(image, affine, photo, v)
+            np.testing.assert_allclose(v_affine, expected, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(g.get(), v, atol=1e-12)
 
 
 def adam(device):

@@ -1,5 +1,7 @@
 """Stage exposure: in numbers, against the twin, and against central differences; then its parameters per photo."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from tolerances import DOUBLE, FLOAT
@@ -13,24 +15,25 @@ SIZES = [(1, 1), (5, 7), (64, 64), (65, 64), (97, 131)]
 
 
 def inputs(height, width):
-    """Image, map and gradient, exact in single precision."""
+    """Image, map, photo and gradient, exact in single precision; a third of the photo each is black and white."""
     rng = np.random.default_rng(height)
     arrays = rng.uniform(0, 1, (height, width, 3)), rng.normal(size=(3, 4)), rng.normal(size=(height, width, 3))
-    return [a.astype(np.float32).astype(np.float64) for a in arrays]
+    image, affine, v_image = (a.astype(np.float32).astype(np.float64) for a in arrays)
+    return [image, affine, rng.choice([0, 128, 255], image.shape).astype(np.uint8), v_image]
 
 
-def by_kernel(device, image, affine, v_image):
-    x, v = device.upload("image", image), device.upload("v", v_image)
-    adjusted = ops.exposure_fwd(device, x, affine)
-    v_affine = ops.exposure_bwd(device, x, affine, v)
+def by_kernel(device, image, affine, photo, v_image):
+    x, p, v = device.upload("image", image), device.upload("photo", photo, np.uint8), device.upload("v", v_image)
+    adjusted = ops.exposure_fwd(device, x, affine, p)
+    v_affine = ops.exposure_bwd(device, x, affine, p, v)
     np.testing.assert_array_equal(x.get(), image.astype(device.real))
     return adjusted.get(), v.get(), v_affine
 
 
-def by_twin(image, affine, v_image):
+def by_twin(image, affine, photo, v_image):
     v = v_image.copy()
-    adjusted = reference.exposure_fwd(image, affine)
-    v_affine = reference.exposure_bwd(image, affine, v)
+    adjusted = reference.exposure_fwd(image, affine, photo)
+    v_affine = reference.exposure_bwd(image, affine, photo, v)
     return adjusted, v, v_affine
 
 
@@ -39,10 +42,26 @@ def test_in_numbers(any_device):
     image = np.array([[[1.0, 2.0, 3.0]]])
     affine = np.array([[1.0, 10.0, 100.0, 0.5], [0, 0, 2, 0], [0, 0, 0, -1]])
     v = np.array([[[1.0, 2.0, 4.0]]])
-    for adjusted, v_image, v_affine in (by_twin(image, affine, v), by_kernel(any_device, image, affine, v)):
+    photo = np.full((1, 1, 3), 128, np.uint8)
+    for run in (by_twin, partial(by_kernel, any_device)):
+        adjusted, v_image, v_affine = run(image, affine, photo, v)
         np.testing.assert_array_equal(adjusted, [[[321.5, 6, -1]]])
         np.testing.assert_array_equal(v_image, [[[1, 10, 104]]])
         np.testing.assert_array_equal(v_affine, [[1, 2, 3, 1], [2, 4, 6, 2], [4, 8, 12, 4]])
+
+
+def test_what_the_camera_clips_counts_as_clipped(any_device):
+    """Beyond white where the photo is white and below black where it is black, and nowhere else."""
+    image = np.array([[[1.5, -0.5, 0.5], [1.5, -0.5, 2.0], [0.875, 0.125, -3.0]]])
+    photo = np.array([[[255, 0, 255], [254, 1, 0], [255, 0, 255]]], np.uint8)
+    v = np.arange(1.0, 10).reshape(1, 3, 3)
+    for run in (by_twin, partial(by_kernel, any_device)):
+        adjusted, v_image, v_affine = run(image, exposure.IDENTITY, photo, v)
+        expected = image.copy()
+        expected[0, 0] = [1, 0, 0.5]
+        np.testing.assert_array_equal(adjusted, expected.astype(any_device.real))
+        np.testing.assert_array_equal(v_image, [[[0, 0, 3], [4, 5, 6], [7, 8, 9]]])
+        np.testing.assert_array_equal(v_affine[:, 3], [4 + 7, 5 + 8, 3 + 6 + 9])
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
@@ -65,10 +84,11 @@ def check(device, height, width):
 
 
 def test_gradients_by_central_differences(device64):
-    image, affine, v = inputs(9, 11)
-    _, v_image, v_affine = by_kernel(device64, image, affine, v)
+    image, affine, photo, v = inputs(9, 11)
+    _, v_image, v_affine = by_kernel(device64, image, affine, photo, v)
+    assert (v_image == 0).any()
     gradcheck(
-        lambda image, affine: float((by_kernel(device64, image, affine, v)[0] * v).sum()),
+        lambda image, affine: float((by_kernel(device64, image, affine, photo, v)[0] * v).sum()),
         {"image": image, "affine": affine},
         {"image": v_image, "affine": v_affine},
     )
@@ -77,15 +97,15 @@ def test_gradients_by_central_differences(device64):
 def test_photos_find_their_exposures_and_the_mean_stays():
     """Descent on |A x + b - y|^2 for photos of three gains: their ratios are found, and the mean map is none."""
     rng = np.random.default_rng(0)
-    image = rng.uniform(0, 1, (8, 8, 3))
+    image, photo = rng.uniform(0, 1, (8, 8, 3)), np.full((8, 8, 3), 128, np.uint8)
     gains = {"a.png": 0.8, "b.png": 1.0, "c.png": 1.2}
     exposures = exposure.start(list(gains))
     config = OptimConfig()
     for k in range(1500):
         name = list(gains)[k % 3]
         affine = exposures.of(name)
-        v = 2 * (reference.exposure_fwd(image, affine) - gains[name] * image) / image.size
-        exposure.update(exposures, name, reference.exposure_bwd(image, affine, v), k / 1500, config)
+        v = 2 * (reference.exposure_fwd(image, affine, photo) - gains[name] * image) / image.size
+        exposure.update(exposures, name, reference.exposure_bwd(image, affine, photo, v), k / 1500, config)
         np.testing.assert_allclose(exposures.values.mean(axis=0), exposure.IDENTITY, atol=1e-12)
     for name, gain in gains.items():
         expected = np.hstack([gain * np.eye(3), np.zeros((3, 1))])
@@ -97,5 +117,5 @@ def test_a_photo_is_seen_as_the_scene_would_show_it():
     photo = np.random.default_rng(0).integers(20, 200, (4, 5, 3), dtype=np.uint8)
     affine = np.array([[1.1, 0.02, 0, 0.01], [0, 0.9, 0.01, 0], [0, 0, 1.05, -0.02]])
     neutral = exposure.neutral(photo, affine)
-    back = 255 * reference.exposure_fwd(neutral / 255, affine)
+    back = 255 * reference.exposure_fwd(neutral / 255, affine, photo)
     np.testing.assert_allclose(back, photo, atol=0.6)  # of 255: half a step of rounding, times the gains

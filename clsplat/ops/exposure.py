@@ -13,14 +13,16 @@ CPU_PIXELS = 4096
 GPU_ITEMS = 2048
 
 
-def exposure_fwd(device: Device, image: Array, affine: NDArray[Any]) -> Array:
-    """Map an image's colours.
+def exposure_fwd(device: Device, image: Array, affine: NDArray[Any], photo: Array) -> Array:
+    """Map an image's colours, as the camera of a photo would show them.
 
     Parameters
     ----------
     image : (H, W, 3) real
     affine : (3, 4) array on the host
         A and b of A x + b, side by side.
+    photo : (H, W, 3) uint8
+        Where it is 255, the result is 1 at most, where it is 0, 0 at least: what a camera clips, it cannot tell.
 
     Returns
     -------
@@ -28,16 +30,18 @@ def exposure_fwd(device: Device, image: Array, affine: NDArray[Any]) -> Array:
     """
     pixels = image.size // 3
     adjusted = device.empty("adjusted image", image.shape)
-    device.launch("exposure", "exposure_fwd", (pixels,), [pixels, _packed(device, affine), image, adjusted])
+    device.launch("exposure", "exposure_fwd", (pixels,), [pixels, _packed(device, affine), image, photo, adjusted])
     return adjusted
 
 
-def exposure_bwd(device: Device, image: Array, affine: NDArray[Any], v_image: Array) -> NDArray[np.float64]:
+def exposure_bwd(
+    device: Device, image: Array, affine: NDArray[Any], photo: Array, v_image: Array
+) -> NDArray[np.float64]:
     """Gradients of `exposure_fwd`.
 
     Parameters
     ----------
-    image, affine
+    image, affine, photo
         As given to `exposure_fwd`.
     v_image : (H, W, 3) real
         Gradient with respect to its result; becomes that with respect to `image`, in place.
@@ -52,7 +56,7 @@ def exposure_bwd(device: Device, image: Array, affine: NDArray[Any], v_image: Ar
     else:
         items, first, step, count = GPU_ITEMS, 1, GPU_ITEMS, -(-pixels // GPU_ITEMS)
     parts = device.empty("v_affine", (items, 12))
-    arguments = [pixels, items, first, step, count, _packed(device, affine), image, v_image, parts]
+    arguments = [pixels, items, first, step, count, _packed(device, affine), image, photo, v_image, parts]
     device.launch("exposure", "exposure_bwd", (items,), arguments)
     return np.asarray(parts.get().sum(axis=0, dtype=np.float64).reshape(3, 4))
 

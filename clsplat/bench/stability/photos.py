@@ -11,6 +11,7 @@ from clsplat.bench.stability.small import CONFIG, small_scene, soot
 from clsplat.bench.stability.trained import held_out, load, spread, trained
 from clsplat.config import BACKGROUNDS, DataConfig
 from clsplat.device import Device
+from clsplat.metrics import psnr_fitted
 from clsplat.render import render
 from clsplat.scene import Scene, View
 
@@ -48,17 +49,23 @@ def displaced(scene: Scene, degrees: float) -> Scene:
 
 def _exposure(device: Device, data: Path | None) -> Found:
     scene, config = load(data, "fern")
-    series: dict[str, list[tuple[float, float | None]]] = {"one exposure for all": [], "--exposure": []}
+    labels = {False: "one exposure for all", True: "--exposure"}
+    series: dict[str, list[tuple[float, float | None]]] = {label: [] for label in labels.values()}
+    fitted = {}
     for gain in GAINS:
         changed = with_gains(scene, gain)
-        for label, on in (("one exposure for all", False), ("--exposure", True)):
+        for on, label in labels.items():
             asked = replace(config, exposure=on)
-            series[label].append((gain, held_out(trained(changed, asked, device), scene, asked, device)))
-    unchanged = series["one exposure for all"][0][1] or 0.0
+            gaussians = trained(changed, asked, device)
+            series[label].append((gain, held_out(gaussians, scene, asked, device)))
+            fitted[label, gain] = held_out(gaussians, scene, asked, device, psnr_fitted)
+    unchanged = series[labels[False]][0][1] or 0.0
+    after = {label: fitted[labels[False], 0.0] - fitted[label, 0.2] for label in labels.values()}
     return Found(
         [
             *(Figure(label, unchanged - (dict(points)[0.2] or 0.0), "dB") for label, points in series.items()),
             Figure("--exposure, photos that agree", unchanged - (dict(series["--exposure"])[0.0] or 0.0), "dB"),
+            *(Figure(f"{label}, after an affine fit", lost, "dB") for label, lost in after.items()),
         ],
         Plot("largest change of a photo's gain", "PSNR of held-out photos, dB", series),
     )

@@ -9,9 +9,10 @@ import numpy as np
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.errors import InputError
-from clsplat.evaluate import mean_metrics
+from clsplat.evaluate import Metric, mean_metrics
 from clsplat.gaussians import Gaussians
 from clsplat.io import load_scene
+from clsplat.metrics import psnr
 from clsplat.scene import Scene
 
 SHORT = TrainConfig(strategy="adc", size="fixed", iterations=500, eval_every=0, data=DataConfig(downscale=8))
@@ -33,10 +34,10 @@ def trained(scene: Scene, config: TrainConfig, device: Device) -> Gaussians:
         return train(scene, config, device, Path(out))
 
 
-def held_out(gaussians: Gaussians, scene: Scene, config: TrainConfig, device: Device) -> float:
-    """Mean PSNR of the held-out photos, dB."""
+def held_out(gaussians: Gaussians, scene: Scene, config: TrainConfig, device: Device, metric: Metric = psnr) -> float:
+    """Mean PSNR of the held-out photos, or what `metric` says, dB."""
     background = BACKGROUNDS[config.data.background]
-    return mean_metrics(gaussians, scene.test, config.render, device, background)["psnr"]
+    return mean_metrics(gaussians, scene.test, config.render, device, background, (metric,))[metric.__name__]
 
 
 def spread(scene: Scene, count: int) -> Scene:
