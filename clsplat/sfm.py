@@ -192,7 +192,8 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
             return model
 
     with _workspace(output) as work, quiet(verbose):
-        found = _largest_model(_readable(folder, names, work), names, work, _matched(config, folder))
+        readable = _readable(folder, names, work, config.max_image_size)
+        found = _largest_model(readable, names, work, _matched(config, folder))
         registered = 0 if found is None else int(found.num_reg_images())
         _check_registered(registered, len(names), photos, config)
         _turn_upright(found)
@@ -263,7 +264,12 @@ def quiet(verbose: bool) -> Iterator[None]:
         logging.minloglevel = before
 
 
-def _readable(folder: Path, names: list[str], work: Path) -> Path:
+def is_sliver(width: int, height: int, edge_max: int) -> bool:
+    """Whether nothing is left of a photo whose longer edge is reduced to `edge_max`: COLMAP dies of it."""
+    return min(width, height) * edge_max < max(width, height)
+
+
+def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path:
     """Folder in which COLMAP reads the pixels that training reads: `folder`, or a copy of it where it would not.
 
     COLMAP ignores the EXIF orientation, and skips files that it cannot decode without an error; hence every photo is
@@ -272,7 +278,12 @@ def _readable(folder: Path, names: list[str], work: Path) -> Path:
     from tqdm import tqdm
 
     def check(name: str) -> bool:
-        read_photo(folder / name, (0.0, 0.0, 0.0), upright=False)
+        height, width, _ = read_photo(folder / name, (0.0, 0.0, 0.0), upright=False).shape
+        if is_sliver(width, height, edge_max):
+            raise InputError(
+                f"{folder / name}: expected a photo at most {edge_max} times as long as it is wide, found "
+                f"{width}x{height} pixels"
+            )
         return is_plain(folder / name)
 
     def copy(name: str, plain: bool) -> None:

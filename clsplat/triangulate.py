@@ -16,7 +16,7 @@ from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.randomness import stream
 from clsplat.scene import View
-from clsplat.sfm import SEED, progress, quiet
+from clsplat.sfm import SEED, is_sliver, progress, quiet
 
 NEIGHBOURS = 10
 """Photos that each is matched with: as many as COLMAP's sequential matching takes before each frame of a video."""
@@ -156,6 +156,8 @@ def _database(views: Iterable[View], database: Path, work: Path) -> dict[str, Ca
         name, camera = f"{number:06}.png", view.camera
         if camera.model not in ("pinhole", "fisheye"):
             raise InputError(f"{view.name}: expected a pinhole or fisheye camera, found {camera.model}")
+        if is_sliver(camera.width, camera.height, EDGE_MAX):
+            continue
         # Read once, then deleted: speed before size.
         Image.fromarray(view.image).save(work / name, compress_level=1)
         counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask

@@ -245,6 +245,13 @@ def test_bad_options_are_refused(solved, options, message):
         reconstruct(solved, SfmConfig(**options))
 
 
+def test_a_photo_of_one_row_is_refused(copy):
+    """COLMAP reduces it to none, and dies."""
+    Image.fromarray(np.zeros((1, 4000, 3), np.uint8)).save(copy / "row.png")
+    with pytest.raises(InputError, match=r"row\.png: expected a photo at most .* found 4000x1"):
+        reconstruct(copy, CONFIG)
+
+
 def test_folders_that_cannot_be_used_are_refused(solved, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="expected at least 3 photos, found 0"):
         reconstruct(tmp_path, CONFIG)

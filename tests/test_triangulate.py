@@ -99,6 +99,31 @@ def test_photos_that_show_nothing_make_no_points(posed):
         assert points.shape == colors.shape == (0, 3)
 
 
+@pytest.mark.parametrize(
+    "lens", [{"fx": 1e-30, "fy": 1e-30}, {"fx": 1e30, "fy": 1e30}, {"cx": 1e30}, {"fx": 1e-3, "fy": 1e6}], ids=str
+)
+def test_cameras_that_cannot_be_make_no_points(posed, lens):
+    wrong = [replace(view, camera=replace(view.camera, **lens)) for view in posed]
+    assert len(triangulate(wrong)[0]) == 0
+
+
+@pytest.mark.parametrize("factor", [0.0, 1e20, 1e37])
+def test_cameras_at_one_place_or_out_of_the_world_make_no_points(posed, factor):
+    def moved(view):
+        viewmat = view.camera.viewmat.copy()
+        viewmat[:3, 3] *= factor
+        return replace(view, camera=replace(view.camera, viewmat=viewmat))
+
+    assert len(triangulate(map(moved, posed))[0]) == 0
+
+
+def test_photos_of_one_row_are_left_out(posed):
+    """COLMAP reduces them to none, and dies."""
+    row = replace(posed[0], image=posed[0].image[:1].repeat(13, axis=1))
+    row = replace(row, camera=replace(row.camera, width=row.image.shape[1], height=1))
+    np.testing.assert_array_equal(triangulate([row, *posed])[0], triangulate(posed)[0])
+
+
 def test_only_cameras_that_colmap_knows_are_taken(posed):
     flat = replace(posed[0], camera=replace(posed[0].camera, model="orthographic"))
     with pytest.raises(InputError, match=r"0\.png: expected a pinhole or fisheye camera.*orthographic"):
