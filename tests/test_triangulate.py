@@ -158,11 +158,12 @@ def test_a_dataset_of_poses_gets_points_from_photos_of_full_size(posed, tmp_path
 
 
 def test_only_photos_that_train_make_points(posed, tmp_path):
-    config = DataConfig(test_every=2)
+    config = DataConfig(test_every=4)
     path = write_transforms(tmp_path, posed)
     scene = load_scene(path, config)
-    assert [view.name for view in scene.train] == ["1.png", "3.png"]
+    assert [view.name for view in scene.train] == ["1.png", "2.png", "3.png"]
     points, _ = triangulate(scene.train)
+    assert len(points) >= FEWEST
     np.testing.assert_array_equal(with_points(scene, path, config).points[: len(points)], points)
 
 
@@ -173,6 +174,7 @@ def test_points_are_filled_up_between_neighbours(posed):
     np.testing.assert_array_equal(more[: len(points)], points)
     # Neighbours mostly lie on one plane of the corner, and what is between them then lies on it as well.
     assert np.median(off_the_corner(more[len(points) :])) < PIXEL
+    assert (more.min(axis=0) == points.min(axis=0)).all() and (more.max(axis=0) == points.max(axis=0)).all()
     np.testing.assert_allclose(blended.mean(axis=0), colors.mean(axis=0), atol=5)
     np.testing.assert_array_equal(filled(points, colors)[0], more)
     enough = filled(more, blended)
