@@ -39,10 +39,10 @@ check-races:
 bench:
 	$(PYTHON) -m clsplat bench kernels -o docs/results/kernels.json --scaling docs/results/kernels.svg
 
-# The charts of docs/benchmarks.md, measured anew: make bench-quality DATA=folder of real scenes. An hour on two cores;
-# what is there already is not measured again (make bench-quality METHODS="mcmc paper-30k" adds hours of others).
+# The charts of docs/benchmarks.md, measured anew: make bench-quality DATA=folder of real scenes. An hour and a half on
+# two cores; what is there already is not measured again (make bench-quality METHODS=paper-30k adds four hours).
 QUALITY_SCENES = fox_pinhole:downscale=4 lego:background=white:downscale=2 fern:downscale=4 castle_p30:downscale=4
-METHODS = fast paper-7k auto
+METHODS = fast paper-7k auto mcmc
 bench-quality:
 	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-quality DATA=..."; exit 2; }
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods $(METHODS) \
