@@ -29,6 +29,7 @@ extensions = [
 ]
 exclude_patterns = ["_build"]
 default_role = "py:obj"
+smartquotes_action = "qe"  # no dashes: options begin with two hyphens
 
 
 def package_digest():
