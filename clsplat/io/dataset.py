@@ -124,8 +124,8 @@ def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: boo
     dataset = _full_size(Path(path), config)
     photos = sorted((photo for photo in dataset.photos if photo.name in cameras), key=lambda photo: photo.name)
     views = (load_view(photo, dataset, config) for photo in photos)
-    near = (replace(view, camera=view.camera.translated(scene.offset)) for view in views)
-    points, colors = triangulate(near, verbose)
+    moved = (replace(view, camera=view.camera.translated(scene.offset)) for view in views)
+    points, colors = triangulate(moved, verbose)
     if len(points):
         points, colors = filled(points, colors)
     return replace(scene, points=points, colors=colors)
