@@ -106,7 +106,7 @@ def _blow_up(device: Device, data: Path | None) -> Found:
 
 
 def points_lost(
-    data: Path | None, name: str, config: TrainConfig, device: Device, box: float = 1
+    data: Path | None, name: str, config: TrainConfig, device: Device, boxes: tuple[int, ...] = (1,)
 ) -> dict[str, float]:
     """What it costs held-out photos, in dB, to start without the points of structure from motion.
 
@@ -116,27 +116,28 @@ def points_lost(
         Folder of the scene `name`.
     config : TrainConfig
     device : Device
-    box : float
-        Of the random points: its edge, in edges of that which `config` asks for.
+    boxes : tuple of int
+        Of the random points: their edges, in edges of that which `config` asks for.
 
     Returns
     -------
     dict
-        ``random``: from random points; ``triangulated``: from points found by the photos and their poses.
+        ``triangulated``: from points found by the photos and their poses; ``random``, ``random, box 3x`` and so on:
+        from random points.
     """
     scene, _ = load(data, name, config)
     none = replace(scene, points=scene.points[:0], colors=scene.colors[:0])
-    at_random = replace(config, init=replace(config.init, random_extent=box * config.init.random_extent))
     assert data is not None  # or `load` would have refused
 
     def reached(start: Scene, config: TrainConfig) -> float:
         return held_out(trained(start, config, device), scene, config, device)
 
     best = reached(scene, config)
-    return {
-        "random": best - reached(none, at_random),
-        "triangulated": best - reached(with_points(none, data / name, config.data), config),
-    }
+    lost = {}
+    for box in boxes:
+        wide = replace(config, init=replace(config.init, random_extent=box * config.init.random_extent))
+        lost["random" if box == 1 else f"random, box {box}x"] = best - reached(none, wide)
+    return lost | {"triangulated": best - reached(with_points(none, data / name, config.data), config)}
 
 
 def _random_start(device: Device, data: Path | None) -> Found:
@@ -147,10 +148,8 @@ def _random_start(device: Device, data: Path | None) -> Found:
     for strategy in ("adc", "mcmc", "error"):
         config = replace(SHORT, strategy=strategy, max_gaussians=START_CAP)
         config = replace(config, init=replace(config.init, random_points=START_CAP // 2))
-        for start, lost in points_lost(data, "fox_pinhole", config, device).items():
+        for start, lost in points_lost(data, "fox_pinhole", config, device, boxes=(1, 3)).items():
             figures.append(Figure(f"{strategy}, {start}", lost, "dB"))
-        wide = points_lost(data, "fox_pinhole", config, device, box=3)["random"]
-        figures.append(Figure(f"{strategy}, random, box 3x", wide, "dB"))
     return Found(figures)
 
 
