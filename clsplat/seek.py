@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from copy import copy, deepcopy
 from dataclasses import replace
-from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +10,6 @@ import numpy as np
 from clsplat import size
 from clsplat.checkpoint import State, as_seen, filtered, measure_pixels, move
 from clsplat.config import TrainConfig
-from clsplat.densify.schedule import TRIAL_GROWTH
 from clsplat.optim import sh_degree_at
 from clsplat.render import fetch
 from clsplat.scene import View
@@ -84,8 +82,7 @@ def seek_size(
         move(trial, None)
         kept = size.Kept(trial.gaussians, trial.moments, trial.strategy.statistics)
         search.rival = size.Rival(kept, point(end, trial, seen))
-    if todo in ("grow", "try"):
-        search.most = min(most, ceil(TRIAL_GROWTH * search.most))
+    search.most = size.most_grown(search, todo, config, most)
     if config.optimizer == "device":
         move(state, device)
     return state

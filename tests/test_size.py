@@ -24,6 +24,7 @@ from clsplat.size import (
     costliest_rows,
     halvings,
     looks,
+    most_grown,
     most_identifiable,
     next_trial,
     point,
@@ -125,14 +126,16 @@ def test_the_photos_in_the_middle_tell_the_gain() -> None:
     assert trial.standard_error == pytest.approx(winsorised.std(ddof=1) / (0.5 * np.sqrt(12)))
 
 
-def test_growth_goes_on_unless_it_surely_hurts() -> None:
-    """Photo by photo the larger side is worse by 0.1 dB on the mean, with a standard error of 0.03 or of 0.1 dB."""
+def test_growth_goes_on_unless_it_hurts() -> None:
+    """Whatever its price: what does not pay in the end is pruned."""
     smaller = [30.0, 31.0, 25.0]
-    for errors, hurts in (((-0.15, -0.10, -0.05), True), ((-0.27, -0.10, 0.07), False), ((0.13, 0.1, 0.07), False)):
+    for gains, hurts in (((-0.15, 0.10, -0.05), True), ((-0.27, 0.01, 0.30), False)):
         sides = (
-            point(1, n, 3, [views], CONFIG) for n, views in ((100, smaller), (200, list(np.add(smaller, errors))))
+            point(1, n, 3, [views], CONFIG) for n, views in ((100, smaller), (200, list(np.add(smaller, gains))))
         )
-        assert Trial(True, *sides).takes_smaller == hurts, errors
+        trial = Trial(True, *sides)
+        assert trial.takes_smaller == hurts, gains
+        assert trial.gain < trial.price
     same = point(1, 100, 3, [smaller], CONFIG)
     assert Trial(True, same, same).takes_smaller, "nothing has grown: two such trials end growth"
 
@@ -155,6 +158,23 @@ def test_growth_that_pays_many_times_needs_no_trial() -> None:
         assert next_trial(Search(most, grown(1.6)), 600, config, 10**6) == todo
     same = point(1, 100, 3, [[30.0, 31.0]], CONFIG)
     assert surely_short([Trial(True, same, same)], 0.1) == 0, "nothing has grown"
+
+
+def test_windows_of_growth_end_where_the_next_trial_is_due() -> None:
+    """By sqrt(2) in a trial, by 2 without one, but no further than growth surely pays, or the bound."""
+    sides = (point(1, n, 3, [[psnr, psnr]], CONFIG) for n, psnr in ((1000, 30.0), (1414, 30.8)))
+    grown = [Trial(True, *sides)]
+    config = replace(CONFIG, size_price=0.1)
+    for most, todo, expected in (
+        (1414, "try", 2000),
+        (1414, "grow", 2828),
+        (4000, "grow", 5657),
+        (4000, "rest", 4000),
+        (4000, "shrink", 4000),
+    ):
+        assert most_grown(Search(most, grown), todo, config, 10**6) == pytest.approx(expected, rel=1e-3), todo
+    for todo in ("try", "grow"):
+        assert most_grown(Search(1414, grown), todo, config, 1500) == 1500
 
 
 def trials_of(grows: bool, *takes_smaller: bool) -> list[Trial]:
@@ -227,10 +247,10 @@ def test_worth_counts_doublings_of_bytes() -> None:
 
 
 def test_stops_are_within_the_run() -> None:
-    assert stops(replace(CONFIG, iterations=2000)) == [*range(200, 1001, 100), *range(1200, 1701, 100)]
-    assert stops(replace(CONFIG, iterations=7000))[:3] == [700, 1050, 1400]
+    assert stops(replace(CONFIG, iterations=2000)) == [*range(200, 1001, 200), *range(1200, 1701, 100)]
+    assert stops(replace(CONFIG, iterations=7000))[:3] == [700, 1400, 2100]
     found = sorted(looks(replace(CONFIG, iterations=2000)))
-    assert found[:5] == [275, 300, 375, 400, 475] and found[-1] == 1700
+    assert found[:4] == [350, 400, 550, 600] and found[-1] == 1700
     for iterations in (1, 2, 3, 10, 19):
         found = stops(replace(CONFIG, iterations=iterations))
         assert found and 1 <= found[0] and found[-1] <= iterations

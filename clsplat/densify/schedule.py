@@ -6,11 +6,11 @@ from clsplat.config import ErrorConfig, McmcConfig, TrainConfig
 from clsplat.errors import InputError
 
 TRIAL_LENGTH = 0.05
-"""Iterations of a trial of clsplat.size, as a fraction of all. On photos of 64 known Gaussians (tests/test_size.py)
+"""Iterations of a trial of pruning of clsplat.size, and of a window of growth, as a fraction of all. On photos of 64 known Gaussians (tests/test_size.py)
 refits of 0.03 of 1500 iterations were too short: every one lost 0.1 to 0.4 dB, and 512 Gaussians were kept."""
 
 GROWTH_SHORTEST = 100
-"""Iterations of a trial of growth at least: the strategies' rounds are so far apart."""
+"""Iterations of a window of growth at least: the strategies' rounds are so far apart."""
 
 TRIAL_GROWTH = sqrt(2)
 """Factor by which the Gaussians grow in a window of growth, if that has rounds enough for `MOST_GROWTH`."""
@@ -21,13 +21,13 @@ ended 0.4 dB, 2 ended 0.8 dB below a growth to the same number by parts (fox_pin
 
 
 def growth_window(config: TrainConfig) -> int:
-    """Iterations of a trial of growth."""
+    """Iterations in which the Gaussians grow by `TRIAL_GROWTH`."""
     return max(round(TRIAL_LENGTH * config.iterations), GROWTH_SHORTEST)
 
 
 class Schedule:
     """Rounds every so many iterations, and growth by equal factors: to the cap, or, where clsplat.size seeks the
-    size, by `TRIAL_GROWTH` in a trial.
+    size, by `TRIAL_GROWTH` in a window.
 
     Raises
     ------
