@@ -6,8 +6,9 @@ from clsplat.config import ErrorConfig, McmcConfig, TrainConfig
 from clsplat.errors import InputError
 
 TRIAL_LENGTH = 0.05
-"""Iterations of a trial of pruning of clsplat.size, and of a window of growth, as a fraction of all. On photos of 64 known Gaussians (tests/test_size.py)
-refits of 0.03 of 1500 iterations were too short: every one lost 0.1 to 0.4 dB, and 512 Gaussians were kept."""
+"""Iterations of a trial of pruning of clsplat.size, and of a window of growth, as a fraction of all. On photos of 64
+known Gaussians (tests/test_size.py) refits of 0.03 of 1500 iterations were too short: every one lost 0.1 to 0.4 dB,
+and 512 Gaussians were kept."""
 
 GROWTH_SHORTEST = 100
 """Iterations of a window of growth at least: the strategies' rounds are so far apart."""
