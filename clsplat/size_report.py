@@ -6,7 +6,7 @@ from pathlib import Path
 
 from clsplat.config import TrainConfig
 from clsplat.io.atomic import replacing
-from clsplat.size import Search, sh_bytes
+from clsplat.size import SURE, Search, sh_bytes
 
 
 def write_report(path: Path, search: Search, config: TrainConfig) -> None:
@@ -18,8 +18,8 @@ def write_report(path: Path, search: Search, config: TrainConfig) -> None:
     """
     chosen = max(search.degrees, key=lambda p: p.worth)
     content = {
-        "rule": "growth unless it loses; pruning if it loses no more than the price of its halvings; then the degree "
-        "with the largest worth = psnr - price log2(bytes)",
+        "rule": f"growth unless it loses more than {SURE:g} standard errors; pruning if it loses no more than "
+        "the price of its halvings; then the degree with the largest worth = psnr - price log2(bytes)",
         "price": config.size_price,
         "least_share": config.size_price * log(10) / (10 * log(2)),
         "chosen": {"n": chosen.n, "sh_degree": chosen.sh_degree},

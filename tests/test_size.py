@@ -126,18 +126,19 @@ def test_the_photos_in_the_middle_tell_the_gain() -> None:
     assert trial.standard_error == pytest.approx(winsorised.std(ddof=1) / (0.5 * np.sqrt(12)))
 
 
-def test_growth_goes_on_unless_it_hurts() -> None:
-    """Whatever its price: what does not pay in the end is pruned."""
+def test_growth_goes_on_unless_it_surely_hurts() -> None:
+    """Whatever its price. Photo by photo the larger side is worse by 0.1 dB on the mean, with a standard error of
+    0.03 or 0.1 dB."""
     smaller = [30.0, 31.0, 25.0]
-    for gains, hurts in (((-0.15, 0.10, -0.05), True), ((-0.27, 0.01, 0.30), False)):
+    for errors, hurts in (((-0.15, -0.10, -0.05), True), ((-0.27, -0.10, 0.07), False), ((0.03, 0.01, 0.02), False)):
         sides = (
-            point(1, n, 3, [views], CONFIG) for n, views in ((100, smaller), (200, list(np.add(smaller, gains))))
+            point(1, n, 3, [views], CONFIG) for n, views in ((100, smaller), (200, list(np.add(smaller, errors))))
         )
         trial = Trial(True, *sides)
-        assert trial.takes_smaller == hurts, gains
+        assert trial.takes_smaller == hurts, errors
         assert trial.gain < trial.price
     same = point(1, 100, 3, [smaller], CONFIG)
-    assert Trial(True, same, same).takes_smaller, "nothing has grown: two such trials end growth"
+    assert Trial(True, same, same).takes_smaller, "nothing has grown"
 
 
 def test_growth_that_pays_many_times_needs_no_trial() -> None:
@@ -186,14 +187,14 @@ def trials_of(grows: bool, *takes_smaller: bool) -> list[Trial]:
 
 
 def test_trials_follow_each_other() -> None:
-    """Growth until two trials in turn have lost or it is late; then pruning, until there is little to gain."""
+    """Growth until it is late, whatever was lost; then pruning, until there is little to gain."""
     config = replace(CONFIG, iterations=2000)
     for lost, todo in (
         ([], "try"),
         ([False, False], "grow"),
         ([False, True], "try"),
         ([True, False, True], "try"),
-        ([False, True, True], "rest"),
+        ([False, True, True], "try"),
     ):
         assert next_trial(Search(100, trials_of(True, *lost)), 600, config, 1000) == todo, lost
     assert next_trial(Search(100), 1000, config, 1000) == "rest", "in the middle of the run"
