@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config import BACKGROUNDS, TrainConfig
-from clsplat.densify.schedule import TRIAL_GROWTH, TRIAL_LENGTH, growth_window
+from clsplat.densify.schedule import GROWTH_SHORTEST, TRIAL_GROWTH, TRIAL_LENGTH, growth_window
 from clsplat.densify.strategy import MOST_GAUSSIANS
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, to_uint8
@@ -285,14 +285,18 @@ def next_trial(
 
 
 def most_grown(search: Search, todo: str, config: TrainConfig, most: int) -> int:
-    """How many Gaussians a window of growth may leave."""
-    if todo == "try":
-        return min(most, ceil(TRIAL_GROWTH * search.most))
+    """How many Gaussians a trial of growth, or the same time without one, may leave.
+
+    Where windows hold less than a round, nothing settles: half the growth would be lost, and 0.27 dB of the demo's.
+    """
+    if todo not in ("try", "grow"):
+        return search.most
+    settles = todo == "try" and TRIAL_LENGTH * config.iterations >= GROWTH_SHORTEST
+    grown = ceil(TRIAL_GROWTH ** (1 if settles else GROWTH_WINDOWS) * search.most)
     if todo == "grow":
-        grown = [trial for trial in search.trials if trial.grows]
-        surely = min(most, surely_short(grown, config.size_price))
-        return min(ceil(surely), ceil(TRIAL_GROWTH**GROWTH_WINDOWS * search.most))
-    return search.most
+        trials = [trial for trial in search.trials if trial.grows]
+        grown = min(grown, ceil(min(most, surely_short(trials, config.size_price))))
+    return min(most, grown)
 
 
 def halvings(trials: list[Trial]) -> float:
