@@ -59,7 +59,8 @@ GROWTH_START = 500
 """Iterations before the first trial of growth, fewer in short runs, as before the strategies' first rounds."""
 
 SURE = 3.0
-"""Standard errors by which growth must lose: in a wrong trial a scene loses more than time."""
+"""Standard errors by which growth must lose: growth that is kept in vain costs time, and is pruned; growth that is
+wrongly lost costs quality."""
 
 GROWTH_WINDOWS = 2
 """Windows of growth in a trial of it: the larger side grows in the first and settles in the second. Without the
@@ -292,11 +293,10 @@ def most_grown(search: Search, todo: str, config: TrainConfig, most: int) -> int
     if todo not in ("try", "grow"):
         return search.most
     settles = todo == "try" and TRIAL_LENGTH * config.iterations >= GROWTH_SHORTEST
-    grown = ceil(TRIAL_GROWTH ** (1 if settles else GROWTH_WINDOWS) * search.most)
-    if todo == "grow":
-        trials = [trial for trial in search.trials if trial.grows]
-        grown = min(grown, ceil(min(most, surely_short(trials, config.size_price))))
-    return min(most, grown)
+    factor = TRIAL_GROWTH ** (1 if settles else GROWTH_WINDOWS)
+    grown = [trial for trial in search.trials if trial.grows]
+    sure = surely_short(grown, config.size_price) if todo == "grow" else inf
+    return ceil(min(factor * search.most, sure, most))
 
 
 def halvings(trials: list[Trial]) -> float:
