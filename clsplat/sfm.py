@@ -8,10 +8,7 @@ import hashlib
 import json
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -24,6 +21,7 @@ from numpy.typing import NDArray
 
 from clsplat.config import SfmConfig
 from clsplat.errors import InputError
+from clsplat.features import SEED, extract, is_sliver, match, quiet
 from clsplat.lenses import camera_models
 
 # Not only for these names: a Pillow that is loaded after pycolmap 4.2.1 takes over some of the zlib inside it and
@@ -32,26 +30,6 @@ from clsplat.photos import FRAMES, is_plain, list_photos, photo_folder, photo_si
 
 RECORD = "clsplat_sfm.json"
 """File beside the model's folder ``0``: of which photos and with which options the model was made."""
-
-SEED = 0
-"""Of RANSAC and of the mapper. The same photos then give the same bytes on one machine, provided that the mapper runs
-on one thread and photos enter the database in their order."""
-
-FOLLOWER = """
-import sqlite3, sys, time
-while True:
-    time.sleep(0.5)
-    try:
-        rows = sqlite3.connect(sys.argv[1], uri=True)
-        print(rows.execute(f"SELECT COUNT(*) FROM {sys.argv[2]}").fetchone()[0], flush=True)
-        rows.close()
-    except sqlite3.Error:
-        pass
-"""
-"""Program that prints how many rows a table of a database has, again and again. In a process of its own: locks on
-files belong to processes, so that within one Python's SQLite and pycolmap's do not see each other's, and the memory
-that they share was cut short under COLMAP (two of six runs on a busy machine ended with a bus error). Between
-processes, and with the database in WAL mode, COLMAP never waits for this."""
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
@@ -193,7 +171,7 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
 
     with _workspace(output) as work, quiet(verbose):
         readable = _readable(folder, names, work, config.max_image_size)
-        found = _largest_model(readable, names, work, _matched(config, folder))
+        found = _largest_model(readable, names, work, _matched(config, folder), verbose)
         registered = 0 if found is None else int(found.num_reg_images())
         _check_registered(registered, len(names), photos, config)
         _turn_upright(found)
@@ -251,24 +229,6 @@ def _workspace(output: Path) -> Iterator[Path]:
         shutil.rmtree(work, ignore_errors=True)
 
 
-@contextmanager
-def quiet(verbose: bool) -> Iterator[None]:
-    """Without COLMAP's messages, unless `verbose`."""
-    from pycolmap import logging
-
-    before = logging.minloglevel
-    logging.minloglevel = before if verbose else int(logging.ERROR)
-    try:
-        yield
-    finally:
-        logging.minloglevel = before
-
-
-def is_sliver(width: int, height: int, edge_max: int) -> bool:
-    """Whether nothing is left of a photo whose longer edge is reduced to `edge_max`: COLMAP dies of it."""
-    return min(width, height) * edge_max < max(width, height)
-
-
 def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path:
     """Folder in which COLMAP reads the pixels that training reads: `folder`, or a copy of it where it would not.
 
@@ -300,7 +260,7 @@ def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path
     return work / "photos"
 
 
-def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig) -> Any:
+def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig, verbose: bool) -> Any:
     """Run the three stages; None where no two photos make a start."""
     import pycolmap
     from tqdm import tqdm
@@ -312,24 +272,16 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
     for name in names:
         by_size.setdefault(photo_size(folder / name), []).append(name)
     reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
-    extraction = pycolmap.FeatureExtractionOptions(max_image_size=config.max_image_size, use_gpu=False)
     mode = pycolmap.CameraMode.SINGLE if config.single_camera else pycolmap.CameraMode.PER_IMAGE
     for group in by_size.values():  # COLMAP's single camera has one size, and it skips photos of another
         pycolmap.import_images(database, folder, image_names=group, camera_mode=mode, options=reader)
-    with progress(database, "keypoints", len(names), "features", "photo"):
-        pycolmap.set_random_seed(SEED)
-        pycolmap.extract_features(
-            database, folder, image_names=names, extraction_options=extraction, device=pycolmap.Device.cpu
-        )
-
-    exhaustive = config.matching == "exhaustive"
-    match = pycolmap.match_exhaustive if exhaustive else pycolmap.match_sequential
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
-    pairs = len(names) * (len(names) - 1) // 2 if exhaustive else None
-    with progress(database, "two_view_geometries", pairs, "matches", "pair"):
-        pycolmap.set_random_seed(SEED)
-        match(database, verification_options=verification, device=pycolmap.Device.cpu)
+    extract(database, folder, names, config.max_image_size)
+    with pycolmap.Database.open(database) as opened:
+        if config.matching == "exhaustive":
+            pairs = pycolmap.ExhaustivePairGenerator(pycolmap.ExhaustivePairingOptions(), opened).all_pairs()
+        else:
+            pairs = pycolmap.SequentialPairGenerator(pycolmap.SequentialPairingOptions(), opened).all_pairs()
+    match(database, pairs, verbose)
 
     options = pycolmap.IncrementalPipelineOptions(
         min_model_size=max(config.min_registered, 2), random_seed=SEED, num_threads=1
@@ -365,29 +317,3 @@ def _turn_upright(model: Any) -> None:
     if np.linalg.norm(down) > 0.1:  # photos upside down cancel those that are not: then there is no common direction
         rotation, _ = Rotation.align_vectors([[0.0, 1.0, 0.0]], [down / np.linalg.norm(down)])
         model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation.as_matrix()), np.zeros(3)))
-
-
-@contextmanager
-def progress(database: Path, table: str, total: int | None, label: str, unit: str) -> Iterator[None]:
-    """Progress bar that counts the rows of a table of COLMAP's database while COLMAP fills it and says nothing."""
-    from tqdm import tqdm
-
-    command = [sys.executable, "-I", "-c", FOLLOWER, f"{database.resolve().as_uri()}?mode=ro", table]
-    with (
-        tqdm(total=total, desc=label, unit=unit, dynamic_ncols=True) as bar,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as follower,
-    ):
-
-        def follow() -> None:
-            for line in follower.stdout or ():
-                bar.n = int(line)
-                bar.refresh()
-
-        thread = threading.Thread(target=follow, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            follower.kill()
-            thread.join()
-        bar.n = total or bar.n

@@ -1,6 +1,6 @@
 """Points for datasets that bring poses alone, triangulated from their photos by COLMAP through pycolmap.
 
-Features and matches are those of `clsplat.sfm`; the poses are taken as they are (Schoenberger and Frahm 2016,
+Features and matches are those of `clsplat.features`; the poses are taken as they are (Schoenberger and Frahm 2016,
 section 4.2, doi:10.1109/CVPR.2016.445).
 """
 
@@ -14,9 +14,9 @@ from PIL import Image
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
+from clsplat.features import SEED, extract, is_sliver, match, quiet
 from clsplat.randomness import stream
 from clsplat.scene import View
-from clsplat.sfm import SEED, is_sliver, progress, quiet
 
 NEIGHBOURS = 10
 """Photos that each is matched with: as many as COLMAP's sequential matching takes before each frame of a video."""
@@ -97,7 +97,11 @@ def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[n
         chosen = pairs(list(cameras.values()))
         if not chosen:
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-        _match(database, work, list(cameras), chosen)
+        names = list(cameras)
+        extract(database, work, names, EDGE_MAX, work / "masks")
+        with pycolmap.Database.open(database) as opened:
+            numbers = {row.name: row.image_id for row in opened.read_all_images()}
+        match(database, [(numbers[names[i]], numbers[names[j]]) for i, j in chosen], verbose)
         model = pycolmap.Reconstruction()
         with pycolmap.Database.open(database) as opened:
             for camera in opened.read_all_cameras():
@@ -169,31 +173,3 @@ def _database(views: Iterable[View], database: Path, work: Path) -> dict[str, Ca
         pycolmap.import_images(database, work, image_names=[name], camera_mode=mode, options=reader)
         cameras[name] = camera
     return cameras
-
-
-def _match(database: Path, work: Path, names: list[str], chosen: list[tuple[int, int]]) -> None:
-    """Features of the photos, and those that pairs of them share."""
-    import pycolmap
-
-    with progress(database, "keypoints", len(names), "features", "photo"):
-        pycolmap.set_random_seed(SEED)
-        pycolmap.extract_features(
-            database,
-            work,
-            image_names=names,
-            reader_options=pycolmap.ImageReaderOptions(mask_path=work / "masks"),
-            extraction_options=pycolmap.FeatureExtractionOptions(max_image_size=EDGE_MAX, use_gpu=False),
-            device=pycolmap.Device.cpu,
-        )
-    listed = work / "pairs.txt"
-    listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in chosen), encoding="utf-8")
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
-    with progress(database, "two_view_geometries", len(chosen), "matches", "pair"):
-        pycolmap.set_random_seed(SEED)
-        pycolmap.match_image_pairs(
-            database,
-            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )

@@ -24,7 +24,8 @@ LAYERS = """
     config photos
     presets
     camera gaussians lenses video
-    sfm panorama
+    features panorama
+    sfm
     scene structs device reference perphoto metrics raytrace orbit
     triangulate
     ops io testing still_life memory pyramid
@@ -49,11 +50,11 @@ BENCH_KERNELS = {"roof"}
 # Where a foreign package may be imported at all, whose absence or weight the rest must not feel.
 ONLY_IN = {
     "pyopencl": {"device", "ops"},
-    "pycolmap": {"sfm", "lenses", "triangulate"},
+    "pycolmap": {"features", "sfm", "lenses", "triangulate"},
     "viser": {"viewer"},
     "av": {"video"},
     "pillow_heif": {"photos"},
-    "sqlite3": set(),  # beside pycolmap's in one process it ends in a bus error, see clsplat.sfm.FOLLOWER
+    "sqlite3": set(),  # beside pycolmap's in one process it ends in a bus error, see clsplat.features.FOLLOWER
 }
 
 

@@ -84,7 +84,7 @@ def runs(solved, monkeypatch):
 
     asked = []
 
-    def largest_model(folder, names, work, config):
+    def largest_model(folder, names, work, config, verbose):
         asked.append(names)
         return pycolmap.Reconstruction(solved / "sparse" / "0")
 
