@@ -17,6 +17,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from clsplat.errors import ClsplatError
+
 SEED = 0
 """Of RANSAC and of the mapper. The same photos then give the same bytes on one machine, provided that matching and
 mapper run on one thread and photos enter the database in their order."""
@@ -27,8 +29,16 @@ WORKERS_MAX = 8
 SHARE_MIN = 16
 """Pairs of photos that are worth a process of their own: they take about as long as it does to start."""
 
+DEPENDENT = """
+import os, signal, sys, threading
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+threading.Thread(target=lambda: (sys.stdin.read(), os._exit(1)), daemon=True).start()
+"""
+"""How the programs below begin: they end when the process that started them does, however it does; Ctrl+C is left to
+that process."""
+
 FOLLOWER = """
-import sqlite3, sys, time
+import sqlite3, time
 while True:
     time.sleep(0.5)
     try:
@@ -47,15 +57,12 @@ that they share was cut short under COLMAP (two of six runs on a busy machine en
 processes, and with the database in WAL mode, COLMAP never waits for this."""
 
 WORKER = """
-import json, os, signal, sys, threading
-signal.signal(signal.SIGINT, signal.SIG_IGN)
-threading.Thread(target=lambda: (sys.stdin.read(), os._exit(1)), daemon=True).start()
+import json
 sys.path[:] = json.loads(sys.argv[1])
 from clsplat.features import match_share
 match_share(sys.argv[2], sys.argv[3], sys.argv[4] == "verbose")
 """
-"""Program that runs `match_share` with the packages of the process that starts it. It ends when that does, however it
-does; Ctrl+C is left to that process."""
+"""Program that runs `match_share` with the packages of the process that starts it."""
 
 
 @contextmanager
@@ -128,7 +135,7 @@ def match(database: Path, pairs: list[tuple[int, int]], verbose: bool = False) -
 
     Raises
     ------
-    RuntimeError
+    ClsplatError
         If a process fails.
     """
     import pycolmap
@@ -144,10 +151,19 @@ def match(database: Path, pairs: list[tuple[int, int]], verbose: bool = False) -
             # By numbers: names in a list of pairs are separated by spaces.
             copy.with_suffix(".txt").write_text("".join(f"{i} {j}\n" for i, j in share.tolist()), encoding="utf-8")
         with _progress(copies, "two_view_geometries", len(pairs), "matches", "pair"):
-            workers = [running.enter_context(_worker(copy, verbose)) for copy in copies]
+            said = "verbose" if verbose else "quiet"
+            workers = [
+                running.enter_context(
+                    _child(WORKER, json.dumps(sys.path), str(copy), str(copy.with_suffix(".txt")), said)
+                )
+                for copy in copies
+            ]
             for worker in workers:
                 if worker.wait() != 0:
-                    raise RuntimeError(f"matching of photos by COLMAP ended with status {worker.returncode}")
+                    raise ClsplatError(
+                        "matches of photos: expected COLMAP to find them, found that its process ended with status "
+                        f"{worker.returncode}; what it wrote is above, and -9 means that the memory did not suffice"
+                    )
         with pycolmap.Database.open(database) as found:
             for copy in copies:
                 with pycolmap.Database.open(copy) as part:
@@ -189,15 +205,16 @@ def match_share(database: str, listed: str, verbose: bool) -> None:
 
 
 @contextmanager
-def _worker(database: Path, verbose: bool) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that runs `match_share`; it does not outlive the context."""
-    files = [str(database), str(database.with_suffix(".txt"))]
-    command = [sys.executable, "-I", "-c", WORKER, json.dumps(sys.path), *files, "verbose" if verbose else "quiet"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as worker:
+def _child(
+    program: str, *arguments: str, stdout: int | None = None, stderr: int | None = None
+) -> Iterator[subprocess.Popen[str]]:
+    """A process that runs one of the programs above; it does not outlive the context."""
+    command = [sys.executable, "-I", "-c", DEPENDENT + program, *arguments]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, text=True) as child:
         try:
-            yield worker
+            yield child
         finally:
-            worker.kill()
+            child.kill()
 
 
 @contextmanager
@@ -208,12 +225,7 @@ def _progress(databases: list[Path], table: str, total: int, label: str, unit: s
     uris = [f"{database.resolve().as_uri()}?mode=ro" for database in databases]
     with (
         tqdm(total=total, desc=label, unit=unit, dynamic_ncols=True) as bar,
-        subprocess.Popen(
-            [sys.executable, "-I", "-c", FOLLOWER, table, *uris],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        ) as follower,
+        _child(FOLLOWER, table, *uris, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as follower,
     ):
 
         def follow() -> None:

@@ -1,6 +1,5 @@
 """Matching in processes: what it finds depends neither on how many there are, nor on what else is going on."""
 
-import json
 import shutil
 import subprocess
 import sys
@@ -11,7 +10,8 @@ from PIL import Image
 from test_sfm import take_photos
 
 from clsplat import features
-from clsplat.features import WORKER, extract, match
+from clsplat.errors import ClsplatError
+from clsplat.features import DEPENDENT, FOLLOWER, extract, match
 
 READER = """
 import sqlite3, sys, time
@@ -96,19 +96,16 @@ def test_a_process_that_fails_is_an_error_and_ends_the_others(extracted, databas
     monkeypatch.setattr(features.os, "cpu_count", lambda: 2)
     fails_first = "import signal, sys\nif not sys.argv[2].endswith('0.db'): signal.pause()\nsys.exit(7)"
     monkeypatch.setattr(features, "WORKER", fails_first)
-    with pytest.raises(RuntimeError, match="status 7"):
+    with pytest.raises(ClsplatError, match="status 7"):
         match(database, extracted[1])
     assert contents(database)[1] == {} and sorted(path.name for path in database.parent.iterdir()) == ["database.db"]
 
 
-def test_a_process_ends_with_the_one_that_started_it(extracted, tmp_path):
-    """Whose end closes the pipe, however it came."""
-    endless = tmp_path / "clsplat"
-    endless.mkdir()
-    (endless / "__init__.py").write_text("")
-    (endless / "features.py").write_text("import time\nprint(flush=True)\ntime.sleep(600)\n")
-    command = [sys.executable, "-I", "-c", WORKER, json.dumps([str(tmp_path), *sys.path]), "", "", "quiet"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as worker:
-        worker.stdout.readline()
-        worker.stdin.close()
-        assert worker.wait(timeout=300) == 1
+@pytest.mark.parametrize("program", [FOLLOWER, "print(flush=True)\nsignal.pause()"], ids=["follower", "other"])
+def test_a_process_ends_with_the_one_that_started_it(program, tmp_path):
+    """Whose end closes the pipe, however it came; the follower's database may be gone by then."""
+    (tmp_path / "a.db").touch()
+    command = [sys.executable, "-I", "-c", DEPENDENT + program, "images", f"{(tmp_path / 'a.db').as_uri()}?mode=ro"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as child:
+        child.stdin.close()
+        assert child.wait(timeout=300) == 1
