@@ -92,7 +92,10 @@ RANDOM_START = 10_000
 """Gaussians of a random start: fog, which the photos dissolve before it grows to what they show."""
 
 PRICING = 24
-"""Photos, at most, by which Gaussians are priced."""
+"""Photos by which Gaussians are priced, where these are more than `PRICING_SHARE` of all."""
+
+PRICING_SHARE = 1 / 5
+"""Of the photos by which Gaussians are priced at least: what few photos show has no price in the others."""
 
 
 class Point(NamedTuple):
@@ -326,7 +329,7 @@ def surely_short(grown: list[Trial], price: float) -> float:
 
 
 def _some(views: list[Any]) -> list[Any]:
-    return views[:: -(-len(views) // PRICING)]
+    return views[:: ceil(len(views) / max(PRICING, PRICING_SHARE * len(views)))]
 
 
 def costliest_rows(

@@ -291,7 +291,8 @@ def _edit(state: State, views: list[View], config: TrainConfig, device: "Device"
     def survey(count: int) -> Contributions:
         order = stream(config.seed, "surveyed views", state.iteration).permutation(len(views))
         chosen = as_seen([views[i] for i in order[:count]], state)
-        return contributions(device, shown, chosen, config.render, BACKGROUNDS[config.data.background], sh_degree)
+        found = contributions(device, shown, chosen, config.render, BACKGROUNDS[config.data.background], sh_degree)
+        return found._replace(share=len(chosen) / len(views))
 
     move(state, None)
     edit = state.strategy.edit(state.iteration, state.gaussians, survey)

@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.config import ErrorConfig, TrainConfig
 from clsplat.densify import Contributions, Survey
-from clsplat.densify.error import HARM, ErrorGuided, split
+from clsplat.densify.error import HARM, SHARE_MIN, ErrorGuided, split
 from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations
 from clsplat.testing import synthetic_scene
@@ -22,10 +22,10 @@ def scene() -> Gaussians:
     return gaussians
 
 
-def seeing(weights: np.ndarray, errors: np.ndarray, prices: np.ndarray | None = None) -> Survey:
+def seeing(weights: np.ndarray, errors: np.ndarray, prices: np.ndarray | None = None, share: float = 1.0) -> Survey:
     def survey(views: int) -> Contributions:
         assert views == CONFIG.error.views
-        return Contributions(weights, errors, weights if prices is None else prices)
+        return Contributions(weights, errors, weights if prices is None else prices, share)
 
     return survey
 
@@ -106,6 +106,18 @@ def test_while_there_is_room_only_real_harm_goes() -> None:
     prices[:] = -share
     edit = strategy.edit(200, scene(), seeing(np.ones(N), errors, prices))
     assert len(np.setdiff1d(np.arange(N), edit.rows)) == CONFIG.error.replaced_most * N
+
+
+@pytest.mark.parametrize(("share", "gone"), [(SHARE_MIN, 5), (0.99 * SHARE_MIN, 0)])
+def test_none_makes_room_by_a_survey_of_few_photos(share: float, gone: int) -> None:
+    """Neither the least useful nor those that do harm in it: the other photos may need them."""
+    for cap in (N, 2 * N):
+        strategy = ErrorGuided(replace(CONFIG, max_gaussians=cap), 1.0, N)
+        strategy.max_gaussians = cap
+        prices = np.full(N, 1.0)
+        prices[:5] = -2 * HARM
+        edit = strategy.edit(200, scene(), seeing(np.ones(N), np.ones(N), prices, share))
+        assert len(np.setdiff1d(np.arange(N), edit.rows)) == gone
 
 
 def test_what_has_no_error_is_not_split() -> None:

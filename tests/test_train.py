@@ -13,7 +13,8 @@ import pytest
 from clsplat.camera import Camera
 from clsplat.checkpoint import State, load_state, save_state
 from clsplat.config import AdcConfig, CoarseConfig, ErrorConfig, InitConfig, McmcConfig, OptimConfig, TrainConfig
-from clsplat.densify import STRATEGIES
+from clsplat.densify import STRATEGIES, Contributions, Edit, Survey
+from clsplat.densify.error import ErrorGuided
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
@@ -287,17 +288,28 @@ def test_each_round_surveys_photos_of_its_own(
     scene: Scene, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rounds: list[list[str]] = []
+    shares: list[float] = []
+    edit = ErrorGuided.edit
+
+    def told(strategy: ErrorGuided, iteration: int, gaussians: Gaussians, survey: Survey) -> Edit:
+        def shared(count: int) -> Contributions:
+            shares.append(survey(count).share)
+            return survey(count)
+
+        return edit(strategy, iteration, gaussians, shared)
 
     def recorded(device: Device, gaussians: Gaussians, views: list[View], *rest: Any) -> Any:
         rounds.append([view.name for view in views])
         return contributions(device, gaussians, views, *rest)
 
+    monkeypatch.setattr(ErrorGuided, "edit", told)
     # clsplat.train is the function, too.
     monkeypatch.setattr(sys.modules["clsplat.train"], "contributions", recorded)
     config = replace(with_strategy("error"), error=ErrorConfig(every=10, views=5))
     train(scene, config, device, tmp_path)
-    assert len(rounds) == 5 - 1  # after iterations 10 to 40, before 0.8 of 60
-    assert all(len(set(names)) == 5 for names in rounds)
+    assert len(rounds) == 2 * (5 - 1)  # after iterations 10 to 40, before 0.8 of 60; twice for the sake of shares
+    assert rounds[::2] == rounds[1::2] and all(len(set(names)) == 5 for names in rounds)
+    assert shares == [5 / len(scene.train)] * 4
     assert len({tuple(sorted(names)) for names in rounds}) > 1
     assert set().union(*rounds) <= {view.name for view in scene.train}
 

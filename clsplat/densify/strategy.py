@@ -19,12 +19,13 @@ class Contributions(NamedTuple):
 
     weights (N,): with which they are composited; errors (N,): the same, times the pixels' squared errors; prices
     (N,): by how much the squared error would rise without the Gaussian alone, negative where it does harm. Squared
-    errors are summed over RGB.
+    errors are summed over RGB. share: of the training photos, how many these are.
     """
 
     weights: Array
     errors: Array
     prices: Array
+    share: float = 1.0
 
 
 # Contributions to so many training photos.
