@@ -274,7 +274,7 @@ class BenchQuality(Charts):
         for metric in metrics if cost == "seconds" else metrics[:1]:  # the table has them all
             text = f"{summary.METRICS[metric].name} against {summary.COSTS[cost].name}; the figures stand below"
             figure = charts.quality_chart(finished, cost, metric)
-            parts += [self.chart(figure, f"quality-{cost}-{metric}", text)]
+            parts += [self.chart(figure, f"{Path(path).stem}-{cost}-{metric}", text)]
             parts += [self.list(summary.verdict(finished, cost, metric))]
         return self.parse_text_to_nodes("\n\n".join([*parts, self.table(summary.table(finished, cost))]))
 
