@@ -92,10 +92,8 @@ RANDOM_START = 10_000
 """Gaussians of a random start: fog, which the photos dissolve before it grows to what they show."""
 
 PRICING = 24
-"""Photos by which Gaussians are priced, where these are more than `PRICING_SHARE` of all."""
-
 PRICING_SHARE = 1 / 5
-"""Of the photos by which Gaussians are priced at least: what few photos show has no price in the others."""
+"""Photos by which Gaussians are priced, or of many photos this share: what few show has no price in the others."""
 
 
 class Point(NamedTuple):
