@@ -26,7 +26,7 @@ mapper run on one thread and photos enter the database in their order."""
 WORKERS_MAX = 8
 """Processes that match. Each has a copy of all features: some MB for each photo."""
 
-SHARE_MIN = 16
+PAIRS_MIN = 16
 """Pairs of photos that are worth a process of their own: they take about as long as it does to start."""
 
 DEPENDENT = """
@@ -143,7 +143,7 @@ def match(database: Path, pairs: list[tuple[int, int]], verbose: bool = False) -
     if not pairs:
         return
     pycolmap.Database.open(database).close()  # its log enters the file, whoever had it open when it was written
-    count = min(os.cpu_count() or 1, WORKERS_MAX, -(-len(pairs) // SHARE_MIN))
+    count = min(os.cpu_count() or 1, WORKERS_MAX, -(-len(pairs) // PAIRS_MIN))
     with TemporaryDirectory(prefix="matches_", dir=database.parent) as folder, ExitStack() as running:
         copies = [Path(folder) / f"{k}.db" for k in range(count)]
         for copy, share in zip(copies, np.array_split(np.array(pairs), count), strict=True):

@@ -57,7 +57,7 @@ def contents(database):
 
 def test_the_number_of_processes_changes_nothing(extracted, tmp_path, monkeypatch):
     pairs, results = extracted[1], []
-    monkeypatch.setattr(features, "SHARE_MIN", 1)
+    monkeypatch.setattr(features, "PAIRS_MIN", 1)
     for count in (1, 2, 4):
         monkeypatch.setattr(features.os, "cpu_count", lambda count=count: count)
         copy = shutil.copyfile(extracted[0], tmp_path / f"{count}.db")
@@ -92,7 +92,7 @@ def test_no_pairs_match_nothing(database):
 
 
 def test_a_process_that_fails_is_an_error_and_ends_the_others(extracted, database, monkeypatch):
-    monkeypatch.setattr(features, "SHARE_MIN", 3)
+    monkeypatch.setattr(features, "PAIRS_MIN", 3)
     monkeypatch.setattr(features.os, "cpu_count", lambda: 2)
     fails_first = "import signal, sys\nif not sys.argv[2].endswith('0.db'): signal.pause()\nsys.exit(7)"
     monkeypatch.setattr(features, "WORKER", fails_first)

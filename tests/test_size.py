@@ -334,9 +334,8 @@ def test_blocks_that_validate_have_no_say_in_prices(device: Device) -> None:
 @pytest.mark.parametrize(("photos", "pricing"), [(8, 8), (24, 24), (25, 13), (100, 20), (300, 60)])
 def test_a_fifth_of_many_photos_says_what_gaussians_are_worth(photos: int, pricing: int, device: Device) -> None:
     gaussians = synthetic_scene(9, 4)[0].astype(np.float32)
-    view = View(
-        "photo", Camera.look_at((0, 0, -5), (0, 0, 0), (0, 1, 0), 20, 16, 16), np.zeros((16, 16, 3), np.uint8)
-    )
+    camera = Camera.look_at((0, 0, -5), (0, 0, 0), (0, 1, 0), 20, 16, 16)
+    view = View("photo", camera, np.zeros((16, 16, 3), np.uint8))
     assert len(unvalidated(gaussians, [view] * photos, CONFIG, device)) == pricing
 
 
