@@ -12,7 +12,7 @@ test-slow:
 
 # Of these, the trainings that show that a known failure of the method is held off.
 stability:
-	$(PYTHON) -m pytest -m slow tests/stability tests/test_faults.py
+	$(PYTHON) -m pytest -m slow tests/stability tests/training/test_faults.py
 
 # The fuzzed tests with CASES cases each, drawn anew: more than 100 000 in all, about half an hour.
 CASES = 4000
@@ -60,4 +60,4 @@ bench-stability:
 
 # The figures of docs/formats.md: make formats SCENE=scene.ply DATA=dataset OPTIONS="--downscale 2".
 formats:
-	$(PYTHON) tests/measure_formats.py $(SCENE) $(DATA) $(OPTIONS)
+	$(PYTHON) tests/formats/measure_formats.py $(SCENE) $(DATA) $(OPTIONS)

@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig, TrainConfig
+from clsplat.dataset import load_scene
 from clsplat.errors import ClsplatError
+from clsplat.formats import load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
-from clsplat.io import load_gaussians, load_scene, save_gaussians
 from clsplat.rasterization import rasterization
 from clsplat.render import Rendering, render, render_views
 from clsplat.scene import Scene, View
-from clsplat.train import train
+from clsplat.training.loop import train
 
 if TYPE_CHECKING:
     from clsplat.device import Device

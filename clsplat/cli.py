@@ -9,14 +9,14 @@ from typing import Annotated
 
 import tyro
 
-from clsplat.bench.commands import Chart, Kernels, Knobs, Quality, Stability
+from clsplat.bench.bench_commands import Chart, Kernels, Knobs, Quality, Stability
 from clsplat.commands import console
 from clsplat.commands.compact import Compact
 from clsplat.commands.console import warn
 from clsplat.commands.files import Devices, Export, Frames, Sfm
 from clsplat.commands.info import Info
 from clsplat.commands.pictures import Eval, Render
-from clsplat.commands.training import Demo, Train
+from clsplat.commands.train import Demo, Train
 from clsplat.commands.viewing import View
 from clsplat.errors import ClsplatError, InputError, driver_errors
 

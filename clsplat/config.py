@@ -196,7 +196,7 @@ class McmcConfig:
 
 @dataclass(frozen=True)
 class ErrorConfig:
-    """Growth to a cap where the photos' errors are (clsplat.densify.error has the sources; values by measurement,
+    """Growth to a cap where the photos' errors are (sources: clsplat.training.densify.error_guided; values measured:
     docs/howto/strategies.md)."""
 
     start: int = 500
@@ -222,7 +222,7 @@ class ErrorConfig:
 
 @dataclass(frozen=True)
 class FewViewsConfig:
-    """Training on few photos (clsplat.few_views has the reasons, docs/stability.md what each brings)."""
+    """Training on few photos (clsplat.training.few_views has the reasons, docs/stability.md what each brings)."""
 
     below: int = 9
     """With fewer training photos than this, the other settings hold (0: never)."""
@@ -246,7 +246,7 @@ class TrainConfig:
     optimizer: Literal["device", "numpy"] = "device"
     """Where Adam runs: in a kernel, or in NumPy on the host (slower; the same to rounding)."""
     strategy: str = "error"
-    """Densification strategy: a name of clsplat.densify.STRATEGIES. adc is the paper's."""
+    """Densification strategy: a name of clsplat.training.densify.STRATEGIES. adc is the paper's."""
     size: Literal["auto", "fixed"] = "auto"
     """auto: the number of Gaussians and the degree of the spherical harmonics are chosen from the photos, parts of
     which validate in the meantime (size.json explains the choice). fixed: what the strategy makes, up to the cap."""

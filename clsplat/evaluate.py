@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.atomic import replacing
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.io.atomic import replacing
 from clsplat.metrics import flip, psnr, psnr_fitted, ssim, to_uint8
 from clsplat.render import Color, render_views
-from clsplat.report import save_difference, save_png, write_page
 from clsplat.scene import View
+from clsplat.show.evaluation_page import save_difference, save_png, write_page
 
 if TYPE_CHECKING:
     from clsplat.device import Device

@@ -1,4 +1,4 @@
-"""A posed set of photos, as every reader of `clsplat.io` returns it."""
+"""A posed set of photos, as every reader of `clsplat.formats` returns it."""
 
 from dataclasses import dataclass, field
 

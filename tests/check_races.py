@@ -20,9 +20,9 @@ from clsplat.camera import Camera
 from clsplat.config import OptimConfig, RenderConfig
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.optim import adam_settings
 from clsplat.render import render, upload
 from clsplat.stages import SplatGrads
+from clsplat.training.optimizer import adam_settings
 
 RACES = """
 __kernel void race(__global int *x) {

@@ -8,11 +8,11 @@ from tolerances import DOUBLE, FLOAT
 from clsplat import ops, reference
 from clsplat.config import OptimConfig
 from clsplat.gaussians import SHAPES, Gaussians, sigmoid
-from clsplat.optim import Moments, adam_settings
 from clsplat.reference.adam import BLOCK
 from clsplat.render import fetch, upload
 from clsplat.stages import ERANK_SLACK
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene
+from clsplat.training.optimizer import Moments, adam_settings
 
 CONFIG = OptimConfig()
 STEPS = 100

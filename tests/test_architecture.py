@@ -18,43 +18,44 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "clsplat"
 STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__init__")
 
-# A module imports from rows above its own only; a package is one unit.
+# A unit, a package or a module of the top level, imports from rows above its own only.
 LAYERS = """
     constants errors stages randomness display
-    config photos
-    presets
-    camera gaussians lenses video
-    features panorama
-    sfm
-    scene structs device reference perphoto metrics raytrace orbit
-    triangulate
-    ops io testing still_life memory pyramid
-    page render optim densify initialize exposure few_views report demo preview
-    prune rasterization survey poses
-    size
-    checkpoint size_report
-    seek
-    train compact
+    config atomic
+    camera gaussians
+    scene structs metrics panorama device reference
+    ops testing formats
+    render dataset demo
+    rasterization pruning
+    training show
     evaluate
-    bench viewer
+    bench
     commands
     cli
     __main__
 """.strip().splitlines()
 LAYER = {unit: depth for depth, row in enumerate(LAYERS) for unit in row.split()}
 
-# Kernels of `clsplat bench kernels`, no stages: nothing is rendered or trained by them, and tests/test_bench.py is
-# where they are checked. roof measures the device's limits, which no equation describes.
+# Packages that stand below a row they could import from, and must not know what it does.
+APART = {
+    "reference": {"device", "structs", "ops", "scene", "metrics", "config"},  # the equations alone
+    "dataset": {"gaussians", "ops", "render", "pruning", "training"},
+    "formats": {"scene", "camera", "ops", "render", "pruning", "training"},
+    "demo": {"gaussians", "reference", "ops", "render", "training"},
+}
+
+# Kernels of `clsplat bench kernels`, no stages: nothing is rendered or trained by them, and
+# tests/bench/test_bench_kernels.py checks them. roof measures the device's limits, which no equation describes.
 BENCH_KERNELS = {"roof"}
 
 # Where a foreign package may be imported at all, whose absence or weight the rest must not feel.
 ONLY_IN = {
     "pyopencl": {"device", "ops"},
-    "pycolmap": {"features", "sfm", "lenses", "triangulate"},
-    "viser": {"viewer"},
-    "av": {"video"},
-    "pillow_heif": {"photos"},
-    "sqlite3": set(),  # beside pycolmap's in one process it ends in a bus error, see clsplat.features.FOLLOWER
+    "pycolmap": {"dataset"},
+    "viser": {"show"},
+    "av": {"dataset"},
+    "pillow_heif": {"dataset"},
+    "sqlite3": set(),  # beside pycolmap's in one process it ends in a bus error, see FOLLOWER in matching.py
 }
 
 
@@ -112,6 +113,7 @@ def test_imports_go_one_way(path):
         root, *rest = name.split(".")
         if root == "clsplat" and rest and rest[0] != unit:
             assert LAYER[rest[0]] < LAYER[unit], f"{path.name} imports {name}"
+            assert rest[0] not in APART.get(unit, ()), f"{path.name} imports {name}"
         elif root in ONLY_IN:
             assert unit in ONLY_IN[root], f"{path.name} imports {name}"
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat import cli, config, constants, densify, io, ops, presets
+from clsplat import cli, config, constants, formats, ops
+from clsplat.training import densify, presets
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -87,7 +88,7 @@ def test_every_strategy_is_described():
 
 def test_every_format_is_measured():
     page = (DOCS / "formats.md").read_text()
-    for suffix in io.FORMATS:
+    for suffix in formats.FORMATS:
         assert page.count(f"| `{suffix}` |") == 2, suffix  # what is kept, and what it costs
 
 

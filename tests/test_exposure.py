@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from tolerances import DOUBLE, FLOAT
 
-from clsplat import exposure, ops, reference
+from clsplat import ops, reference
 from clsplat.config import OptimConfig
 from clsplat.testing import assert_matches, gradcheck
+from clsplat.training import photo_exposures as exposure
 
 # One pixel; less than, and more than what a work-item has, on a CPU and on a GPU.
 SIZES = [(1, 1), (5, 7), (64, 64), (65, 64), (97, 131)]

@@ -21,12 +21,12 @@ from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.evaluate import mean_metrics
-from clsplat.initialize import initialize
 from clsplat.metrics import to_uint8
 from clsplat.render import render, upload
 from clsplat.stages import Splats
 from clsplat.testing import assert_matches, synthetic_scene, threshold_distances
-from clsplat.train import train
+from clsplat.training.initialize import initialize
+from clsplat.training.loop import train
 
 WIDE = (0.05, -0.01, 0.003, -0.0004)
 MODELS = pytest.mark.parametrize("model", ["orthographic", "fisheye"])

@@ -9,10 +9,10 @@ from PIL import Image
 from clsplat.camera import Camera
 from clsplat.config import DataConfig
 from clsplat.constants import BLUR
+from clsplat.dataset import load_scene
+from clsplat.dataset.lenses import Intrinsics, project
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.io import load_scene
-from clsplat.lenses import Intrinsics, project
 from clsplat.panorama import FACES, assemble, face_size, faces
 from clsplat.render import render
 

@@ -11,11 +11,11 @@ from clsplat.camera import Camera
 from clsplat.config import OptimConfig
 from clsplat.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN
 from clsplat.gaussians import Gaussians, logit
-from clsplat.optim import adam_settings
 from clsplat.reference.project import rotations as reference_rotations
 from clsplat.render import download, upload
 from clsplat.stages import SplatGrads, Splats
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene, threshold_distances
+from clsplat.training.optimizer import adam_settings
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 GRADIENTS = ("means2d", "conics", "opacities", "colors")

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
+from clsplat.dataset import load_scene
 from clsplat.device import Device
 from clsplat.evaluate import mean_metrics
-from clsplat.io import load_scene
-from clsplat.train import train
+from clsplat.training.loop import train
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.bench.report import COLORS
+from clsplat.bench.kernel_report import COLORS
 from clsplat.bench.summary import (
     COSTS,
     MEAN,

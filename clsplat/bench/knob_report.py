@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from clsplat.bench.report import COLORS, Results, chart_title, milliseconds, origin, table
-from clsplat.io.atomic import replacing
+from clsplat.atomic import replacing
+from clsplat.bench.kernel_report import COLORS, Results, chart_title, milliseconds, origin, table
 
 PANELS = (("render", "rendering"), ("step", "a step of training"))
 

@@ -14,7 +14,7 @@ from clsplat.config import BACKGROUNDS, RenderConfig, TrainConfig
 from clsplat.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.prune import with_degree
+from clsplat.pruning.prices import with_degree
 from clsplat.render import download, forward, upload
 
 ALPHA_MINS = (0.5 * ALPHA_MIN, 2 * ALPHA_MIN, 4 * ALPHA_MIN, 8 * ALPHA_MIN)

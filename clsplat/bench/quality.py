@@ -18,16 +18,17 @@ from tqdm import tqdm
 from clsplat.bench.environment import describe
 from clsplat.bench.results import KEYS, Record, append_record, read_records, write_records
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
+from clsplat.dataset import load_scene, with_points
 from clsplat.device import Device
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluate import mean_metrics
+from clsplat.formats import save_gaussians
 from clsplat.gaussians import Gaussians
-from clsplat.io import load_scene, save_gaussians, with_points
 from clsplat.metrics import flip, psnr, ssim
-from clsplat.presets import YAML, load_config, load_preset, with_settings
 from clsplat.render import render_views
 from clsplat.scene import Scene, View
-from clsplat.train import train
+from clsplat.training.loop import train
+from clsplat.training.presets import YAML, load_config, load_preset, with_settings
 
 SAMPLES = 8
 """Samples of a training, at equal factors of iterations."""
@@ -298,7 +299,7 @@ def run_cell(cell: Cell, scene: Scene, evaluator: Device, record: Callable[[Reco
         Renders the held-out views: apart from the device that trains, whose memory is measured.
     record : callable
     """
-    from clsplat.memory import parse_size
+    from clsplat.training.memory import parse_size
 
     config = cell.config
     limit = None if config.memory_limit is None else parse_size(config.memory_limit, "--memory-limit")

@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from clsplat.atomic import replacing
 from clsplat.errors import InputError
-from clsplat.io.atomic import replacing
 
 Record = dict[str, Any]
 

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.bench.workloads import Workload
-from clsplat.checkpoint import State, move
 from clsplat.config import OptimConfig, TrainConfig
-from clsplat.densify import STRATEGIES
 from clsplat.device import Device
-from clsplat.memory import Photos
-from clsplat.optim import Moments
-from clsplat.train import step
+from clsplat.training.checkpoint import State, move
+from clsplat.training.densify import STRATEGIES
+from clsplat.training.loop import step
+from clsplat.training.memory import Photos
+from clsplat.training.optimizer import Moments
 
 ITERATION = 3001
 """Of a default run: all bands of the spherical harmonics are trained, densification watches, and no edit is due."""

@@ -102,7 +102,7 @@ def from_files(scene: Path, cameras: Path, views: int, data: DataConfig) -> list
     scene : Path
         File of Gaussians.
     cameras : Path
-        Dataset, as `clsplat.io.load_scene` takes it.
+        Dataset, as `clsplat.dataset.load_scene` takes it.
     views : int
         How many of its views, at most; at least 1.
     data : DataConfig
@@ -113,7 +113,8 @@ def from_files(scene: Path, cameras: Path, views: int, data: DataConfig) -> list
     InputError
         If a file is missing or damaged, or `views` is less than 1.
     """
-    from clsplat.io import load_gaussians, load_scene
+    from clsplat.dataset import load_scene
+    from clsplat.formats import load_gaussians
 
     if views < 1:
         raise InputError(f"--views: expected 1 or more, found {views}")

@@ -13,9 +13,9 @@ from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
 from clsplat.errors import InputError
 
 if TYPE_CHECKING:
-    from clsplat.compact import Limits
     from clsplat.device import Device
     from clsplat.gaussians import Gaussians
+    from clsplat.pruning.compaction import Limits
     from clsplat.scene import Scene, View
 
 HELD_OUT = 6
@@ -51,9 +51,10 @@ class Compact:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.compact import ASSUMED_PSNR, Judge, compact
-        from clsplat.io import load_gaussians, load_scene, save_gaussians, suffix_of
-        from clsplat.memory import size_text
+        from clsplat.dataset import load_scene
+        from clsplat.formats import load_gaussians, save_gaussians, suffix_of
+        from clsplat.pruning.compaction import ASSUMED_PSNR, Judge, compact
+        from clsplat.training.memory import size_text
 
         limits = self._limits()
         suffix = suffix_of(self.out)
@@ -94,8 +95,8 @@ class Compact:
             say(f"loss: {found.loss:.3f} dB of PSNR, if the scene has {ASSUMED_PSNR:.0f} dB against photos unknown")
 
     def _limits(self) -> "Limits":
-        from clsplat.compact import Limits
-        from clsplat.memory import parse_size
+        from clsplat.pruning.compaction import Limits
+        from clsplat.training.memory import parse_size
 
         size = None if self.max_bytes is None else parse_size(self.max_bytes, "--max-bytes")
         if self.max_gaussians is None and size is None and self.max_psnr_loss is None:
@@ -112,7 +113,7 @@ class Compact:
         self, gaussians: "Gaussians", scene: "Scene | None", config: RenderConfig, device: "Device"
     ) -> "tuple[list[View], list[View]]":
         """Views that price, and views that judge."""
-        from clsplat.compact import automatic_cameras, own_views
+        from clsplat.pruning.viewpoints import automatic_cameras, own_views
 
         background = BACKGROUNDS[self.data_config.background]
         if scene is None:

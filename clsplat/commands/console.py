@@ -58,7 +58,7 @@ def new_folder(out: Path) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file, whole or not at all."""
-    from clsplat.io.atomic import replacing
+    from clsplat.atomic import replacing
 
     with replacing(path) as file:
         file.write((json.dumps(value, indent=2) + "\n").encode())
@@ -71,7 +71,7 @@ def moved(gaussians: "Gaussians", by: Any) -> "Gaussians":
 
 def say_cameras(dataset: Path, picture: Path) -> None:
     """Tell what structure from motion found, if it was ours, with warnings, and draw it."""
-    from clsplat.preview import draw_cameras, preview
+    from clsplat.dataset.sfm.summary import draw_cameras, preview
 
     found = preview(dataset)
     if found is None:
@@ -85,7 +85,7 @@ def say_cameras(dataset: Path, picture: Path) -> None:
 
 def say_scores(report: dict[str, Any], out: Path) -> None:
     """Tell the mean figures and where the page is."""
-    from clsplat.report import METRICS
+    from clsplat.show.evaluation_page import METRICS
 
     mean = ", ".join(f"{METRICS[name][0]} {value:.4g}" for name, value in report["mean"].items() if value is not None)
     say(f"held-out photos: {mean}; page: {out / 'index.html'}")

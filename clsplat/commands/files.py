@@ -51,7 +51,7 @@ class Frames:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.video import extract_frames
+        from clsplat.dataset.video import extract_frames
 
         count = extract_frames(self.video, self.out, self.fps)
         say(f"{self.out}: {count} frames of {self.video.name}; next: clsplat train {self.out} -o SCENE")
@@ -69,7 +69,7 @@ class Sfm:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.sfm import reconstruct
+        from clsplat.dataset.sfm.reconstruction import reconstruct
 
         model = reconstruct(self.photos, self.sfm, self.out, verbose=console.loudness == "verbose")
         say_cameras(self.out or self.photos, model.parent / "cameras.png")
@@ -93,7 +93,7 @@ class Export:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.io import load_gaussians, save_gaussians
+        from clsplat.formats import load_gaussians, save_gaussians
 
         if (self.to is None) == (self.out is None):
             raise InputError("export: expected one file to write, as in: clsplat export scene.ply scene.spz")
@@ -107,9 +107,9 @@ class Export:
         say(f"{out}: {len(gaussians)} Gaussians, {out.stat().st_size / 1e6:.3g} MB")
 
     def _page(self, out: Path, gaussians: "Gaussians", mode: Mode, offset: Any) -> None:
-        from clsplat.io import load_scene
-        from clsplat.orbit import first_photo, overview
-        from clsplat.page import save_page
+        from clsplat.dataset import load_scene
+        from clsplat.show.camera_paths import first_photo, overview
+        from clsplat.show.web_page import save_page
 
         views = []
         if self.data is not None:

@@ -32,7 +32,7 @@ class Info:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.io.sog import META
+        from clsplat.formats.sog import META
 
         if not self.path.exists():
             raise InputError(f"{self.path}: expected a file of Gaussians, a run or a dataset, found nothing")
@@ -45,8 +45,8 @@ class Info:
 
 def scene_lines(path: Path) -> list[str]:
     """What `info` says about a file of Gaussians."""
-    from clsplat.io import load_gaussians, suffix_of
-    from clsplat.io.anatomy import ANATOMIES
+    from clsplat.formats import load_gaussians, suffix_of
+    from clsplat.formats.anatomy import ANATOMIES
 
     gaussians, mode, offset = load_gaussians(path)
     anatomy = ANATOMIES[suffix_of(path) or ".sog"](path)
@@ -74,8 +74,8 @@ def scene_lines(path: Path) -> list[str]:
 
 def run_lines(folder: Path) -> list[str]:
     """What `info` says about a folder that `train` has written, finished or not."""
-    from clsplat.presets import DATA_PATH
-    from clsplat.report import read_log
+    from clsplat.show.evaluation_page import read_log
+    from clsplat.training.presets import DATA_PATH
 
     last = read_log(folder / "log.jsonl")[-1]
     rows = {"what": "a run of clsplat train"}
@@ -101,10 +101,10 @@ def run_lines(folder: Path) -> list[str]:
 
 def dataset_lines(path: Path) -> list[str]:
     """What `info` says about a dataset; no cameras are recovered for it."""
-    from clsplat import sfm
     from clsplat.config import DataConfig
-    from clsplat.io import colmap, transforms
-    from clsplat.photos import list_photos, photo_folder, photo_size
+    from clsplat.dataset import colmap, transforms
+    from clsplat.dataset.photos import list_photos, photo_folder, photo_size
+    from clsplat.dataset.sfm import reconstruction as sfm
 
     record, model = sfm.read_record(path), colmap.find_model(path)
     source = path / record["photos"] if record else path

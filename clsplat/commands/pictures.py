@@ -31,8 +31,9 @@ class Eval:
 
     def run(self) -> None:
         """Run the command."""
+        from clsplat.dataset import load_scene
         from clsplat.evaluate import evaluate
-        from clsplat.io import load_gaussians, load_scene
+        from clsplat.formats import load_gaussians
 
         gaussians, mode, offset = load_gaussians(self.scene)
         device = open_device(self.device)
@@ -73,11 +74,12 @@ class Render:
         from PIL import Image
         from tqdm import tqdm
 
-        from clsplat.io import load_gaussians, load_scene
-        from clsplat.io.atomic import replacing
+        from clsplat.atomic import replacing
+        from clsplat.dataset import load_scene
+        from clsplat.formats import load_gaussians
         from clsplat.metrics import to_uint8
-        from clsplat.orbit import orbit
         from clsplat.render import Rendering, render_views
+        from clsplat.show.camera_paths import orbit
 
         if self.path not in ("test", "orbit"):
             raise InputError(f"--path: expected test or orbit, found {self.path!r}")

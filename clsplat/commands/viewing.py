@@ -30,9 +30,10 @@ class View:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.io import load_gaussians, load_scene
-        from clsplat.orbit import first_photo, overview
-        from clsplat.viewer import Viewer
+        from clsplat.dataset import load_scene
+        from clsplat.formats import load_gaussians
+        from clsplat.show.camera_paths import first_photo, overview
+        from clsplat.show.viewer import Viewer
 
         gaussians, mode, offset = load_gaussians(self.scene)
         device = open_device(self.device)

@@ -27,11 +27,13 @@ from matplotlib.figure import Figure
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from clsplat import cli, config, constants, presets
-from clsplat.bench import charts, report, results, summary
+from clsplat import cli, config, constants
+from clsplat.bench import charts, results, summary
+from clsplat.bench import kernel_report as report
 from clsplat.bench.knob_report import knobs_text
 from clsplat.bench.stability import EXPERIMENTS
-from clsplat.bench.stability import report as stability
+from clsplat.bench.stability import stability_report as stability
+from clsplat.training import presets
 
 HEADER_RULE = "|---"
 

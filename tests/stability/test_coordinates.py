@@ -3,17 +3,17 @@
 from dataclasses import replace
 
 import numpy as np
-from test_io_dataset import write_colmap
+from test_loading import write_colmap
 
 from clsplat.bench.stability.small import CONFIG, small_scene
 from clsplat.config import DataConfig, InitConfig
+from clsplat.dataset import load_scene
+from clsplat.dataset.loading import _near_origin
 from clsplat.evaluate import mean_metrics
-from clsplat.initialize import initialize
-from clsplat.io import load_scene
-from clsplat.io.dataset import _near_origin
 from clsplat.render import render
 from clsplat.scene import Scene
-from clsplat.train import train
+from clsplat.training.initialize import initialize
+from clsplat.training.loop import train
 
 
 def test_the_same_image_in_coordinates_of_the_world(device, tmp_path):

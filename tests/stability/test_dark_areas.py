@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from test_io_dataset import write_colmap
+from test_loading import write_colmap
 
 from clsplat.bench.stability.small import CONFIG, small_scene, soot
 from clsplat.config import DataConfig
-from clsplat.io import load_scene
-from clsplat.pyramid import shrunk
+from clsplat.dataset import load_scene
 from clsplat.render import render
-from clsplat.train import train
+from clsplat.training.coarse_to_fine import shrunk
+from clsplat.training.loop import train
 
 RANDOM = DataConfig(random_background=True)
 

@@ -8,10 +8,10 @@ from clsplat.bench.stability.densities import left_by_pruning
 from clsplat.bench.stability.small import CONFIG, small_scene
 from clsplat.constants import ALPHA_MIN
 from clsplat.gaussians import logit
-from clsplat.prune import without_invisible
+from clsplat.pruning.prices import without_invisible
 from clsplat.render import render
 from clsplat.testing import synthetic_scene
-from clsplat.train import train
+from clsplat.training.loop import train
 
 
 def test_training_goes_on_where_everything_has_become_transparent(device, tmp_path):

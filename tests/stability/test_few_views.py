@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat import few_views
 from clsplat.bench.stability.small import CONFIG, small_scene, with_train
 from clsplat.evaluate import mean_metrics
-from clsplat.train import train
+from clsplat.training import few_views
+from clsplat.training.loop import train
 
 
 def noisy(view, rng):

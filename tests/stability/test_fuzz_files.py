@@ -18,18 +18,19 @@ from damage import ANY, BINARY, JSON_CHANGES, JSON_VALUES, TEXT, changed, damage
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from test_io_colmap import write_bin, write_photos, write_txt
-from test_io_dataset import write_transforms
+from test_colmap import write_bin, write_photos, write_txt
+from test_loading import write_transforms
 
-from clsplat.checkpoint import load_state, save_state
 from clsplat.config import DataConfig, TrainConfig
+from clsplat.dataset import load_scene
+from clsplat.dataset.photos import orientation, photo_size, read_photo
 from clsplat.errors import InputError
-from clsplat.io import FORMATS, colmap, load_gaussians, load_scene, save_gaussians, transforms
-from clsplat.io.compact import EXPANSION_FREE
-from clsplat.photos import orientation, photo_size, read_photo
+from clsplat.formats import FORMATS, colmap, load_gaussians, save_gaussians, transforms
+from clsplat.formats.quantisation import EXPANSION_FREE
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
-from clsplat.train import initial_state
+from clsplat.training.checkpoint import load_state, save_state
+from clsplat.training.loop import initial_state
 
 MEMORY_MAX = 3 * EXPANSION_FREE
 """Bytes that reading a file of some kB may allocate: what files unfold to at most, and float copies of it."""

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat import poses
 from clsplat.bench.stability.small import CONFIG, small_scene, with_train
-from clsplat.checkpoint import load_state
 from clsplat.evaluate import mean_metrics
-from clsplat.train import train
+from clsplat.training import photo_poses as poses
+from clsplat.training.checkpoint import load_state
+from clsplat.training.loop import train
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ import numpy as np
 from clsplat.bench.stability.experiment import Experiment, Figure, Found
 from clsplat.bench.stability.trained import load, trained
 from clsplat.config import TrainConfig
-from clsplat.densify import STRATEGIES
 from clsplat.device import Device
 from clsplat.gaussians import logit
-from clsplat.prune import without_invisible
-from clsplat.survey import Contributions
+from clsplat.pruning.prices import without_invisible
 from clsplat.testing import synthetic_scene
+from clsplat.training.contributions import Contributions
+from clsplat.training.densify import STRATEGIES
 
 CAP = 5000
 

@@ -10,11 +10,11 @@ from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
 from clsplat.bench.stability.small import CONFIG, small_scene, with_train
 from clsplat.bench.stability.trained import SHORT, held_out, load, trained
 from clsplat.config import AdcConfig, DataConfig, TrainConfig
+from clsplat.dataset import with_points
 from clsplat.device import Device
 from clsplat.evaluate import mean_metrics
-from clsplat.io import with_points
 from clsplat.scene import Scene, View
-from clsplat.train import train
+from clsplat.training.loop import train
 
 RESET_CONFIG = replace(
     CONFIG, iterations=400, adc=replace(CONFIG.adc, every=25, reset_every=150, start=50, stop_fraction=0.8)

@@ -8,9 +8,9 @@ import numpy as np
 from PIL import Image
 
 from clsplat.bench.stability.experiment import Experiment, Figure, Found
+from clsplat.dataset.photos import read_photo
 from clsplat.device import Device
 from clsplat.errors import InputError
-from clsplat.photos import read_photo
 
 GREY = np.linspace(0, 255, 12 * 16).reshape(12, 16)
 RGB = np.stack([GREY, GREY[::-1], GREY[:, ::-1]], axis=2).astype(np.uint8)

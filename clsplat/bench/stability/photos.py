@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat import few_views, poses
 from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
 from clsplat.bench.stability.small import CONFIG, small_scene, soot
 from clsplat.bench.stability.trained import held_out, load, spread, trained
@@ -14,6 +13,8 @@ from clsplat.device import Device
 from clsplat.metrics import psnr_fitted
 from clsplat.render import render
 from clsplat.scene import Scene, View
+from clsplat.training import few_views
+from clsplat.training import photo_poses as poses
 
 GAINS = (0.0, 0.1, 0.2, 0.4)
 NOISES = (0.0, 0.2, 0.5, 1.0)

@@ -9,9 +9,9 @@ from PIL import Image
 from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
 from clsplat.bench.stability.trained import load, trained
 from clsplat.config import DataConfig, Mode, RenderConfig
+from clsplat.dataset import load_scene
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.io import load_scene
 from clsplat.metrics import psnr, to_uint8
 from clsplat.render import render_views
 from clsplat.scene import View

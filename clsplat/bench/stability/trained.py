@@ -7,11 +7,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
+from clsplat.dataset import load_scene
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.evaluate import Metric, mean_metrics
 from clsplat.gaussians import Gaussians
-from clsplat.io import load_scene
 from clsplat.metrics import psnr
 from clsplat.scene import Scene
 
@@ -28,7 +28,7 @@ def load(data: Path | None, name: str, config: TrainConfig = SHORT) -> tuple[Sce
 
 def trained(scene: Scene, config: TrainConfig, device: Device) -> Gaussians:
     """The Gaussians of a training whose files are not kept."""
-    from clsplat.train import train
+    from clsplat.training.loop import train
 
     with TemporaryDirectory() as out:
         return train(scene, config, device, Path(out))

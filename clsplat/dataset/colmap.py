@@ -1,0 +1,283 @@
+"""Reader of COLMAP models, binary and text; the layout is that of COLMAP's documentation, "Output Format"."""
+
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config import DataConfig
+from clsplat.dataset.decoding import SIZE_MAX, Dataset, PosedPhoto
+from clsplat.dataset.finding import PhotosMissing, checked_name, find_mask, locate, mask_folder, warn_of_missing
+from clsplat.dataset.lenses import Intrinsics
+from clsplat.errors import InputError
+
+MODELS: tuple[tuple[str, int], ...] = (
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
+)
+"""Camera models and their numbers of parameters; the index is the number that binary files hold."""
+
+FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+"""Where a dataset may have its model, in order."""
+
+Model = tuple[
+    dict[int, Intrinsics], list[tuple[str, int, NDArray[np.float64]]], NDArray[np.float64], NDArray[np.uint8]
+]
+"""Cameras by id; name, camera id and viewmat of each photo; points (P, 3) in world units; their colours (P, 3)."""
+
+
+def find_model(root: Path) -> Path | None:
+    """The folder of the COLMAP model of the dataset `root`, or None."""
+    for folder in FOLDERS:
+        if any((root / folder / f"cameras.{ending}").is_file() for ending in ("bin", "txt")):
+            return root / folder
+    return None
+
+
+def read_dataset(root: Path, model: Path, config: DataConfig, photos: Path | None = None) -> Dataset:
+    """Read a COLMAP model and find its photos and masks.
+
+    Parameters
+    ----------
+    root : Path
+        The dataset's folder. Photos are looked for in its folder ``images`` (``images_2`` and so on, as
+        `config.downscale` says), or in itself.
+    model : Path
+        Folder of the model.
+    config : DataConfig
+        Size of the photos, folder of the masks.
+    photos : Path, optional
+        Where to look for photos instead of `root`; the photos are upright there.
+
+    Returns
+    -------
+    Dataset
+        Photos without a file are left out with a warning.
+
+    Raises
+    ------
+    PhotosMissing
+        If there is none of the photos.
+    InputError
+        If a file is damaged or does not fit the others, or a mask is missing; the message names it.
+    """
+    cameras, images, points, colors = read_model(model)
+    names = [name for name, _, _ in images]
+    folder = root if photos is None else photos
+    try:
+        files, reduce = locate(folder, [f"images/{name}" for name in names], config.downscale)
+    except PhotosMissing as error:
+        try:
+            files, reduce = locate(folder, names, config.downscale)
+        except PhotosMissing:
+            raise error from None
+    warn_of_missing(model, names, files)
+    masks = None if config.masks is None else mask_folder(root, config.masks)
+    return Dataset(
+        [
+            PosedPhoto(name, file, viewmat, cameras[camera], None if masks is None else find_mask(masks, name))
+            for (name, camera, viewmat), file in zip(images, files, strict=True)
+            if file is not None
+        ],
+        points,
+        colors,
+        reduce,
+        upright=photos is not None,
+    )
+
+
+def read_model(folder: Path) -> Model:
+    """Read ``cameras``, ``images`` and ``points3D``, each from ``.bin`` or otherwise ``.txt``.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged, or has no images; the message names it.
+    """
+    cameras_path, cameras = _read(folder, "cameras", _cameras_bin, _cameras_txt)
+    images_path, images = _read(folder, "images", _images_bin, _images_txt)
+    points_path, points = _read(folder, "points3D", _points_bin, _points_txt)
+
+    by_id: dict[int, Intrinsics] = {}
+    for number, model, width, height, params in cameras:
+        if not (1 <= width <= SIZE_MAX and 1 <= height <= SIZE_MAX) or not np.isfinite(params).all():
+            raise InputError(
+                f"{cameras_path}: expected finite parameters and 1 to {SIZE_MAX} pixels per edge, found "
+                f"{width}x{height}, {params} for camera {number}"
+            )
+        by_id[number] = Intrinsics(model, params, width, height)
+    posed = []
+    for name, camera, quat, translation in images:
+        if camera not in by_id:
+            raise InputError(f"{images_path}: expected camera {camera} of photo {name} in {cameras_path.name}")
+        posed.append((checked_name(name, images_path), camera, _viewmat(quat, translation, name, images_path)))
+    if not posed:
+        raise InputError(f"{images_path}: expected at least one photo with a pose, found none")
+    rows: NDArray[np.float64] = np.fromiter(points, dtype=np.dtype((np.float64, 6)))
+    if not np.isfinite(rows).all() or ((rows[:, 3:] < 0) | (rows[:, 3:] > 255)).any():
+        raise InputError(f"{points_path}: expected finite points with colours from 0 to 255, found others")
+    return by_id, posed, rows[:, :3].copy(), rows[:, 3:].astype(np.uint8)
+
+
+def _read(folder: Path, name: str, read_bin: Any, read_txt: Any) -> tuple[Path, Iterator[Any]]:
+    for path, read in ((folder / f"{name}.bin", read_bin), (folder / f"{name}.txt", read_txt)):
+        if path.is_file():
+            return path, read(path)
+    raise InputError(f"{folder / name}.bin: expected this file or {name}.txt beside the other files, found neither")
+
+
+def _viewmat(quat: Any, translation: Any, name: str, path: Path) -> NDArray[np.float64]:
+    largest = max(map(abs, quat))  # divided by first: the squares of what a damaged file holds may overflow
+    known = 0 < largest < np.inf and np.isfinite((*quat, *translation)).all()
+    scaled = np.array(quat) / largest if known else np.full(4, np.nan)
+    w, x, y, z = scaled / np.linalg.norm(scaled)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    viewmat[:3, 3] = translation
+    if not np.isfinite(viewmat).all():
+        raise InputError(f"{path}: expected a finite pose, found {quat}, {translation} for photo {name}")
+    return viewmat
+
+
+class _Bytes:
+    """A binary file, read from front to back and never beyond its end, whatever its counts say."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.data, self.at = path, path.read_bytes(), 0
+
+    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
+        self._expect(layout.size)
+        self.at += layout.size
+        return layout.unpack_from(self.data, self.at - layout.size)
+
+    def count(self) -> int:
+        return int(self.take(struct.Struct("<Q"))[0])
+
+    def skip(self, size: int) -> None:
+        self.at += size
+
+    def text(self) -> str:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            self._expect(len(self.data))
+        start, self.at = self.at, end + 1
+        return os.fsdecode(self.data[start:end])
+
+    def end(self) -> None:
+        if self.at != len(self.data):
+            raise InputError(f"{self.path}: expected {self.at} bytes by its own counts, found {len(self.data)}")
+
+    def _expect(self, size: int) -> None:
+        if size > len(self.data) - self.at:
+            raise InputError(
+                f"{self.path}: expected {size} more bytes at byte {self.at}, found {len(self.data) - self.at}; the "
+                "file is cut off or damaged"
+            )
+
+
+def _cameras_bin(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
+    file = _Bytes(path)
+    head = struct.Struct("<IiQQ")
+    for _ in range(file.count()):
+        number, model, width, height = file.take(head)
+        if not 0 <= model < len(MODELS):
+            raise InputError(
+                f"{path}: expected camera models 0 to {len(MODELS) - 1}, found {model} for camera {number}"
+            )
+        yield number, MODELS[model][0], width, height, file.take(struct.Struct(f"<{MODELS[model][1]}d"))
+    file.end()
+
+
+def _images_bin(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
+    file = _Bytes(path)
+    head = struct.Struct("<I7dI")
+    for _ in range(file.count()):
+        _, *pose, camera = file.take(head)
+        name = file.text()
+        file.skip(24 * file.count())  # keypoints: x, y and the point's id
+        yield name, camera, tuple(pose[:4]), tuple(pose[4:])
+    file.end()
+
+
+def _points_bin(path: Path) -> Iterator[tuple[float, ...]]:
+    file = _Bytes(path)
+    head = struct.Struct("<Q3d3Bd")
+    for _ in range(file.count()):
+        row = file.take(head)
+        file.skip(8 * file.count())  # track: image id and index of the keypoint
+        yield row[1:7]
+    file.end()
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    text = path.read_text(encoding="utf-8", errors="surrogateescape")
+    yield from ((number, line.strip()) for number, line in enumerate(text.split("\n"), 1))
+
+
+def _damaged(path: Path, number: int, expected: str, line: str) -> InputError:
+    return InputError(f"{path}, line {number}: expected {expected}, found {line[:80]!r}")
+
+
+def _cameras_txt(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
+    counts = dict(MODELS)
+    for number, line in _lines(path):
+        if line and not line.startswith("#"):
+            try:
+                camera, model, width, height, *params = line.split()
+                row = int(camera), model, int(width), int(height), tuple(map(float, params))
+            except ValueError as error:
+                raise _damaged(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", line) from error
+            if counts.get(model) != len(params):
+                wanted = f"{counts[model]} parameters" if model in counts else f"one of {', '.join(counts)}"
+                raise _damaged(path, number, f"{wanted} for camera {camera}", line)
+            yield row
+
+
+def _images_txt(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
+    lines = _lines(path)
+    for number, line in lines:
+        if line and not line.startswith("#"):
+            try:
+                _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
+                quat, translation = map(float, (qw, qx, qy, qz)), map(float, (tx, ty, tz))
+                row = name, int(camera), tuple(quat), tuple(translation)
+            except ValueError as error:
+                raise _damaged(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from error
+            yield row
+            next(lines, None)  # its keypoints; the line may be empty
+
+
+def _points_txt(path: Path) -> Iterator[tuple[float, ...]]:
+    for number, line in _lines(path):
+        if line and not line.startswith("#"):
+            words = line.split(maxsplit=7)
+            try:
+                x, y, z, r, g, b = words[1:7]
+                row = float(x), float(y), float(z), float(int(r)), float(int(g)), float(int(b))
+            except (OverflowError, ValueError) as error:
+                raise _damaged(path, number, "POINT3D_ID X Y Z R G B", line) from error
+            yield row

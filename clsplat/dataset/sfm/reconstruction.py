@@ -1,0 +1,327 @@
+"""Cameras from photos, by COLMAP through pycolmap.
+
+Structure from motion is SIFT on the CPU, matching, incremental mapping: Schoenberger and Frahm 2016,
+doi:10.1109/CVPR.2016.445.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config import SfmConfig
+from clsplat.dataset.lenses import camera_models
+
+# Not only for these names: a Pillow that is loaded after pycolmap 4.2.1 takes over some of the zlib inside it and
+# crashes when it writes a PNG. Loaded first, it keeps its own.
+from clsplat.dataset.photos import (
+    FRAMES,
+    is_plain,
+    list_photos,
+    photo_folder,
+    photo_size,
+    read_photo,
+    write_upright_png,
+)
+from clsplat.dataset.sfm.matching import SEED, extract, is_sliver, match, quiet
+from clsplat.errors import InputError
+
+RECORD = "clsplat_sfm.json"
+"""File beside the model's folder ``0``: of which photos and with which options the model was made."""
+
+
+def read_record(folder: Path) -> dict[str, Any] | None:
+    """What `reconstruct` noted about the model in `folder`.
+
+    Returns
+    -------
+    dict or None
+        ``photos``: their folder, relative to `folder` or absolute; ``hashes``: BLAKE2 of each photo by name;
+        ``options``: fields of the `SfmConfig`; ``registered``: number of poses. None: `folder` has no model of ours.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged.
+    """
+    path = folder / "sparse" / RECORD
+    if not path.is_file():
+        return None
+    try:
+        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        SfmConfig(**record["options"])
+        if not isinstance(record["hashes"], dict) or not isinstance(record["registered"], int):
+            raise TypeError("hashes or registered of another type")
+        return {**record, "photos": str(record["photos"])}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: expected our record of a structure from motion, found {error!r}; delete its folder to redo it"
+        ) from error
+
+
+@dataclass(frozen=True, eq=False)
+class SparseModel:
+    """A model as it is looked at.
+
+    Parameters
+    ----------
+    names : list of str
+        Photos with a pose, sorted; V of them.
+    positions, directions : (V, 3) float64
+        Of their cameras, in world units, and the way they look, of length 1.
+    points_seen : (V,) int
+        Points of the model in each photo.
+    points : (P, 3) float64
+    colors : (P, 3) uint8
+    error : float
+        Mean reprojection error, in pixels of the photos that were matched.
+    track_length : float
+        Photos that a point is seen in, on average.
+    """
+
+    names: list[str]
+    positions: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    points_seen: NDArray[np.int64]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    error: float
+    track_length: float
+
+
+def read_sparse(model: Path) -> SparseModel:
+    """Read a COLMAP model in its binary or text format.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    import pycolmap
+
+    try:
+        found = pycolmap.Reconstruction(model)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"{model}: expected a COLMAP model, found: {error}") from error
+    images = sorted((i for i in found.images.values() if i.has_pose), key=lambda image: image.name)
+    poses = [image.cam_from_world() for image in images]
+    points = list(found.points3D.values())
+    return SparseModel(
+        [image.name for image in images],
+        np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3),
+        np.array([pose.rotation.matrix()[2] for pose in poses]).reshape(-1, 3),
+        np.array([image.num_points3D for image in images]),
+        np.array([point.xyz for point in points]).reshape(-1, 3),
+        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        float(found.compute_mean_reprojection_error()),
+        float(found.compute_mean_track_length()),
+    )
+
+
+def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, verbose: bool = False) -> Path:
+    """Recover cameras and sparse points from photos; reuse the model where photos and options are unchanged.
+
+    Parameters
+    ----------
+    photos : Path
+        Folder with photos, or whose folder ``images`` has them (with sub-folders). At least 3 that overlap.
+    config : SfmConfig
+        Options.
+    output : Path, optional
+        Folder in which the model is put; it then refers to `photos`, and `clsplat.dataset.load_scene` loads it.
+        Default: `photos`.
+    verbose : bool
+        Show COLMAP's own messages.
+
+    Returns
+    -------
+    Path
+        ``sparse/0`` in `output`: the largest model, in COLMAP's binary format. It describes the photos upright, as
+        their EXIF orientation says.
+
+    Raises
+    ------
+    InputError
+        If there are no photos, one is damaged, too few can be registered, the folder cannot be written or holds a
+        model that is not ours.
+    """
+    photos = Path(photos)
+    output = photos if output is None else Path(output)
+    if not photos.is_dir():
+        raise InputError(f"{photos}: expected a folder of photos, found {'a file' if photos.exists() else 'nothing'}")
+    folder, names = photo_folder(photos), list_photos(photos)
+    if len(names) < max(config.min_registered, 2):
+        raise InputError(f"{folder}: expected at least {max(config.min_registered, 2)} photos, found {len(names)}")
+    _check_options(config)
+    hashes = {name: hashlib.blake2b((folder / name).read_bytes(), digest_size=16).hexdigest() for name in names}
+    model, record = output / "sparse" / "0", read_record(output)
+    if record is None and (output / "sparse").exists():
+        raise InputError(
+            f"{output / 'sparse'}: expected no such folder or a model of ours, found one of others; remove it, or "
+            "choose another folder with -o"
+        )
+    if record is not None and record["hashes"] == hashes and (model / "images.bin").is_file():
+        # How many photos must be registered changes nothing in the model: it is checked against it.
+        made_with = replace(SfmConfig(**record["options"]), min_registered=config.min_registered)
+        if made_with == config:
+            _check_registered(record["registered"], len(names), photos, config)
+            return model
+
+    with _workspace(output) as work, quiet(verbose):
+        readable = _readable(folder, names, work, config.max_image_size)
+        found = _largest_model(readable, names, work, _matched(config, folder), verbose)
+        registered = 0 if found is None else int(found.num_reg_images())
+        _check_registered(registered, len(names), photos, config)
+        _turn_upright(found)
+        (work / "sparse" / "0").mkdir(parents=True)
+        found.write_binary(work / "sparse" / "0")
+        where = "." if output.resolve() == photos.resolve() else str(photos.resolve())
+        record = {"photos": where, "registered": registered, "options": asdict(config), "hashes": hashes}
+        (work / "sparse" / RECORD).write_text(json.dumps(record, indent=1), encoding="utf-8")
+        if (output / "sparse").exists():
+            os.replace(output / "sparse", work / "stale")
+        os.replace(work / "sparse", output / "sparse")
+    return model
+
+
+def _check_options(config: SfmConfig) -> None:
+    if config.matching not in ("auto", "exhaustive", "sequential"):
+        raise InputError(f"matching: expected auto, exhaustive or sequential, found {config.matching!r}")
+    if config.camera_model not in camera_models():
+        raise InputError(f"camera_model: expected one of {', '.join(camera_models())}, found {config.camera_model!r}")
+    if config.max_image_size < 1:
+        raise InputError(f"max_image_size: expected a number of pixels, found {config.max_image_size}")
+
+
+def _matched(config: SfmConfig, folder: Path) -> SfmConfig:
+    """The options with what `matching` means for the photos in `folder`."""
+    if config.matching != "auto":
+        return config
+    return replace(config, matching="sequential" if (folder / FRAMES).is_file() else "exhaustive")
+
+
+def _check_registered(registered: int, count: int, photos: Path, config: SfmConfig) -> None:
+    if registered < max(config.min_registered, 2):
+        raise InputError(
+            f"{photos}: expected structure from motion to find the poses of at least {max(config.min_registered, 2)} "
+            f"photos, found those of {registered} of {count}; take more photos that overlap by two thirds, sharp, of "
+            "a scene with texture, from places that differ"
+        )
+
+
+@contextmanager
+def _workspace(output: Path) -> Iterator[Path]:
+    """Temporary folder inside `output`, so that what is made in it can be renamed to its place."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=".clsplat_sfm_", dir=output))
+    except OSError as error:
+        raise InputError(
+            f"{output}: expected a folder in which the cameras found can be kept, found: {error.strerror}; copy the "
+            "photos to a folder that can be written, or put the cameras elsewhere by `clsplat sfm PHOTOS -o DIR` and "
+            "give DIR instead of the photos"
+        ) from error
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path:
+    """Folder in which COLMAP reads the pixels that training reads: `folder`, or a copy of it where it would not.
+
+    COLMAP ignores the EXIF orientation, and skips files that it cannot decode without an error; hence every photo is
+    decoded here first.
+    """
+    from tqdm import tqdm
+
+    def check(name: str) -> bool:
+        height, width, _ = read_photo(folder / name, (0.0, 0.0, 0.0), upright=False).shape
+        if is_sliver(width, height, edge_max):
+            raise InputError(
+                f"{folder / name}: expected a photo at most {edge_max} times as long as it is wide, found "
+                f"{width}x{height} pixels"
+            )
+        return is_plain(folder / name)
+
+    def copy(name: str, plain: bool) -> None:
+        if not plain:
+            return write_upright_png(folder / name, work / "photos" / name)
+        (work / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(folder / name, work / "photos" / name)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        plain = list(tqdm(pool.map(check, names), "check photos", len(names), unit="photo", dynamic_ncols=True))
+        if all(plain):
+            return folder
+        list(tqdm(pool.map(copy, names, plain), "turn photos", len(names), unit="photo", dynamic_ncols=True))
+    return work / "photos"
+
+
+def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig, verbose: bool) -> Any:
+    """Run the three stages; None where no two photos make a start."""
+    import pycolmap
+    from tqdm import tqdm
+
+    database = work / "database.db"
+    pycolmap.Database.open(database).close()
+
+    by_size: dict[tuple[int, int], list[str]] = {}
+    for name in names:
+        by_size.setdefault(photo_size(folder / name), []).append(name)
+    reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
+    mode = pycolmap.CameraMode.SINGLE if config.single_camera else pycolmap.CameraMode.PER_IMAGE
+    for group in by_size.values():  # COLMAP's single camera has one size, and it skips photos of another
+        pycolmap.import_images(database, folder, image_names=group, camera_mode=mode, options=reader)
+    extract(database, folder, names, config.max_image_size)
+    with pycolmap.Database.open(database) as opened:
+        if config.matching == "exhaustive":
+            pairs = pycolmap.ExhaustivePairGenerator(pycolmap.ExhaustivePairingOptions(), opened).all_pairs()
+        else:
+            pairs = pycolmap.SequentialPairGenerator(pycolmap.SequentialPairingOptions(), opened).all_pairs()
+    match(database, pairs, verbose)
+
+    options = pycolmap.IncrementalPipelineOptions(
+        min_model_size=max(config.min_registered, 2), random_seed=SEED, num_threads=1
+    )
+    (work / "models").mkdir()
+    with tqdm(total=len(names), desc="poses", unit="photo", dynamic_ncols=True) as bar:
+
+        def start() -> None:  # of a model: COLMAP begins anew where photos are left that do not fit the first
+            bar.n = 2
+            bar.refresh()
+
+        pycolmap.set_random_seed(SEED)
+        models = pycolmap.incremental_mapping(
+            database,
+            folder,
+            work / "models",
+            options=options,
+            initial_image_pair_callback=start,
+            next_image_callback=bar.update,
+        )
+        largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+        bar.n = 0 if largest is None else largest.num_reg_images()
+    return largest
+
+
+def _turn_upright(model: Any) -> None:
+    """Rotate a model's world so that its y axis points down as the photos do on average: viewers take -y as up, and
+    COLMAP's world is that of the first photo, however it was tilted."""
+    import pycolmap
+    from scipy.spatial.transform import Rotation
+
+    down = np.mean([image.cam_from_world().rotation.matrix()[1] for image in model.images.values()], axis=0)
+    if np.linalg.norm(down) > 0.1:  # photos upside down cancel those that are not: then there is no common direction
+        rotation, _ = Rotation.align_vectors([[0.0, 1.0, 0.0]], [down / np.linalg.norm(down)])
+        model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation.as_matrix()), np.zeros(3)))

@@ -1,0 +1,162 @@
+"""What structure from motion found, before a scene is trained on it: figures, warnings in words, and a picture."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.atomic import replacing
+from clsplat.dataset.photos import list_photos, photo_folder, photo_sharpness
+from clsplat.dataset.sfm import reconstruction as sfm
+
+ERROR_MAX = 1.5
+"""Pixels of the mean reprojection error above which we warn: the real scenes we test with have 0.4 to 1."""
+
+TRACK_MIN = 2.5
+"""Photos that a point is seen in, on average, below which we warn: 2 is the least there is, and means that no third
+photo confirms it. The real scenes we test with have 3.0 to 6.7."""
+
+POINTS_MIN = 50
+"""Points in a photo below which its pose is called doubtful: COLMAP registers a photo by 30 of them
+(abs_pose_min_num_inliers)."""
+
+BLUR_MAX = 0.3
+"""Part of the photos' median sharpness below which one is called blurred: in five real scenes the least has 0.56."""
+
+NAMED = 10
+"""Photos that a warning names; the others are counted."""
+
+PICTURE_POINTS = 20_000
+"""Points that are drawn."""
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """What structure from motion found.
+
+    Parameters
+    ----------
+    photos : list of str
+        Names of all photos.
+    model : SparseModel
+        Poses and points.
+    sharpness : (len(photos),) float
+        Of each photo, as `clsplat.dataset.photos.sharpness` measures it.
+    """
+
+    photos: list[str]
+    model: sfm.SparseModel
+    sharpness: NDArray[np.float64]
+
+    def summary(self) -> str:
+        """One line of figures."""
+        m = self.model
+        return (
+            f"{len(m.names)} of {len(self.photos)} photos have a pose; {len(m.points):,} points, each seen in "
+            f"{m.track_length:.1f} photos; mean reprojection error {m.error:.2f} px"
+        )
+
+    def warnings(self) -> list[str]:
+        """What is wrong with photos or poses, and what to do; empty where nothing is."""
+        m, found = self.model, []
+        missing = [name for name in self.photos if name not in set(m.names)]
+        if missing:
+            found.append(
+                f"no pose was found for {self._share(missing)}; they are not trained on. They overlap too little "
+                "with the others, are blurred, or show what has no texture; take photos in between"
+            )
+        blurred = [
+            name
+            for name, value in zip(self.photos, self.sharpness, strict=True)
+            if value < BLUR_MAX * np.median(self.sharpness)
+        ]
+        if blurred:
+            found.append(f"blurred beside the others are {self._share(blurred)}; leave them out")
+        weak = [name for name, count in zip(m.names, m.points_seen, strict=True) if count < POINTS_MIN]
+        if weak:
+            found.append(f"poses are doubtful, by fewer than {POINTS_MIN} points, of {self._share(weak)}")
+        if m.track_length < TRACK_MIN:
+            found.append(
+                f"points are seen in {m.track_length:.1f} photos on average: photos overlap too little; neighbours "
+                "should share two thirds of what they show"
+            )
+        if m.error > ERROR_MAX:
+            found.append(
+                f"the mean reprojection error of {m.error:.1f} px is large: something moved, the zoom changed "
+                "(--sfm.no-single-camera), or the lens needs another --sfm.camera-model"
+            )
+        return found
+
+    def _share(self, names: list[str]) -> str:
+        more = len(names) - NAMED
+        listed = ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+        return f"{len(names)} of {len(self.photos)} photos: {listed}"
+
+
+def preview(dataset: Path) -> Preview | None:
+    """Read the model that `reconstruct` made for `dataset`, and look at its photos.
+
+    Returns
+    -------
+    Preview or None
+        None where the dataset's cameras come from elsewhere.
+
+    Raises
+    ------
+    InputError
+        If the record, the model or a photo is damaged.
+    """
+    record = sfm.read_record(dataset)
+    if record is None:
+        return None
+    photos = dataset / record["photos"]
+    names = list_photos(photos)
+    with ThreadPoolExecutor() as pool:
+        values = list(pool.map(lambda name: photo_sharpness(photo_folder(photos) / name), names))
+    return Preview(names, sfm.read_sparse(dataset / "sparse" / "0"), np.array(values))
+
+
+def draw_cameras(path: Path, model: sfm.SparseModel) -> None:
+    """Write a picture of cameras and points, from above and from the side, as a PNG.
+
+    Parameters
+    ----------
+    path : Path
+    model : SparseModel
+        Its y axis points down.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 5.5), dpi=120, layout="constrained")
+    chosen = np.arange(len(model.points))[:: -(-len(model.points) // PICTURE_POINTS) or 1]
+    everything = np.concatenate([model.positions, model.points[chosen]])
+    low, high = np.percentile(everything, [3, 97], axis=0)
+    low, high = np.minimum(low, model.positions.min(axis=0)), np.maximum(high, model.positions.max(axis=0))
+    reach = 0.55 * float((high - low).max())
+    middle = (low + high) / 2
+    for axes, title, (across, up), signs in zip(
+        figure.subplots(1, 2), ("from above", "from the side"), ((0, 2), (0, 1)), ((1, 1), (1, -1)), strict=True
+    ):
+        points = model.points[chosen][:, [across, up]] * signs
+        axes.scatter(*points.T, c=model.colors[chosen] / 255, s=1.5, linewidths=0)
+        eyes, looks = (x[:, [across, up]] * signs for x in (model.positions, model.directions))
+        style = {"color": "#d55e00", "angles": "xy", "scale_units": "xy", "width": 0.004, "zorder": 3}
+        axes.quiver(*eyes.T, *looks.T, scale=1 / (0.12 * reach), **style)
+        axes.plot(*eyes.T, "o", color="#d55e00", markersize=4, zorder=4)
+        centre = middle[[across, up]] * signs
+        axes.set_xlim(centre[0] - reach, centre[0] + reach)
+        axes.set_ylim(centre[1] - reach, centre[1] + reach)
+        axes.set_aspect("equal")
+        axes.set_title(title, fontsize="medium")
+        axes.tick_params(labelsize="small")
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(f"{len(model.names)} cameras (orange, with the way they look), {len(model.points):,} points")
+    with replacing(path) as file:
+        figure.savefig(file, format="png", metadata={"Software": None})

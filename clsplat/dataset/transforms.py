@@ -1,0 +1,221 @@
+"""Reader of transforms.json: the dialects of NeRF's Blender scenes, instant-ngp and nerfstudio.
+
+A camera is a camera-to-world matrix in OpenGL axes (x right, y up, z back) and intrinsics, of the file or of the
+frame. nerfstudio's ``applied_transform`` is contained in its cameras and points already, and is left as it is.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config import DataConfig
+from clsplat.dataset.decoding import SIZE_MAX, Dataset, PosedPhoto
+from clsplat.dataset.finding import checked_name, find_mask, locate, mask_folder, warn_of_missing
+from clsplat.dataset.lenses import Intrinsics
+from clsplat.dataset.photos import photo_size
+from clsplat.errors import InputError
+from clsplat.formats.ply import read_points
+
+PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE")
+"""Values of ``camera_model``; whichever it is, the coefficients that are given count and the others are zero."""
+
+Json = dict[str, Any]
+
+
+def find_transforms(root: Path) -> list[tuple[Path, bool | None]]:
+    """The files with the cameras of the dataset `root`, each with whether its photos are held out.
+
+    ``transforms_train.json`` and ``transforms_test.json`` (or ``_val``), otherwise ``transforms.json`` (None: no
+    split); empty where there is neither.
+    """
+    train = root / "transforms_train.json"
+    if train.is_file():
+        others = [path for part in ("test", "val") if (path := root / f"transforms_{part}.json").is_file()]
+        return [(train, False), *((path, True) for path in others[:1])]
+    whole = root / "transforms.json"
+    return [(whole, None)] if whole.is_file() else []
+
+
+def read_dataset(root: Path, config: DataConfig) -> Dataset:
+    """Read the transforms.json of the dataset `root` and find its photos, masks and points.
+
+    Parameters
+    ----------
+    root : Path
+        The dataset's folder, for which `find_transforms` finds a file.
+    config : DataConfig
+        Size of the photos, folder of the masks (before the frames' own ``mask_path``).
+
+    Returns
+    -------
+    Dataset
+        Photos without a file are left out with a warning. Points come from ``ply_file_path``.
+
+    Raises
+    ------
+    PhotosMissing
+        If there is none of the photos.
+    InputError
+        If a file is damaged, a value is missing or no number, or a mask is missing; the message names it.
+    """
+    metas = [(path, held_out, _read_json(path)) for path, held_out in find_transforms(root)]
+    frames = [
+        ({**meta, **frame}, path, _is_held_out(frame, meta, held_out))
+        for path, held_out, meta in metas
+        for frame in meta["frames"]
+    ]
+    names = [checked_name(frame["file_path"], path) for frame, path, _ in frames]
+    files, reduce = locate(root, names, config.downscale)
+    warn_of_missing(metas[0][0], names, files)
+    masks = None if config.masks is None else mask_folder(root, config.masks)
+    photos = []
+    for (frame, path, held_out), name, file in zip(frames, names, files, strict=True):
+        if file is None:
+            continue
+        name = name if (root / name).suffix else name + file.suffix
+        intrinsics = _intrinsics(frame, f"{path}, frame {name}", file, config.downscale // reduce)
+        if masks is not None:
+            inside = name if (masks / "images").is_dir() else name.removeprefix("images/")
+            mask: Path | None = find_mask(masks, inside)
+        else:
+            mask = root / checked_name(frame["mask_path"], path) if "mask_path" in frame else None
+        photos.append(PosedPhoto(name, file, _viewmat(frame, path, name), intrinsics, mask, held_out))
+    points, colors = _read_points(root, metas[0][2], metas[0][0])
+    return Dataset(photos, points, colors, reduce)
+
+
+def _read_json(path: Path) -> Json:
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+    except (RecursionError, ValueError) as error:
+        raise InputError(f"{path}: expected JSON, found an error: {error}") from error
+    frames = meta.get("frames") if isinstance(meta, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f'{path}: expected a list "frames" with at least one photo, found none')
+    for number, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise InputError(f'{path}: expected a "file_path" in every frame, found none in frame {number}')
+    return dict(meta)
+
+
+def _is_held_out(frame: Json, meta: Json, held_out: bool | None) -> bool | None:
+    """The split of the files' names, or nerfstudio's lists of file names."""
+    lists = [meta[key] for key in ("test_filenames", "val_filenames") if isinstance(meta.get(key), list)]
+    return any(frame["file_path"] in names for names in lists) if lists and held_out is None else held_out
+
+
+def _number(frame: Json, key: str, where: str) -> float | None:
+    if key not in frame:
+        return None
+    value = frame[key]
+    if not _is_number(value):
+        raise InputError(f"{where}: expected a finite number as {key}, found {str(value)[:80]!r}")
+    return float(value)
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an int beyond all floats
+        return False
+
+
+def _number_or(default: float, frame: Json, key: str, where: str) -> float:
+    value = _number(frame, key, where)
+    return default if value is None else value
+
+
+def _intrinsics(frame: Json, where: str, file: Path, downscaled: int) -> Intrinsics:
+    """Intrinsics at the declared size; where none is declared, that of the file times `downscaled`."""
+    stored = photo_size(file)
+    width = round(_number_or(stored[0] * downscaled, frame, "w", where))
+    height = round(_number_or(stored[1] * downscaled, frame, "h", where))
+    if not (1 <= width <= SIZE_MAX and 1 <= height <= SIZE_MAX):
+        raise InputError(f"{where}: expected 1 to {SIZE_MAX} pixels per edge in w and h, found {width}x{height}")
+    model = frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV")
+    if model == "EQUIRECTANGULAR":
+        return Intrinsics("EQUIRECTANGULAR", (float(width), float(height)), width, height)
+    fx, fy = _focal(frame, "x", width, where), _focal(frame, "y", height, where)
+    fx, fy = fx or fy, fy or fx  # one alone stands for square pixels
+    if fx is None or fy is None:
+        raise InputError(f"{where}: expected fl_x or camera_angle_x, found neither")
+    cx, cy = _number_or(width / 2, frame, "cx", where), _number_or(height / 2, frame, "cy", where)
+
+    keys = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+    k1, k2, k3, k4, k5, k6, p1, p2 = (_number_or(0.0, frame, key, where) for key in keys)
+    if model in FISHEYE:
+        if p1 or p2 or k5 or k6:
+            raise InputError(f"{where}: expected only k1 to k4 for a {model} camera, found p1, p2, k5 or k6")
+        return Intrinsics("OPENCV_FISHEYE", (fx, fy, cx, cy, k1, k2, k3, k4), width, height)
+    if model not in PERSPECTIVE:
+        raise InputError(
+            f"{where}: expected a camera_model among {', '.join(PERSPECTIVE + FISHEYE)} and EQUIRECTANGULAR, found "
+            f"{model!r}"
+        )
+    if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
+        return Intrinsics("PINHOLE", (fx, fy, cx, cy), width, height)
+    if (k4 or k5 or k6) and model != "FULL_OPENCV":
+        # nerfstudio's k4 belongs to r^8, OpenCV's divides: neither may be taken for the other.
+        raise InputError(f"{where}: expected at most k1, k2, k3, p1, p2 for a {model} camera, found k4, k5 or k6")
+    return Intrinsics("FULL_OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6), width, height)
+
+
+def _focal(frame: Json, axis: str, edge: int, where: str) -> float | None:
+    focal = _number(frame, f"fl_{axis}", where)
+    angle = _number(frame, f"camera_angle_{axis}", where)
+    if focal is None and angle is not None:
+        if not 0 < angle < np.pi:
+            raise InputError(f"{where}: expected camera_angle_{axis} between 0 and pi, found {angle}")
+        focal = float(edge / 2 / np.tan(angle / 2))
+    if focal is not None and focal <= 0:
+        raise InputError(f"{where}: expected a positive fl_{axis}, found {focal}")
+    return focal
+
+
+def _viewmat(frame: Json, path: Path, name: str) -> NDArray[np.float64]:
+    """World to camera in OpenCV axes."""
+    try:
+        matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
+    except (OverflowError, TypeError, ValueError):
+        matrix = np.empty(0)
+    viewmat = np.eye(4)
+    if matrix.shape in ((4, 4), (3, 4)):
+        rotation = matrix[:3, :3] * (1.0, -1.0, -1.0)
+        viewmat[:3, :3] = rotation.T
+        with np.errstate(over="ignore", invalid="ignore"):  # of a damaged file; refused below
+            viewmat[:3, 3] = -rotation.T @ matrix[:3, 3]
+    else:
+        viewmat[:] = np.nan
+    if not np.isfinite(viewmat).all():
+        raise InputError(f"{path}: expected a finite 4x4 transform_matrix for frame {name}, found another or none")
+    return viewmat
+
+
+def _read_points(root: Path, meta: Json, source: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Positions (P, 3) and colours (P, 3) of ``ply_file_path``; grey where it has no colours."""
+    if "ply_file_path" not in meta:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
+    path = root / checked_name(meta["ply_file_path"], source)
+    try:
+        with path.open("rb") as file:
+            vertices = read_points(path, file)
+    except OSError as error:
+        raise InputError(f"{path}: expected a PLY file of points, as {source.name} says: {error.strerror}") from error
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: expected finite points, found NaN or infinity")
+    channels = ("red", "green", "blue")
+    if not set(channels) <= set(vertices.dtype.names or ()):
+        return points, np.full(points.shape, 128, dtype=np.uint8)
+    colors = np.stack([vertices[channel] for channel in channels], axis=-1)
+    if colors.dtype != np.uint8:
+        raise InputError(f"{path}: expected colours of type uchar, found {colors.dtype}")
+    return points, colors

@@ -1,0 +1,6 @@
+"""Training: algorithm 1 of Kerbl et al. 2023.
+
+Belongs here: the loop and its step, the state and its checkpoints, the optimiser, the first Gaussians, densification
+(`densify`), the search for the number of Gaussians (`autosize`) and whole configurations (`presets`). Does not belong
+here: loading photos, evaluation, and anything that writes a scene.
+"""

@@ -1,0 +1,104 @@
+"""How the size of a scene was chosen: size.json and its chart."""
+
+import json
+from math import log
+from pathlib import Path
+
+from clsplat.atomic import replacing
+from clsplat.config import TrainConfig
+from clsplat.training.autosize.rule import SURE, Search, sh_bytes
+
+
+def write_report(path: Path, search: Search, config: TrainConfig) -> None:
+    """size.json: every point with what it was worth, the rule and the choice.
+
+    least_share: the price as that of one Gaussian. A doubling that gains p dB lowers the squared error by the
+    fraction p ln(10)/10, and is ln(2) on the natural scale of N: the last Gaussian must lower it by this part of a
+    Gaussian's even share.
+    """
+    chosen = max(search.degrees, key=lambda p: p.worth)
+    content = {
+        "rule": f"growth unless it loses more than {SURE:g} standard errors; pruning if it loses no more than "
+        "the price of its halvings; then the degree with the largest worth = psnr - price log2(bytes)",
+        "price": config.size_price,
+        "least_share": config.size_price * log(10) / (10 * log(2)),
+        "chosen": {"n": chosen.n, "sh_degree": chosen.sh_degree},
+        "trials": [
+            {
+                "iteration": trial.larger.iteration,
+                "kind": "growth" if trial.grows else "pruning",
+                "n": [trial.smaller.n, trial.larger.n],
+                "psnr": [trial.smaller.psnr, trial.larger.psnr],
+                "gain": trial.gain,
+                "standard_error": trial.standard_error,
+                "price": trial.price,
+                "taken": trial.smaller.n if trial.takes_smaller else trial.larger.n,
+            }
+            for trial in search.trials
+        ],
+        "degrees": [
+            {"sh_degree": p.sh_degree, "bytes": p.n * sh_bytes(p.sh_degree), "psnr": p.psnr, "worth": p.worth}
+            for p in search.degrees
+        ],
+    }
+    with replacing(path) as file:
+        file.write(json.dumps(content, indent=1).encode())
+
+
+def size_chart(report: Path, path: Path) -> None:
+    """Draw how the size of a scene was chosen, as a PNG.
+
+    Left, the validation PSNR against the number of Gaussians: the two sides of each trial joined; right, against the
+    bytes, of each degree of the spherical harmonics.
+
+    Parameters
+    ----------
+    report : Path
+        size.json of a training run.
+    path : Path
+        The PNG.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter
+
+    content = json.loads(report.read_text())
+    chosen, degrees = content["chosen"], content["degrees"]
+    figure = Figure(figsize=(9, 4.2), dpi=150, layout="constrained")
+    by_n, by_bytes = figure.subplots(1, 2, width_ratios=[3, 2])
+    grey, blue, orange, green = "0.55", "#0072b2", "#d55e00", "#009e73"
+    labelled: set[str] = set()
+    for trial in content["trials"]:
+        color, label = (grey, "growth") if trial["kind"] == "growth" else (blue, "pruning")
+        larger = trial["psnr"][1]
+        sides = [larger - trial["gain"], larger]  # means of all photos would belie what the middle half decided
+        by_n.plot(trial["n"], sides, "-", color=color, label=None if label in labelled else label)
+        labelled.add(label)
+        for n, quality in zip(trial["n"], sides, strict=True):
+            by_n.plot(n, quality, "o", color=color, markerfacecolor=color if n == trial["taken"] else "white")
+        price = [sides[0], sides[0] + trial["price"]]
+        name = f"price: {content['price']:g} dB per doubling"
+        by_n.plot(trial["n"], price, "--", color=orange, linewidth=1, label=None if name in labelled else name)
+        labelled.add(name)
+    best = max(degrees, key=lambda p: p["worth"])
+    by_n.axvline(chosen["n"], color=orange, linewidth=0.8, label=f"chosen: {chosen['n']:,}")
+    by_n.set_xlabel("Gaussians; two sides of a trial joined, the full one goes on")
+    by_n.set_ylabel("PSNR of the validation photos, dB")
+    by_bytes.plot([p["bytes"] / 1e6 for p in degrees], [p["psnr"] for p in degrees], "o-", color=green)
+    by_bytes.plot(best["bytes"] / 1e6, best["psnr"], "*", color=orange, markersize=15, zorder=4)
+    for p in degrees:
+        marker = ", chosen" if p is best else ""
+        right = p is degrees[0]  # the curve is to the right of the first, to the left of the others
+        place = {"xytext": (8 if right else -10, -4), "ha": "left" if right else "right"}
+        at = p["bytes"] / 1e6, p["psnr"]
+        by_bytes.annotate(f"degree {p['sh_degree']}{marker}", at, textcoords="offset points", **place)
+    by_bytes.set_xlabel("MB, without refitting")
+    by_bytes.margins(x=0.3)
+    for axes in (by_n, by_bytes):
+        axes.set_xscale("log", base=2)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.3g}" if x < 1000 else f"{x / 1000:,.3g}k"))
+        axes.grid(color="0.9")
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+    by_n.legend(frameon=False)
+    with replacing(path) as file:
+        figure.savefig(file, format="png", metadata={"Software": None})

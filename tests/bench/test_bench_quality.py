@@ -1,0 +1,335 @@
+"""`clsplat bench quality`: what is trained and recorded, and what survives interruption and failure."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_cli import fails, run, write_dataset
+
+from clsplat.bench import quality
+from clsplat.bench.quality import (
+    differences,
+    make_cells,
+    parse_budget,
+    parse_method,
+    parse_source,
+    run_cell,
+    run_cells,
+    sample_iterations,
+)
+from clsplat.bench.results import append_record, read_records, write_records
+from clsplat.bench.summary import COSTS
+from clsplat.config import AdcConfig, DataConfig, InitConfig, TrainConfig
+from clsplat.dataset import load_scene
+from clsplat.errors import InputError
+from clsplat.formats import save_gaussians
+from clsplat.gaussians import Gaussians
+from clsplat.metrics import psnr
+from clsplat.render import render
+from clsplat.training.presets import load_preset, with_settings
+
+ITERATIONS = 12
+SMALL = {"iterations": ITERATIONS, "init": {"random_points": 150, "sh_degree": 1}}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two scenes of 9 photos, two of them held out, and two methods."""
+    folder = tmp_path_factory.mktemp("quality")
+    for name in ("one", "two"):
+        write_dataset(folder / name)
+    (folder / "plain.json").write_text(json.dumps(SMALL))
+    (folder / "capped.json").write_text(json.dumps(SMALL | {"strategy": "error", "max_gaussians": 100}))
+    return folder
+
+
+def cells_of(data: Path, *methods: str, scenes: tuple[str, ...] = ("one",)) -> list[quality.Cell]:
+    return make_cells([str(data / s) for s in scenes], [str(data / f"{m}.json") for m in methods], ["own"], [])
+
+
+class TestCells:
+    def test_a_dataset_may_say_how_its_photos_are_read(self):
+        source = parse_source("some/where/lego:background=white:test_every=4")
+        assert (source.name, source.path) == ("lego:background=white:test_every=4", Path("some/where/lego"))
+        assert source.data == DataConfig(background="white", test_every=4)
+        assert parse_source("C:/photos").path == Path("C:/photos")
+        assert parse_source("C:/photos:downscale=2").data == DataConfig(downscale=2)
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("a:downscal=2", "downscal: expected one of background"),
+            ("a:downscale=3", "downscale: expected 1, 2, 4, 8"),
+        ],
+    )
+    def test_options_that_are_none(self, text, expected):
+        with pytest.raises(InputError, match=expected):
+            parse_source(text)
+
+    def test_methods_are_presets_or_files(self, data):
+        assert parse_method("fast") == ("fast", load_preset("fast"))
+        assert parse_method(str(data / "plain.json")) == ("plain", with_settings(TrainConfig(), SMALL, ""))
+        with pytest.raises(InputError, match="expected one of"):
+            parse_method("slow")
+
+    @pytest.mark.parametrize(
+        ("text", "own", "cap"),
+        [("own", 7, 7), ("own", None, None), ("x0.5", 9, 4), ("x2", 9, 18), ("x.5", None, None), ("300", 7, 300)],
+    )
+    def test_budgets(self, text, own, cap):
+        assert parse_budget(text, own) == cap
+
+    @pytest.mark.parametrize("text", ["", "x", "x0", "-3", "0", "0.5", "x-1", "1e5", "owner"])
+    def test_budgets_that_are_none(self, text):
+        with pytest.raises(InputError, match="--budgets: expected own"):
+            parse_budget(text, 5)
+
+    def test_every_combination_once(self):
+        cells = make_cells(["a:downscale=2", "b"], ["paper-7k", "fast"], ["own", "x0.5", "1000"], [10, 20])
+        cap = load_preset("fast").max_gaussians
+        assert cap is not None
+        found = {(c.source.name, c.method, c.config.max_gaussians, c.config.iterations) for c in cells}
+        # Half of no cap is no cap: that training runs once.
+        caps = {"paper-7k": (None, 1000), "fast": (cap, cap // 2, 1000)}
+        expected = {(s, m, n, i) for s in ("a:downscale=2", "b") for m in caps for n in caps[m] for i in (10, 20)}
+        assert found == expected
+        assert len(cells) == len(expected)
+        assert [c.source.name for c in cells] == sorted(c.source.name for c in cells), "photos are read once"
+        assert all(c.config.data.downscale == (2 if c.source.name != "b" else 1) for c in cells)
+
+    def test_a_methods_own_iterations(self):
+        (cell,) = make_cells(["a"], ["paper-30k"], ["own"], [])
+        assert cell.config.iterations == 30_000
+
+    def test_names_that_would_be_one(self, tmp_path):
+        for folder in ("a", "b"):
+            (tmp_path / folder).mkdir()
+            (tmp_path / folder / "m.json").write_text("{}")
+        with pytest.raises(InputError, match="data: expected names that differ, found scene 2 times"):
+            make_cells(["a/scene", "b/scene"], ["fast"], ["own"], [])
+        with pytest.raises(InputError, match="--methods: expected names that differ, found m 2 times"):
+            make_cells(["a"], [str(tmp_path / "a" / "m.json"), str(tmp_path / "b" / "m.json")], ["own"], [])
+        with pytest.raises(InputError, match="--iterations: expected 1 or more, found 0"):
+            make_cells(["a"], ["fast"], ["own"], [0])
+
+    def test_settings_are_what_differs(self):
+        config = TrainConfig(seed=3, adc=AdcConfig(every=7), init=InitConfig(opacity=0.5))
+        assert differences(config) == {"seed": 3, "adc": {"every": 7}, "init": {"opacity": 0.5}}
+        assert with_settings(TrainConfig(), differences(config), "") == config
+
+    def test_samples_at_equal_factors(self):
+        assert sample_iterations(7000)[0] == 140
+        assert sample_iterations(7000)[-1] == 7000
+        assert len(sample_iterations(7000)) == quality.SAMPLES
+        assert np.ptp(np.diff(np.log(sample_iterations(7000)))) < 0.01
+        assert sample_iterations(1) == [1]
+
+
+@pytest.fixture(scope="module")
+def trained(data, device):
+    """A cell with its records, and the Gaussians that each was taken of."""
+    (cell,) = cells_of(data, "plain")
+    scene = load_scene(cell.source.path, cell.source.data)
+    records, states = [], []
+
+    def measured(gaussians, *arguments, real=quality.measure):
+        states.append(gaussians)
+        return real(gaussians, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(quality, "measure", measured)
+        last = run_cell(cell, scene, device, records.append)
+    assert last == records[-1]
+    return cell, scene, records, states
+
+
+class TestOneTraining:
+    def test_samples_are_where_they_should_be(self, trained):
+        _, _, records, _ = trained
+        assert [r["iteration"] for r in records] == sample_iterations(ITERATIONS)
+        assert ["fps" in r for r in records] == [False] * (len(records) - 1) + [True]
+        seconds = [r["seconds"] for r in records]
+        assert seconds == sorted(seconds) and seconds[0] > 0
+        assert all((r["train"], r["test"], r["width"], r["height"]) == (7, 2, 40, 32) for r in records)
+
+    def test_figures_are_those_of_the_gaussians(self, trained, device, tmp_path):
+        _, scene, records, states = trained
+        for record, gaussians in zip(records, states, strict=True):
+            shown = [render(gaussians, view.camera, device=device).rgb for view in scene.test]
+            expected = np.mean([psnr(rgb, view.image) for rgb, view in zip(shown, scene.test, strict=True)])
+            assert record["psnr"] == pytest.approx(expected)
+            assert 0 < record["ssim"] < 1
+            assert record["num_gaussians"] == len(gaussians)
+            for suffix in ("ply", "spz"):
+                save_gaussians(tmp_path / f"a.{suffix}", gaussians)
+                assert record[f"{suffix}_bytes"] == (tmp_path / f"a.{suffix}").stat().st_size
+        assert records[-1]["psnr"] > records[0]["psnr"]
+        assert len({record["psnr"] for record in records}) == len(records)
+
+    def test_memory_is_that_of_training(self, trained):
+        _, _, records, _ = trained
+        parameters = 4 * 150 * (11 + 3 * 4)
+        photos = 7 * 40 * 32 * 3
+        assert all(r["memory_bytes"] > 3 * parameters + photos for r in records)
+        assert [r["memory_bytes"] for r in records] == sorted(r["memory_bytes"] for r in records)
+
+    def test_time_stands_still_while_it_is_evaluated(self, trained, device, monkeypatch):
+        cell, scene, _, _ = trained
+        clock = SimpleNamespace(now=100.0)
+        monkeypatch.setattr(
+            quality, "time", SimpleNamespace(perf_counter=lambda: clock.now, process_time=lambda: clock.now)
+        )
+        monkeypatch.setattr(quality, "frames_per_second", lambda *_: 1.0)
+        some = Gaussians(*(np.zeros(0) for _ in range(5)))
+
+        def training(scene, config, device, out, *, evaluate=None, evaluate_after=(), progress=None):
+            for iteration in range(1, config.iterations + 1):
+                clock.now += 2  # an iteration takes two seconds
+                if evaluate and iteration in evaluate_after:
+                    evaluate(some)
+            return some
+
+        def measured(*_):
+            clock.now += 1000
+            return {"psnr": 1.0}
+
+        monkeypatch.setattr(quality, "train", training)
+        monkeypatch.setattr(quality, "measure", measured)
+        records = []
+        run_cell(cell, scene, device, records.append)
+        assert [r["seconds"] for r in records] == [2 * r["iteration"] for r in records]
+
+    def test_frames_per_second_is_of_the_median(self, trained, device, monkeypatch):
+        cell, scene, _, _ = trained
+        clock = SimpleNamespace(now=0.0)
+        monkeypatch.setattr(
+            quality, "time", SimpleNamespace(perf_counter=lambda: clock.now, process_time=lambda: clock.now)
+        )
+
+        def renderings(gaussians, cameras, *_, **__):
+            for i, _ in enumerate(cameras):
+                # The first round is slow, and so are a few later ones.
+                clock.now += 7.0 if i < len(scene.test) or i % 4 == 0 else 0.25
+                yield object()
+
+        monkeypatch.setattr(quality, "render_views", renderings)
+        assert quality.frames_per_second(None, scene.test, cell.config, device) == 4.0
+
+
+class TestBench:
+    def start(self, data, device, path, *methods, scenes=("one",)):
+        said = []
+        run_cells(cells_of(data, *methods, scenes=scenes), device, path, said.append)
+        return read_records(path), said
+
+    def test_what_is_there_is_not_trained_again(self, data, device, tmp_path, monkeypatch):
+        path = tmp_path / "results.jsonl"
+        records, _ = self.start(data, device, path, "plain")
+        assert {r["device"] for r in records} == {device.label}
+        for name in ("driver", "commit", "date", "settings", "scene", "method", "load"):
+            assert all(name in r for r in records), name
+        before = path.read_bytes()
+        monkeypatch.setattr(quality, "run_cell", lambda *_: pytest.fail("trained again"))
+        assert self.start(data, device, path, "plain")[0] == records
+        assert path.read_bytes() == before
+        # Nor does another cell's failure take its records.
+        monkeypatch.setattr(quality, "run_cell", lambda *_: 1 / 0)
+        again, _ = self.start(data, device, path, "plain", "capped")
+        assert again[:-1] == records
+        assert again[-1]["failed"] == "ZeroDivisionError: division by zero"
+
+    def test_what_was_interrupted_runs_anew(self, data, device, tmp_path):
+        path = tmp_path / "results.jsonl"
+        records, _ = self.start(data, device, path, "plain", "capped")
+        cut = path.read_text().rindex("\n", 0, -1)
+        path.write_text(path.read_text()[: cut + 20])  # within the last line
+        again, said = self.start(data, device, path, "plain", "capped")
+        assert said[0].startswith("1 of 2 ")
+        assert len(again) == len(records)
+        first = len([r for r in records if r["method"] == "plain"])
+        assert again[:first] == records[:first]
+        assert [r["psnr"] for r in again] == [r["psnr"] for r in records], "runs repeat to the bit"
+
+    def test_other_settings_take_the_place(self, data, device, tmp_path):
+        path = tmp_path / "results.jsonl"
+        records, _ = self.start(data, device, path, "plain")
+        (cell,) = cells_of(data, "plain")
+        run_cells([replace(cell, config=replace(cell.config, seed=1))], device, path, lambda _: None)
+        again = read_records(path)
+        assert len(again) == len(records)
+        assert all(r["settings"]["seed"] == 1 for r in again)
+
+    def test_interruption_ends_it(self, data, device, tmp_path, monkeypatch):
+        def interrupted(*_):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(quality, "run_cell", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            self.start(data, device, tmp_path / "results.jsonl", "plain")
+
+    def test_failures_are_results(self, data, device, tmp_path):
+        write_dataset(tmp_path / "corrupt")
+        photo = tmp_path / "corrupt" / "3.png"
+        photo.write_bytes(photo.read_bytes()[:100])
+        (tmp_path / "empty").mkdir()
+        path = tmp_path / "results.jsonl"
+        scenes = [
+            str(tmp_path / "corrupt"),
+            str(tmp_path / "empty"),
+            f"{data / 'one'}:test_every=0",
+            str(data / "one"),
+        ]
+        methods = [str(data / "plain.json"), str(data / "capped.json")]
+        cells = make_cells(scenes, methods, ["own"], [])
+        run_cells(cells, device, path, lambda _: None)
+        by_scene = {}
+        for r in read_records(path):
+            by_scene.setdefault(r["scene"], []).append(r)
+        assert [r["failed"].startswith("corrupt/3.png: expected") for r in by_scene["corrupt"]] == [True, True]
+        assert ["found none" in r["failed"] for r in by_scene["empty"]] == [True, True]
+        assert ["held-out" in r["failed"] for r in by_scene["one:test_every=0"]] == [True, True]
+        assert sum("fps" in r for r in by_scene["one"]) == 2
+
+    def test_memory_that_does_not_suffice_is_a_result(self, data, device, tmp_path):
+        cells = make_cells([str(data / "one")], [str(data / "plain.json")], ["own"], [], memory_limit="0.1MB")
+        run_cells(cells, device, tmp_path / "results.jsonl", lambda _: None)
+        (record,) = read_records(tmp_path / "results.jsonl")
+        assert "--memory-limit" in record["failed"]
+
+    def test_a_failure_is_tried_again(self, data, device, tmp_path, monkeypatch):
+        path = tmp_path / "results.jsonl"
+        with monkeypatch.context() as patch:
+            patch.setattr(quality, "run_cell", lambda *_: 1 / 0)
+            assert len(self.start(data, device, path, "plain")[0]) == 1
+        assert all("psnr" in r for r in self.start(data, device, path, "plain")[0])
+
+
+def test_the_file_of_results(tmp_path):
+    path = tmp_path / "results.jsonl"
+    assert read_records(path) == []
+    record = {"scene": "a", "method": "b", "max_gaussians": None, "iterations": 3, "device": "c"}
+    write_records(path, [record])
+    append_record(path, record | {"psnr": 1.5})
+    with path.open("a") as file:
+        file.write('{"scene": "a", "met')
+    assert read_records(path) == [record, record | {"psnr": 1.5}]
+    with pytest.raises(ValueError):
+        append_record(path, record | {"psnr": float("nan")})
+    path.write_text('{"scene": "a"}\n')
+    with pytest.raises(InputError, match=r"results\.jsonl, line 1: expected a record"):
+        read_records(path)
+
+
+def test_the_command(data, tmp_path, capsys, monkeypatch):
+    # A chart takes a second: of one cost is enough.
+    monkeypatch.setattr("clsplat.bench.charts_page.COSTS", {"seconds": COSTS["seconds"]})
+    run("bench", "quality", data / "one", "--methods", data / "plain.json", "-o", tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"results.jsonl", "index.html", "time-psnr.png", "time-psnr.svg", "published-ssim.svg"} <= names
+    assert "    " in capsys.readouterr().err
+    assert "--budgets" in fails(capsys, "bench", "quality", data / "one", "--budgets", "half", "-o", tmp_path / "no")
+    assert "results.jsonl" in fails(capsys, "bench", "chart", tmp_path)
+    assert not (tmp_path / "no").exists()

@@ -1,0 +1,90 @@
+"""The viewer as commands open it."""
+
+# ruff: noqa: F811 (a fixture is imported and then named as an argument)
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import TRAIN, dataset, fails, run, trained  # noqa: F401  (fixtures)
+
+from clsplat.config import DataConfig
+from clsplat.dataset import load_scene
+from clsplat.formats import FORMATS, load_gaussians, save_gaussians
+from clsplat.gaussians import Gaussians
+
+
+@pytest.fixture
+def held(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Gaussians]]:
+    """What viewers hold, with the text of their panel; each is left by Ctrl-C at once."""
+    pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
+    from clsplat.show.viewer import Viewer
+
+    seen: list[tuple[str, Gaussians]] = []
+
+    def hold(self: Viewer, gaussians: Gaussians, until: object = None) -> None:
+        seen.append((self._facts, gaussians))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "hold", hold)
+    return seen
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_view_opens_every_format(
+    trained: Path, tmp_path: Path, held: list[tuple[str, Gaussians]], suffix: str
+) -> None:
+    scene = tmp_path / f"scene{suffix}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what the format cannot hold
+        run("export", trained / "scene.ply", scene)
+    run("view", scene, "--port", 18090)
+    ((facts, gaussians),) = held
+    assert scene.name in facts
+    for name, array in load_gaussians(scene)[0].arrays().items():
+        np.testing.assert_array_equal(gaussians.arrays()[name], array)
+
+
+def test_view_goes_to_the_photos(
+    trained: Path, dataset: Path, tmp_path: Path, held: list[tuple[str, Gaussians]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from clsplat.show.viewer import Viewer
+
+    made: list[tuple[object, ...]] = []
+    start = Viewer.__init__
+
+    def watched(self: Viewer, *arguments: object, **options: object) -> None:
+        made.append(arguments)
+        start(self, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Viewer, "__init__", watched)
+    gaussians = load_gaussians(trained / "scene.ply")[0]
+    save_gaussians(tmp_path / "scene.ply", gaussians, offset=(10.0, 0.0, 0.0))  # the dataset's is 0
+    run("view", tmp_path / "scene.ply", "--data", dataset, "--port", 18090)
+    scene = load_scene(dataset, DataConfig())
+    _, _, viewpoint, views, _ = made[0]
+    assert len(views) == 9
+    np.testing.assert_array_equal(viewpoint.camera.viewmat, scene.train[0].camera.viewmat)
+    np.testing.assert_allclose(held[0][1].means, gaussians.means + np.float32([10, 0, 0]), rtol=1e-6)
+
+
+def test_train_with_a_viewer_ends_with_the_same_bits_and_stays_open(
+    trained: Path, dataset: Path, tmp_path: Path, held: list[tuple[str, Gaussians]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from clsplat.show.viewer import Viewer
+
+    sizes: list[int] = []
+    monkeypatch.setattr(Viewer, "follow", lambda self, gaussians, interrupted: sizes.append(len(gaussians)))
+    run("train", dataset, "-o", tmp_path / "out", "--viewer", *TRAIN)
+    ((facts, gaussians),) = held
+    assert sizes == [200] * 20, "every iteration is shown"
+    assert "20 of 20" in facts and f"{len(gaussians):,}" in facts and "PSNR" in facts
+    assert (tmp_path / "out" / "scene.ply").read_bytes() == (trained / "scene.ply").read_bytes()
+
+
+def test_a_missing_viewer_is_a_sentence(
+    trained: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert "pip install 'clsplat[viewer]'" in fails(capsys, "view", trained / "scene.ply")

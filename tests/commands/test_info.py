@@ -1,0 +1,155 @@
+"""What `clsplat info` says about files of every format, runs and datasets."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clsplat.cli import main
+from clsplat.formats import FORMATS, save_gaussians
+from clsplat.formats.anatomy import ANATOMIES
+from clsplat.testing import synthetic_scene
+
+N = 300
+
+
+def info(path, capsys):
+    """The table's rows by name, and all of the text."""
+    main(["info", str(path)])
+    text = capsys.readouterr().out
+    rows = (line.strip().split("  ", 1) for line in text.splitlines() if line.startswith("  "))
+    return {name: value.strip() for name, value in rows}, text
+
+
+@pytest.fixture
+def gaussians():
+    scene = synthetic_scene(N, seed=2, sh_degree=2)[0].astype(np.float32)
+    scene.means[0] = -7, 1, 0
+    scene.means[1] = 5, 3, 2
+    scene.means[2:] = np.clip(scene.means[2:], -2, 2)
+    scene.means[2:, 1] = np.clip(scene.means[2:, 1], 1, 2)
+    scene.means[2:, 2] = np.clip(scene.means[2:, 2], 0, 2)
+    return scene
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_every_format_tells_what_it_holds(gaussians, suffix, tmp_path, capsys):
+    path = tmp_path / f"a{suffix}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what the format cannot hold
+        save_gaussians(path, gaussians, "antialiased", (1000, 0, -20))
+    rows, text = info(path, capsys)
+    anatomy = ANATOMIES[suffix](path)
+    assert rows["format"] == anatomy.format
+    assert rows["Gaussians"] == f"{N}"
+    assert rows["sh degree"] == ("0" if suffix == ".splat" else "2")
+    assert rows["mode"] == ("classic" if suffix == ".splat" else "antialiased")
+    low, high = (np.array(eval(end)) for end in rows["bounds"].split(" to "))
+    np.testing.assert_allclose([low, high], [[-7, 1, 0], [5, 3, 2]], atol=0.02)
+    assert ("offset" in rows) == (suffix in (".ply", ".compressed.ply", ".sog"))
+    if "offset" in rows:
+        assert rows["offset"].startswith("(1000, 0, -20)")
+    # The parts are all of the file, but for the ZIP's directory and the headers of compressed files.
+    whole = sum(anatomy.parts.values())
+    if anatomy.packed:
+        assert whole == N * (9 + 1 + 3 + 3 + 4 + 24)
+    else:
+        assert 0 <= path.stat().st_size - whole <= (2000 if suffix == ".sog" else 0)
+    for name in anatomy.parts:
+        assert f"\n  {name} " in text
+
+
+def test_comments_are_shown(gaussians, tmp_path, capsys):
+    save_gaussians(tmp_path / "a.ply", gaussians, "antialiased")
+    assert info(tmp_path / "a.ply", capsys)[0]["comments"] == "SplatRenderMode: mip"
+
+
+def test_parts_of_a_ply(gaussians, tmp_path):
+    save_gaussians(tmp_path / "a.ply", gaussians)
+    parts = ANATOMIES[".ply"](tmp_path / "a.ply").parts
+    assert parts.pop("header") > 100
+    assert parts == {
+        **{"means": 12 * N, "normals, unused": 12 * N, "colours (sh of band 0)": 12 * N, "sh above band 0": 96 * N},
+        **{"opacities": 4 * N, "scales": 12 * N, "quaternions": 16 * N},
+    }
+
+
+def test_histograms_count_every_gaussian(gaussians, tmp_path, capsys):
+    gaussians.logit_opacities[:100] = 10
+    gaussians.logit_opacities[100:] = -10
+    gaussians.log_scales[:] = np.log(0.5)
+    save_gaussians(tmp_path / "a.ply", gaussians)
+    rows, text = info(tmp_path / "a.ply", capsys)
+    assert rows["0.9 to 1"].split("  ") == ["33.3 %", "#" * 20]
+    assert rows["0 to 0.1"].split("  ") == ["66.7 %", "#" * 40]
+    sizes = text.split("size: geometric")[1]
+    assert sizes.count("100.0 %") == 1 and sizes.count(" 0.0 %") == 9
+
+
+def test_an_unpacked_sog(gaussians, tmp_path, capsys):
+    import zipfile
+
+    save_gaussians(tmp_path / "a.sog", gaussians)
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(tmp_path / "unpacked")
+    (tmp_path / "unpacked" / "notes.txt").write_text("not the scene's")
+    for path in (tmp_path / "unpacked", tmp_path / "unpacked" / "meta.json"):
+        rows, text = info(path, capsys)
+        assert (
+            rows["format"] == "SOG (PlayCanvas), version 2, in a folder" and rows["comments"] == "generator: clsplat"
+        )
+        assert "notes.txt" not in text and "0.0 bytes" not in rows["size"]
+
+
+def test_a_run(gaussians, tmp_path, capsys):
+    record = {"iteration": 30, "num_gaussians": 123, "seconds": 4.2, "loss": 0.1, "psnr": 21.5}
+    (tmp_path / "log.jsonl").write_text(json.dumps(record) + "\n")
+    (tmp_path / "config.json").write_text(json.dumps({"iterations": 40}))
+    rows, _ = info(tmp_path, capsys)
+    assert rows["iterations"] == "30 of 40" and rows["held-out PSNR"] == "21.50 dB" and rows["Gaussians"] == "123"
+    assert "--resume" in rows["scene.ply"]
+    save_gaussians(tmp_path / "scene.ply", gaussians)
+    rows, _ = info(tmp_path, capsys)
+    assert "scene.ply" not in rows and rows["Gaussians"] == f"{N}" and rows["iterations"] == "30 of 40"
+    (tmp_path / "config.json").write_text("[")
+    with pytest.raises(SystemExit):
+        main(["info", str(tmp_path)])
+    assert "config.json: expected the settings of a run" in capsys.readouterr().err
+
+
+def test_photos_and_transforms(tmp_path, capsys):
+    for k, width in enumerate((40, 40, 30)):
+        Image.new("RGB", (width, 20)).save(tmp_path / f"{k}.png")
+    rows, _ = info(tmp_path, capsys)
+    assert rows == {
+        "what": "photos without cameras: train, or sfm, finds them",
+        **{"photos": "3", "sizes": "2 of 40x20, 1 of 30x20"},
+    }
+    pose = np.eye(4).tolist()
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose} for k in range(2)]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "w": 40, "h": 20, "frames": frames}))
+    rows, _ = info(tmp_path, capsys)
+    assert rows["what"] == "transforms.json" and rows["poses"] == "2" and rows["points"] == "0"
+    assert rows["cameras"] == "2 of PINHOLE 40x20" and rows["sizes"] == "2 of 40x20"
+
+
+def test_a_colmap_model(shared, capsys):
+    rows, _ = info(shared / "data" / "castle_p30", capsys)
+    assert rows["what"] == "COLMAP model" and rows["poses"] == "30" and rows["sizes"] == "30 of 768x512"
+    assert rows["cameras"] == "30 of PINHOLE 768x512" and rows["points"] == "12,914"
+    rows, _ = info(shared / "data" / "fox", capsys)
+    assert rows["photos"] == "0" and rows["smaller copies"].startswith("50 in images_2")
+
+
+def test_what_is_nothing_is_said(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    for path, found in ((tmp_path / "none", "found nothing"), (tmp_path / "empty", "neither photos nor cameras")):
+        with pytest.raises(SystemExit):
+            main(["info", str(path)])
+        assert found in capsys.readouterr().err
+
+
+def test_every_format_has_an_anatomy():
+    assert list(ANATOMIES) == list(FORMATS)

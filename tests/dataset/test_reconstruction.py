@@ -1,0 +1,325 @@
+"""Structure from motion on rendered photos whose cameras are known, and what becomes of its model on disk."""
+
+import json
+import os
+import re
+import shutil
+import tempfile
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from clsplat.camera import Camera
+from clsplat.config import DataConfig, SfmConfig
+from clsplat.dataset import load_scene
+from clsplat.dataset.colmap import read_model
+from clsplat.dataset.lenses import Intrinsics, is_pinhole, undistorted
+from clsplat.dataset.sfm import reconstruction as sfm
+from clsplat.dataset.sfm.reconstruction import RECORD, read_record, reconstruct
+from clsplat.errors import InputError
+
+CONFIG = SfmConfig(camera_model="SIMPLE_RADIAL")
+FILES = ["cameras.bin", "images.bin", "points3D.bin"]
+
+
+def cameras():
+    """Four cameras in front of a corner, some 11 degrees apart."""
+    eyes = [(3.2 * np.cos(a), 3.2 * np.sin(a), 1.6 + 0.3 * (k % 2)) for k, a in enumerate(np.linspace(0.5, 1.1, 4))]
+    return [Camera.look_at(eye, (0.4, 0.4, 0.4), (0, 0, 1), 300, 320, 240) for eye in eyes]
+
+
+def corner(camera, textures):
+    """Photo of the three planes x = 0, y = 0, z = 0, each with a texture of 160 pixels per unit."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = camera.rays(x, y) @ camera.viewmat[:3, :3]
+    reach = np.where(rays < 0, -camera.position / rays, np.inf)
+    plane, hit = reach.argmin(axis=-1), camera.position + rays * reach.min(axis=-1)[..., None]
+    photo = np.zeros((*x.shape, 3))
+    for axis in range(3):
+        on = plane == axis
+        at = 160 * np.delete(hit[on], axis, axis=1).T
+        for channel in range(3):
+            photo[on, channel] = map_coordinates(textures[axis][..., channel], at, order=1, mode="grid-wrap")
+    return np.rint(photo).astype(np.uint8)
+
+
+def take_photos(seed, seen_by=None):
+    """What the four cameras, or others, see of a corner with textures of its own."""
+    rng = np.random.default_rng(seed)
+    textures = []
+    for _ in range(3):
+        layers = [s * gaussian_filter(rng.normal(size=(512, 512, 3)), (s, s, 0), mode="wrap") for s in (1.5, 4, 12)]
+        textures.append(np.clip(127 + 60 * sum(layers) / np.std(sum(layers)), 0, 255))
+    return [corner(camera, textures) for camera in seen_by or cameras()]
+
+
+@pytest.fixture(scope="session")
+def photos():
+    """What the four cameras see, as arrays."""
+    return take_photos(0)
+
+
+@pytest.fixture(scope="session")
+def solved(photos, tmp_path_factory):
+    """Folder of the photos with their model; not to be changed."""
+    folder = tmp_path_factory.mktemp("solved")
+    for k, photo in enumerate(photos):
+        Image.fromarray(photo).save(folder / f"photo {k}.png")
+    assert reconstruct(folder, CONFIG) == folder / "sparse" / "0"
+    return folder
+
+
+@pytest.fixture
+def copy(solved, tmp_path):
+    """A copy of `solved`, to be changed."""
+    return shutil.copytree(solved, tmp_path / "copy")
+
+
+@pytest.fixture
+def runs(solved, monkeypatch):
+    """Replaces the minutes of work by the model of `solved`; counts how often it was asked for."""
+    import pycolmap
+
+    asked = []
+
+    def largest_model(folder, names, work, config, verbose):
+        asked.append(names)
+        return pycolmap.Reconstruction(solved / "sparse" / "0")
+
+    monkeypatch.setattr(sfm, "_largest_model", largest_model)
+    return asked
+
+
+def test_known_cameras_are_recovered(solved):
+    scene = load_scene(solved, DataConfig(test_every=0))
+    assert [view.name for view in scene.train] == [f"photo {k}.png" for k in range(4)]
+    found, true = (np.array([c.position for c in cs]) for cs in ([v.camera for v in scene.train], cameras()))
+    found, true = found - found.mean(axis=0), true - true.mean(axis=0)
+    u, s, vt = np.linalg.svd(true.T @ found)  # Umeyama 1991
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation, scale = u @ sign @ vt, np.trace(np.diag(s) @ sign) / (found**2).sum()
+    # Seen: 0.06 %. A pixel at this focal length is 0.3 % of the distance.
+    assert (
+        np.linalg.norm(scale * found @ rotation.T - true, axis=1).max() < 0.003 * np.linalg.norm(true, axis=1).max()
+    )
+    for view, camera in zip(scene.train, cameras(), strict=True):
+        relative = view.camera.viewmat[:3, :3] @ rotation.T @ camera.viewmat[:3, :3].T
+        assert np.degrees(np.arccos(min((np.trace(relative) - 1) / 2, 1))) < 0.2
+        assert view.camera.fx == pytest.approx(300, rel=0.01)
+    assert len(scene.points) > 500 and scene.colors.std() > 20
+
+
+def test_the_world_is_upright(solved):
+    scene = load_scene(solved, DataConfig(test_every=0))
+    down = np.mean([view.camera.viewmat[1, :3] for view in scene.train], axis=0)
+    np.testing.assert_allclose(down / np.linalg.norm(down), [0, 1, 0], atol=1e-9)
+
+
+def test_nothing_but_model_and_record_stays(solved):
+    assert sorted(os.listdir(solved)) == [*(f"photo {k}.png" for k in range(4)), "sparse"]
+    assert sorted(os.listdir(solved / "sparse")) == ["0", RECORD]
+    record = read_record(solved)
+    assert record["photos"] == "." and record["registered"] == 4
+    assert SfmConfig(**record["options"]) == CONFIG and sorted(record["hashes"]) == [
+        f"photo {k}.png" for k in range(4)
+    ]
+
+
+def test_unlike_photos_are_turned_first_and_give_the_same_model(solved, photos, tmp_path, capfd):
+    """EXIF orientation and transparency: structure from motion sees the pixels that training sees."""
+    folder = tmp_path / "images"  # one level up counts as the dataset
+    folder.mkdir()
+    for k, (photo, tag) in enumerate(zip(photos, (6, 3, 1, 1), strict=True)):
+        stored = {6: photo[:, ::-1].swapaxes(0, 1), 3: photo[::-1, ::-1], 1: photo}[tag]
+        if k == 2:
+            stored = np.dstack([stored, np.full(stored.shape[:2], 255, np.uint8)])
+        exif = Image.Exif()
+        exif[0x0112] = tag
+        Image.fromarray(stored).save(folder / f"photo {k}.png", exif=exif)
+    model = reconstruct(tmp_path, CONFIG)
+    # The same pixels and the same seed: on one machine the same bytes.
+    for name in FILES:
+        assert (model / name).read_bytes() == (solved / "sparse" / "0" / name).read_bytes()
+    scene = load_scene(tmp_path, DataConfig(test_every=0))
+    plain = load_scene(solved, DataConfig(test_every=0))
+    for view, other in zip(scene.train, plain.train, strict=True):
+        np.testing.assert_array_equal(view.image, other.image)
+        np.testing.assert_array_equal(view.camera.viewmat, other.camera.viewmat)
+    err = capfd.readouterr().err
+    for stage in ("check photos", "features", "matches", "poses"):
+        assert stage in err
+    assert not re.search(r"^[IWE]\d{8} ", err, re.MULTILINE)  # COLMAP's log
+
+
+def test_a_fresh_model_is_reused(copy, runs):
+    before = (copy / "sparse" / "0" / "images.bin").stat().st_mtime_ns
+    assert reconstruct(copy, CONFIG) == copy / "sparse" / "0"
+    os.utime(copy / "photo 0.png")  # copied or touched, not changed
+    load_scene(copy, DataConfig())
+    assert not runs and (copy / "sparse" / "0" / "images.bin").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("change", ["changed", "added", "removed", "options", "lost"])
+def test_a_stale_model_is_redone(copy, runs, change):
+    config = CONFIG
+    if change == "changed":
+        Image.new("RGB", (320, 240)).save(copy / "photo 1.png")
+    elif change == "added":
+        shutil.copy(copy / "photo 1.png", copy / "photo 9.png")
+    elif change == "removed":
+        (copy / "photo 1.png").unlink()
+    elif change == "options":
+        config = SfmConfig(camera_model="SIMPLE_RADIAL", matching="sequential")
+    else:
+        (copy / "sparse" / "0" / "images.bin").unlink()
+    reconstruct(copy, config)
+    assert len(runs) == 1
+    reconstruct(copy, config)
+    assert len(runs) == 1
+    assert sorted(os.listdir(copy / "sparse")) == ["0", RECORD]
+
+
+def test_loading_notices_changed_photos_and_keeps_the_options(copy, runs):
+    Image.new("RGB", (320, 240)).save(copy / "photo 1.png")
+    load_scene(copy, DataConfig())
+    assert len(runs) == 1 and SfmConfig(**read_record(copy)["options"]) == CONFIG
+    load_scene(copy, DataConfig(sfm=SfmConfig(max_image_size=200)))
+    assert len(runs) == 2 and read_record(copy)["options"]["max_image_size"] == 200
+
+
+def test_the_model_can_be_put_elsewhere(solved, tmp_path, runs):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for k in range(4):
+        shutil.copy(solved / f"photo {k}.png", photos)
+    output = tmp_path / "deep" / "model"
+    assert reconstruct(photos, CONFIG, output) == output / "sparse" / "0"
+    assert len(os.listdir(photos)) == 4
+    scene = load_scene(output, DataConfig(test_every=0))
+    beside = load_scene(solved, DataConfig(test_every=0))
+    np.testing.assert_array_equal(scene.train[2].image, beside.train[2].image)
+    shutil.rmtree(photos)
+    with pytest.raises(InputError, match=r"photos.*nothing"):
+        load_scene(output, DataConfig())
+
+
+def test_too_few_poses_are_refused_and_leave_nothing(tmp_path):
+    rng = np.random.default_rng(1)
+    for k in range(3):
+        Image.fromarray(rng.integers(0, 256, (96, 128, 3)).astype(np.uint8)).save(tmp_path / f"{k}.png")
+    with pytest.raises(InputError, match=r"at least 3 photos, found those of 0 of 3.*overlap"):
+        reconstruct(tmp_path, CONFIG)
+    assert sorted(os.listdir(tmp_path)) == ["0.png", "1.png", "2.png"]
+
+
+def test_a_cached_model_must_have_enough_poses_too(copy, runs):
+    shutil.copy(copy / "photo 3.png", copy / "photo 4.png")
+    reconstruct(copy, CONFIG)  # by `runs`, a model of 4 photos
+    with pytest.raises(InputError, match="at least 5 photos, found those of 4 of 5"):
+        reconstruct(copy, SfmConfig(camera_model="SIMPLE_RADIAL", min_registered=5))
+    assert len(runs) == 1
+
+
+def test_of_two_models_the_larger_is_taken(photos, tmp_path):
+    for k, photo in enumerate(take_photos(1)[:3]):
+        Image.fromarray(photo).save(tmp_path / f"a{k}.png")
+    for k, photo in enumerate(photos):
+        Image.fromarray(photo).save(tmp_path / f"b{k}.png")
+    _, images, _, _ = read_model(reconstruct(tmp_path, CONFIG))
+    assert sorted(name for name, _, _ in images) == ["b0.png", "b1.png", "b2.png", "b3.png"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"matching": "random"}, "matching"),
+        ({"camera_model": "PINBALL"}, "camera_model.*SIMPLE_RADIAL"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model"),
+        ({"max_image_size": 0}, "max_image_size"),
+    ],
+)
+def test_bad_options_are_refused(solved, options, message):
+    with pytest.raises(InputError, match=message):
+        reconstruct(solved, SfmConfig(**options))
+
+
+def test_a_photo_of_one_row_is_refused(copy):
+    """COLMAP reduces it to none, and dies."""
+    Image.fromarray(np.zeros((1, 4000, 3), np.uint8)).save(copy / "row.png")
+    with pytest.raises(InputError, match=r"row\.png: expected a photo at most .* found 4000x1"):
+        reconstruct(copy, CONFIG)
+
+
+def test_folders_that_cannot_be_used_are_refused(solved, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="expected at least 3 photos, found 0"):
+        reconstruct(tmp_path, CONFIG)
+    with pytest.raises(InputError, match=r"absent.*nothing"):
+        reconstruct(tmp_path / "absent", CONFIG)
+    for k in range(4):
+        shutil.copy(solved / f"photo {k}.png", tmp_path)
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patch:  # the tests may run as root, who may write anywhere
+        patch.setattr(tempfile, "mkdtemp", refuse)
+        with pytest.raises(InputError, match=r"Permission denied.*copy the photos.*-o DIR"):
+            reconstruct(tmp_path, CONFIG)
+    (tmp_path / "photo 2.png").write_bytes(b"no photo")
+    with pytest.raises(InputError, match=r"photo 2\.png"):
+        reconstruct(tmp_path, CONFIG)
+    assert len(os.listdir(tmp_path)) == 4
+    (tmp_path / "sparse").mkdir()
+    with pytest.raises(InputError, match="one of others"):
+        reconstruct(tmp_path, CONFIG)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", json.dumps({"options": {"speed": 9}, "hashes": {}, "registered": 1})]
+)
+def test_damaged_records_are_refused_by_name(tmp_path, text):
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "sparse" / RECORD).write_text(text)
+    with pytest.raises(InputError, match=rf"{RECORD}.*delete"):
+        read_record(tmp_path)
+
+
+def test_portrait_and_landscape_are_two_cameras(tmp_path, photos):
+    """COLMAP's one camera has one size and would drop the other photos without a word."""
+    for k, photo in enumerate(photos):
+        Image.fromarray(photo[:, 40:280] if k in (1, 2) else photo).save(tmp_path / f"{k}.png")
+    cameras, images, _, _ = read_model(reconstruct(tmp_path, CONFIG))
+    assert sorted((camera.width, camera.height) for camera in cameras.values()) == [(240, 240), (320, 240)]
+    assert len(images) == 4
+
+
+def test_lenses_without_distortion_keep_their_size():
+    for model, params in [
+        ("PINHOLE", (50.0, 51.0, 32.0, 24.0)),
+        ("SIMPLE_PINHOLE", (50.0, 32.0, 24.0)),
+        ("OPENCV", (50.0, 51.0, 32.0, 24.0, 0.0, 0.0, 0.0, 0.0)),
+        ("RADIAL", (50.0, 32.0, 24.0, 0.0, 0.0)),
+    ]:
+        intrinsics = Intrinsics(model, params, 64, 48)
+        pinhole = undistorted(intrinsics)
+        assert is_pinhole(intrinsics) and (pinhole.model, pinhole.width, pinhole.height) == ("PINHOLE", 64, 48)
+        assert pinhole.params == (50, 51 if 51 in params else 50, 32, 24)
+    assert not is_pinhole(Intrinsics("OPENCV_FISHEYE", (50.0, 51.0, 32.0, 24.0, 0.0, 0.0, 0.0, 0.0), 64, 48))
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+def test_a_real_facade_is_recovered(shared, tmp_path):
+    """All of sceaux's photos get a pose, which agrees with the poses that come with the scene."""
+    for file in (shared / "data" / "sceaux" / "images").iterdir():
+        with Image.open(file) as image:
+            image.resize((480, 355), Image.Resampling.BOX).save(tmp_path / file.name, quality=95)
+    found = load_scene(tmp_path, DataConfig(test_every=0)).train
+    given = load_scene(shared / "data" / "sceaux", DataConfig(test_every=0)).train
+    assert [view.name for view in found] == [view.name for view in given]
+    one, other = (np.array([view.camera.position for view in views]) for views in (found, given))
+    one, other = (points - points.mean(axis=0) for points in (one, other))
+    correlation = np.linalg.svd(one.T @ other)[1].sum() / np.linalg.norm(one) / np.linalg.norm(other)
+    assert correlation > 0.9999  # 1 for two point sets that differ by a similarity; 1 % of noise gives 0.99995

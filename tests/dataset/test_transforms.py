@@ -1,0 +1,360 @@
+"""transforms.json in its dialects: known cameras come back, and what cannot be right is refused."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.lib.recfunctions import repack_fields
+from PIL import Image
+
+from clsplat.camera import Camera
+from clsplat.config import DataConfig
+from clsplat.dataset import load_scene
+from clsplat.dataset.lenses import Intrinsics
+from clsplat.dataset.transforms import read_dataset
+from clsplat.errors import InputError
+
+CAMERAS = [
+    Camera.look_at(eye, (0, 0, 0), (0, 0, 1), 50, 64, 48) for eye in [(3, 0, 1), (0, 3, 1), (-3, 0, 1), (0, -3, 1)]
+]
+NAMES = ["images/0.png", "images/1.png", "images/2.png", "images/3.png"]
+
+
+def opengl(camera):
+    """Camera to world, x right, y up, z back."""
+    return (np.linalg.inv(camera.viewmat) @ np.diag([1, -1, -1, 1])).tolist()
+
+
+def frames(names=NAMES):
+    return [{"file_path": n, "transform_matrix": opengl(c)} for n, c in zip(names, CAMERAS, strict=False)]
+
+
+def write(root, name="transforms.json", names=NAMES, **fields):
+    (root / name).write_text(json.dumps({"frames": frames(names), **fields}))
+
+
+def write_photos(root, names=NAMES, size=(64, 48), mode="RGB"):
+    for k, name in enumerate(names):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new(mode, size, (k, 100, 200, 0) if mode == "RGBA" else (k, 100, 200)).save(root / name)
+
+
+@pytest.fixture
+def root(tmp_path):
+    """A folder with four photos."""
+    write_photos(tmp_path)
+    return tmp_path
+
+
+def intrinsics_of(root, downscale=1):
+    return read_dataset(root, DataConfig(downscale=downscale)).photos[0].intrinsics
+
+
+def test_poses_become_opencv_world_to_camera(root):
+    write(root, fl_x=50)
+    scene = load_scene(root, DataConfig(test_every=0))
+    assert [view.name for view in scene.train] == NAMES and not scene.test
+    for view, camera in zip(scene.train, CAMERAS, strict=True):
+        np.testing.assert_allclose(view.camera.viewmat, camera.viewmat, atol=1e-12)
+        np.testing.assert_allclose(view.camera.position, camera.position, atol=1e-12)
+        assert (view.camera.fx, view.camera.cx, view.camera.cy) == (50, 32, 24)
+    assert scene.points.shape == (0, 3)
+
+
+def test_matrices_of_three_rows_are_the_same(root):
+    rows = [{**frame, "transform_matrix": frame["transform_matrix"][:3]} for frame in frames()]
+    (root / "transforms.json").write_text(json.dumps({"frames": rows, "fl_x": 50}))
+    np.testing.assert_allclose(read_dataset(root, DataConfig()).photos[1].viewmat, CAMERAS[1].viewmat, atol=1e-12)
+
+
+def test_blender_angle_and_names_without_ending(tmp_path):
+    names = ["train/r_0.png", "train/r_1.png", "test/r_0.png"]
+    write_photos(tmp_path, names, mode="RGBA")
+    angle = 2 * np.arctan(32 / 50)
+    write(tmp_path, "transforms_train.json", ["./train/r_0", "./train/r_1"], camera_angle_x=angle)
+    write(tmp_path, "transforms_test.json", ["./test/r_0"], camera_angle_x=angle)
+    scene = load_scene(tmp_path, DataConfig(background="white", test_every=1))
+    assert [view.name for view in scene.train] == names[:2] and [view.name for view in scene.test] == names[2:]
+    np.testing.assert_allclose([scene.train[0].camera.fx, scene.train[0].camera.fy], 50)
+    assert (scene.train[0].image == 255).all()  # transparent: the background
+
+
+def test_validation_photos_are_held_out_where_there_are_no_test_photos(tmp_path):
+    names = ["train/0.png", "val/0.png", "test/0.png"]
+    write_photos(tmp_path, names)
+    for part in ("train", "val"):
+        write(tmp_path, f"transforms_{part}.json", [f"{part}/0"], fl_x=50)
+    assert [view.name for view in load_scene(tmp_path, DataConfig()).test] == ["val/0.png"]
+    write(tmp_path, "transforms_test.json", ["test/0"], fl_x=50)
+    assert [view.name for view in load_scene(tmp_path, DataConfig()).test] == ["test/0.png"]
+
+
+def test_nerfstudios_split_is_kept(root):
+    write(root, fl_x=50, train_filenames=NAMES[:2], val_filenames=NAMES[2:3], test_filenames=NAMES[3:])
+    scene = load_scene(root, DataConfig())
+    assert [view.name for view in scene.test] == NAMES[2:]
+
+
+def test_frames_have_intrinsics_of_their_own(root):
+    rows = frames()
+    rows[0] |= {"fl_x": 70, "fl_y": 71, "cx": 30, "cy": 20}
+    (root / "transforms.json").write_text(json.dumps({"frames": rows, "fl_x": 50, "w": 64.0, "h": 48.0}))
+    first, second, *_ = (photo.intrinsics for photo in read_dataset(root, DataConfig()).photos)
+    assert first == Intrinsics("PINHOLE", (70, 71, 30, 20), 64, 48)
+    assert second == Intrinsics("PINHOLE", (50, 50, 32, 24), 64, 48)
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"fl_x": 50, "fl_y": 60}, (50, 60)),
+        ({"fl_x": 50}, (50, 50)),
+        ({"fl_y": 60}, (60, 60)),
+        ({"fl_x": 50, "camera_angle_x": 3.0}, (50, 50)),
+        ({"camera_angle_x": 2 * np.arctan(0.5), "camera_angle_y": 2 * np.arctan(0.25)}, (64, 96)),
+    ],
+)
+def test_focal_lengths(root, fields, expected):
+    write(root, **fields)
+    np.testing.assert_allclose(intrinsics_of(root).params[:2], expected)
+
+
+@pytest.mark.parametrize(
+    ("fields", "model", "coefficients"),
+    [
+        ({"camera_model": "SIMPLE_PINHOLE", "k1": 0}, "PINHOLE", ()),
+        ({"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}, "FULL_OPENCV", (0.1, 0.2, 0.3, 0.4, 0, 0, 0, 0)),
+        ({"camera_model": "OPENCV", "k1": 0.1, "k3": 0.5}, "FULL_OPENCV", (0.1, 0, 0, 0, 0.5, 0, 0, 0)),
+        ({"camera_model": "SIMPLE_RADIAL", "k1": 0.1}, "FULL_OPENCV", (0.1, 0, 0, 0, 0, 0, 0, 0)),
+        ({"camera_model": "FULL_OPENCV", "k4": 0.1, "k6": 0.2}, "FULL_OPENCV", (0, 0, 0, 0, 0, 0.1, 0, 0.2)),
+        (
+            {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4},
+            "OPENCV_FISHEYE",
+            (0.1, 0.2, 0.3, 0.4),
+        ),
+        ({"is_fisheye": True}, "OPENCV_FISHEYE", (0, 0, 0, 0)),
+    ],
+)
+def test_distortion_becomes_a_colmap_model(root, fields, model, coefficients):
+    write(root, fl_x=50, **fields)
+    assert intrinsics_of(root) == Intrinsics(model, (50, 50, 32, 24, *coefficients), 64, 48)
+
+
+def test_smaller_copies_keep_the_declared_intrinsics(tmp_path):
+    write_photos(tmp_path, [name.replace("images", "images_2") for name in NAMES], (32, 24))
+    write(tmp_path, fl_x=50, cx=33, cy=25, w=64, h=48)
+    camera = load_scene(tmp_path, DataConfig(downscale=2)).train[0].camera
+    assert (camera.fx, camera.cx, camera.cy, camera.width, camera.height) == (25, 16.5, 12.5, 32, 24)
+    with pytest.raises(InputError, match="downscale 2"):
+        load_scene(tmp_path, DataConfig())
+
+
+@pytest.mark.parametrize("fields", [{"fl_x": 50}, {"camera_angle_x": 2 * np.arctan(32 / 50)}])
+def test_intrinsics_without_a_size_belong_to_the_full_size(tmp_path, fields):
+    write_photos(tmp_path, [name.replace("images", "images_2") for name in NAMES], (32, 24))
+    write(tmp_path, **fields)
+    np.testing.assert_allclose(load_scene(tmp_path, DataConfig(downscale=2)).train[0].camera.fx, 25)
+
+
+def test_reduced_photos_have_reduced_cameras(root):
+    write(root, fl_x=50)
+    camera = load_scene(root, DataConfig(downscale=4)).train[0].camera
+    assert (camera.fx, camera.cx, camera.width, camera.height) == (12.5, 8, 16, 12)
+
+
+def test_frames_without_a_file_are_counted_in_one_warning(root):
+    (root / NAMES[1]).unlink()
+    (root / NAMES[2]).unlink()
+    write(root, fl_x=50)
+    with pytest.warns(UserWarning, match="2 of 4") as caught:
+        dataset = read_dataset(root, DataConfig())
+    assert len(caught) == 1 and [photo.name for photo in dataset.photos] == [NAMES[0], NAMES[3]]
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_points_come_from_the_ply(root, binary):
+    from plyfile import PlyData, PlyElement
+
+    dtype = [(axis, "f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
+    vertices = np.array([(1, 2, 3, 4, 5, 6), (-1, 0, 0.5, 255, 0, 7)], dtype=dtype)
+    PlyData([PlyElement.describe(vertices, "vertex")], text=not binary).write(root / "points.ply")
+    write(root, fl_x=50, ply_file_path="points.ply")
+    dataset = read_dataset(root, DataConfig())
+    np.testing.assert_array_equal(dataset.points, [[1, 2, 3], [-1, 0, 0.5]])
+    np.testing.assert_array_equal(dataset.colors, [[4, 5, 6], [255, 0, 7]])
+    PlyData([PlyElement.describe(repack_fields(vertices[["x", "y", "z"]]), "vertex")]).write(root / "points.ply")
+    np.testing.assert_array_equal(read_dataset(root, DataConfig()).colors, np.full((2, 3), 128))
+    vertices["x"] = np.nan
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(root / "points.ply")
+    with pytest.raises(InputError, match=r"points\.ply.*finite"):
+        read_dataset(root, DataConfig())
+
+
+PLY_HEADER = b"ply\nformat %s 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n"
+
+
+@pytest.mark.parametrize("content", [None, b"", PLY_HEADER % b"ascii", PLY_HEADER % b"binary_little_endian"])
+def test_damaged_points_are_refused_by_name(root, content):
+    if content is not None:
+        (root / "points.ply").write_bytes(content)
+    write(root, fl_x=50, ply_file_path="points.ply")
+    with pytest.raises(InputError, match=r"points\.ply"):
+        read_dataset(root, DataConfig())
+
+
+def test_masks_of_frames_and_of_the_folder(root):
+    write_photos(root, [f"masks/{k}.png" for k in range(4)])
+    write(root, fl_x=50)
+    masks = [photo.mask for photo in read_dataset(root, DataConfig(masks="masks")).photos]
+    assert masks == [root / "masks" / f"{k}.png" for k in range(4)]
+    rows = frames()
+    rows[0]["mask_path"] = "masks/3.png"
+    (root / "transforms.json").write_text(json.dumps({"frames": rows, "fl_x": 50}))
+    assert [photo.mask for photo in read_dataset(root, DataConfig()).photos] == [
+        root / "masks/3.png",
+        None,
+        None,
+        None,
+    ]
+
+
+def bad_frame(**fields):
+    rows = frames()
+    rows[1] |= fields
+    return {"frames": rows}
+
+
+MIRRORED = (np.array(opengl(CAMERAS[1])) @ np.diag([-1, 1, 1, 1])).tolist()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"frames": []}, "frames"),
+        ({"frames": {"a": 1}}, "frames"),
+        ({"frames": ["a"]}, "file_path.*frame 0"),
+        (bad_frame(file_path=None), "file_path.*frame 1"),
+        (bad_frame(file_path="../1.png"), r"\.\./1\.png"),
+        (bad_frame(file_path="/1.png"), r"/1\.png"),
+        (bad_frame(transform_matrix=None), r"transform_matrix.*1\.png"),
+        (bad_frame(transform_matrix=[[1, 2], [3]]), r"transform_matrix.*1\.png"),
+        (bad_frame(transform_matrix=(np.eye(4) * np.nan).tolist()), r"transform_matrix.*1\.png"),
+        (bad_frame(transform_matrix=MIRRORED), r"1\.png.*determinant -1"),
+        (bad_frame(transform_matrix=(2 * np.eye(4)).tolist()), r"1\.png.*determinant"),
+        (bad_frame(fl_x="wide"), r"1\.png.*fl_x.*wide"),
+        (bad_frame(fl_x=-3), r"1\.png.*fl_x"),
+        (bad_frame(k1=float("nan")), r"1\.png.*k1"),
+        (bad_frame(w=0), r"1\.png.*0x48"),
+        (bad_frame(w=48, h=64), r"1\.png.*48x64.*64x48"),
+        ({"fl_x": None}, "fl_x"),
+        ({"camera_model": "PINBALL"}, "camera_model.*PINBALL"),
+        ({"k4": 0.1}, "k4"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "p1"),
+        ({"ply_file_path": "../points.ply"}, r"\.\./points\.ply"),
+    ],
+)
+def test_what_cannot_be_right_is_refused(root, fields, message):
+    (root / "transforms.json").write_text(json.dumps({"frames": frames(), "fl_x": 50, **fields}))
+    with pytest.raises(InputError, match=message):
+        load_scene(root, DataConfig())
+
+
+def test_neither_focal_length_nor_angle_is_an_error(root):
+    write(root)
+    with pytest.raises(InputError, match="fl_x or camera_angle_x"):
+        load_scene(root, DataConfig())
+    write(root, camera_angle_x=3.5)
+    with pytest.raises(InputError, match="camera_angle_x between"):
+        load_scene(root, DataConfig())
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "\xff"])
+def test_files_that_are_no_transforms_are_refused_by_name(root, content):
+    (root / "transforms.json").write_text(content, encoding="latin-1")
+    with pytest.raises(InputError, match=r"transforms\.json"):
+        load_scene(root, DataConfig())
+
+
+# ---- real scenes
+
+
+@pytest.mark.shared
+def test_lego_brings_its_split(shared):
+    scene = load_scene(shared / "data" / "lego", DataConfig(background="white"))
+    assert (len(scene.train), len(scene.test), len(scene.points)) == (100, 25, 0)
+    camera = scene.train[0].camera
+    assert scene.train[0].image.shape == (400, 400, 3)
+    np.testing.assert_allclose(camera.fx, 200 / np.tan(0.6911112070083618 / 2))
+    # The cameras stand on a sphere of radius 4.03 around the origin and look at it.
+    for view in scene.train + scene.test:
+        np.testing.assert_allclose(np.linalg.norm(view.camera.position), 4.03, atol=0.01)
+        np.testing.assert_allclose(view.camera.viewmat[:2, 3], 0, atol=0.01)
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("downscale", [2, 4])
+def test_fox_agrees_with_its_colmap_model(shared, tmp_path, downscale):
+    """Two reconstructions of the same photos: the same cameras up to a similarity."""
+    fox = shared / "data" / "fox"
+    for name in ("images_2", "images_4", "transforms.json"):
+        (tmp_path / name).symlink_to(fox / name)
+    config = DataConfig(downscale=downscale, test_every=0)
+    with pytest.warns(UserWarning, match="17 of 67"):
+        theirs = load_scene(tmp_path, config).train
+    ours = load_scene(fox, config).train
+    assert [view.name for view in theirs] == [f"images/{view.name}" for view in ours] and len(ours) == 50
+    source, target = (np.array([view.camera.position for view in views]) for views in (ours, theirs))
+    source, target = source - source.mean(axis=0), target - target.mean(axis=0)
+    u, s, vt = np.linalg.svd(target.T @ source)  # Umeyama 1991
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation, scale = u @ sign @ vt, np.trace(np.diag(s) @ sign) / (source**2).sum()
+    error = np.linalg.norm(scale * source @ rotation.T - target, axis=1)
+    # The data's README: 0.14 % of the extent and 0.76 degrees at most, from different principal points.
+    assert np.sqrt(np.mean(error**2)) < 0.002 * np.linalg.norm(target, axis=1).max()
+    for one, other in zip(ours, theirs, strict=True):
+        relative = one.camera.viewmat[:3, :3] @ rotation.T @ other.camera.viewmat[:3, :3].T
+        assert np.degrees(np.arccos((np.trace(relative) - 1) / 2)) < 1.0
+    np.testing.assert_allclose(ours[0].camera.fx, theirs[0].camera.fx, rtol=0.001)
+    np.testing.assert_allclose(ours[0].image.shape, theirs[0].image.shape, atol=4)
+
+
+def test_whole_numbers_in_text_are_not_wrapped(root):
+    """300 as uchar would be 44."""
+    header = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    colours = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    (root / "points.ply").write_text(f"{header}{colours}end_header\n1 2 3 300 0 0\n")
+    write(root, fl_x=50, ply_file_path="points.ply")
+    with pytest.raises(InputError, match=r"points\.ply: expected red within uint8"):
+        read_dataset(root, DataConfig())
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_points_declared_but_not_there_take_no_memory(root, kind):
+    header = f"ply\nformat {kind} 1.0\nelement vertex 100000000000\n" + "".join(
+        f"property float {a}\n" for a in "xyz"
+    )
+    (root / "points.ply").write_text(f"{header}end_header\n1 2 3\n")
+    write(root, fl_x=50, ply_file_path="points.ply")
+    with pytest.raises(InputError, match=r"points\.ply: expected at least \d+ bytes"):
+        read_dataset(root, DataConfig())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"mask_path": None},
+        {"fl_x": 10**400},
+        {"w": 1e300, "h": 7.5e299},
+        {"transform_matrix": [[10**400] * 4] * 4},
+        {"transform_matrix": [[1, 0, 0, 0], [1e308, -1, 0, 1e308], [0, 0, -1, 0], [0, 0, 0, 1]]},
+    ],
+    ids=["mask", "focal length", "size", "pose", "product of a pose"],
+)
+def test_values_that_broke_the_reader(root, change):
+    """Found by fuzzing: TypeError, OverflowError, a warning of NumPy's, and lists of 1e300 pixels."""
+    first, *others = frames()
+    (root / "transforms.json").write_text(
+        json.dumps({"frames": [first | {"fl_x": 50} | change, *others], "fl_x": 50})
+    )
+    with pytest.raises(InputError, match="transforms"):
+        read_dataset(root, DataConfig())

@@ -1,0 +1,312 @@
+"""The viewer: cameras to and fro, frames as our renders, training undisturbed, and a browser that shows them."""
+
+import math
+import sys
+import threading
+import time
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from browser import browser, wait_for
+
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig, TrainConfig
+from clsplat.errors import DeviceError, InputError
+from clsplat.metrics import psnr, to_uint8
+from clsplat.ops import count_pairs
+from clsplat.render import forward, render, upload
+from clsplat.scene import Scene, View
+from clsplat.show.camera_paths import first_photo
+from clsplat.show.viewer import FRAME_TIME, MODES, STILL_AFTER, Viewer, client_camera, picture, whole_view, wxyz_of
+from clsplat.testing import synthetic_scene
+from clsplat.training.loop import train
+
+SIZE = (320, 240)
+
+
+def cameras(count=5, tilt=0.2):
+    """Around what `synthetic_scene` shows, tilted to either side, principal points in the middle."""
+    gaussians, camera = synthetic_scene(300, seed=5)
+    centre = gaussians.means.mean(axis=0)
+    distance = np.linalg.norm(camera.position - centre)
+    result = []
+    for i in range(count):
+        angle = 2 * math.pi * i / count
+        eye = centre + distance * np.array([math.sin(angle), 0.3 * math.sin(2 * i), -math.cos(angle)])
+        up = (tilt * (-1) ** i, -1, 0.1 * i)
+        result.append(Camera.look_at(eye, centre, up, 300 + 10 * i, *SIZE))
+    return gaussians, result
+
+
+def views_of(cams):
+    return [View(f"{i}.png", c, np.zeros((c.height, c.width, 3), np.uint8)) for i, c in enumerate(cams)]
+
+
+def test_a_camera_survives_the_way_to_the_browser_and_back():
+    for camera in cameras()[1]:
+        found = client_camera(3 * wxyz_of(camera), camera.position, whole_view(camera, 4 / 3), *SIZE)
+        np.testing.assert_allclose(found.viewmat, camera.viewmat, atol=1e-12)
+        np.testing.assert_allclose(found.K, camera.K, rtol=1e-12)
+
+
+@pytest.mark.parametrize("window", [(300, 900), (900, 300), (320, 240)])
+def test_a_window_shows_the_whole_photo(window):
+    camera = replace(cameras()[1][0], fx=200.0)
+    fov = whole_view(camera, window[0] / window[1])
+    seen = client_camera(wxyz_of(camera), camera.position, fov, *window)
+    slack = np.array([window[0] / seen.fx * camera.fx / 320, window[1] / seen.fy * camera.fy / 240])
+    assert slack.min() == pytest.approx(1)
+
+
+class TestPicture:
+    def test_render_is_ours(self, device):
+        gaussians, (camera, *_) = cameras()
+        frame, legend = picture(device, upload(device, gaussians), camera, RenderConfig(), (1.0, 0.0, 0.5), "render")
+        ours = render(gaussians, camera, device=device, background=(1.0, 0.0, 0.5))
+        np.testing.assert_array_equal(frame, to_uint8(ours.rgb))
+        assert legend == ""
+
+    def test_depth_alpha_and_count_say_what_they_show(self, device):
+        gaussians, (camera, *_) = cameras()
+        gaussians.logit_opacities[:] = 4
+        ours = render(gaussians, camera, device=device, depth=True)
+        shown = {
+            mode: picture(device, upload(device, gaussians), camera, RenderConfig(), (0.0, 0.0, 0.0), mode)
+            for mode in MODES
+        }
+        alpha = np.repeat(ours.alpha[:, :, None], 3, axis=2)
+        np.testing.assert_array_equal(shown["alpha"][0], to_uint8(alpha))
+        solid = ours.alpha > 0.5
+        assert 0 < solid.mean() < 1
+        assert not shown["depth"][0][~solid].any()
+        brightness = shown["depth"][0].sum(axis=2)[solid].astype(float)
+        assert np.corrcoef(brightness, ours.depth[solid])[0, 1] < -0.8, "near must be bright"
+        near, far = np.percentile(ours.depth[solid], [2, 98])
+        assert f"bright {near:.3g}, dark {far:.3g}" in shown["depth"][1]
+        run = forward(device, upload(device, gaussians), camera, RenderConfig(), np.zeros(3), 0, gradients=False)
+        count = count_pairs(device, run.splats, run.bins)[1].get()
+        assert f"bright {count.max()} Gaussians per pixel; mean {count.mean():.1f}" in shown["count"][1]
+        order = np.argsort(count, axis=None)[[0, -1]]
+        darkest, brightest = shown["count"][0].sum(axis=2).ravel()[order]
+        assert darkest < brightest == shown["count"][0].sum(axis=2).max()
+
+    def test_an_empty_view_has_no_depth(self, device):
+        gaussians, (camera, *_) = cameras()
+        gaussians.logit_opacities[:] = -20
+        frame, legend = picture(device, upload(device, gaussians), camera, RenderConfig(), (1.0, 1.0, 1.0), "depth")
+        assert not frame.any()
+        assert legend == "nothing opaque in view"
+
+
+def test_without_viser_it_says_how_to_get_it(device, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    cams = cameras()[1]
+    with pytest.raises(InputError, match=r"pip install 'clsplat\[viewer\]'"):
+        Viewer(device, RenderConfig(), first_photo(cams), [], (0.0, 0.0, 0.0))
+
+
+@pytest.fixture
+def viewer(device):
+    """Of five cameras; its clients are what a test makes of it."""
+    pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
+    cams = cameras()[1]
+    result = Viewer(device, RenderConfig(), first_photo(cams), views_of(cams), (0.0, 0.0, 0.0), port=18080)
+    yield result
+    result.close()
+
+
+class Clock:
+    """The viewer's time: a millisecond for each look at it, and what a test adds."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def perf_counter(self):
+        self.now += 1e-3
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    result = Clock()
+    monkeypatch.setattr("clsplat.show.viewer.time", result)
+    return result
+
+
+class FakeClient:
+    """A browser that records the frames it is sent."""
+
+    def __init__(self, viewer, camera, moved=0.0):
+        from clsplat.show.viewer import _Client
+
+        self.frames = []
+        scene = SimpleNamespace(set_background_image=lambda frame, **_: self.frames.append(frame))
+        self.state = viewer._clients[0] = _Client(SimpleNamespace(scene=scene), camera, moved)
+
+
+class TestResolution:
+    def test_first_coarse_then_whole_when_still(self, viewer, device, clock):
+        gaussians, cams = cameras()
+        client = FakeClient(viewer, cams[1])
+        assert viewer.draw(gaussians)
+        assert client.frames[0].shape[1] == SIZE[0] / 4
+        assert not viewer.draw(gaussians), "nothing is due while the camera may move on"
+        clock.now += STILL_AFTER
+        while viewer.draw(gaussians):
+            pass
+        assert [f.shape[1] for f in client.frames] == sorted({f.shape[1] for f in client.frames})
+        np.testing.assert_array_equal(client.frames[-1], to_uint8(render(gaussians, cams[1], device=device).rgb))
+        assert not viewer.draw(gaussians), "and nothing more"
+
+    def test_a_movement_is_drawn_at_once_and_in_time(self, viewer, monkeypatch, clock):
+        """Frames whose time goes with their pixels come to take FRAME_TIME."""
+        gaussians, cams = cameras()
+
+        def slow(device, gaussians, camera, *_):
+            clock.now += 2.5 * camera.width * camera.height / (SIZE[0] * SIZE[1])
+            return np.zeros((camera.height, camera.width, 3), np.uint8), ""
+
+        monkeypatch.setattr("clsplat.show.viewer.picture", slow)
+        client = FakeClient(viewer, cams[0])
+        for i in range(12):
+            client.state.camera, client.state.moved = cams[i % 5], clock.now
+            before = clock.now
+            assert viewer.draw(gaussians)
+        assert clock.now - before == pytest.approx(FRAME_TIME, rel=0.1)
+
+    def test_training_is_shown_anew_but_not_all_the_time(self, viewer, clock):
+        gaussians, cams = cameras()
+        client = FakeClient(viewer, cams[0])
+        clock.now += STILL_AFTER
+        while viewer.draw(gaussians):
+            pass
+        client.state.shown = shown = client.state.shown._replace(seconds=1.0)
+        clock.now = shown.at + 9  # a frame of a second may come every ten
+        viewer.follow(gaussians, lambda: False)
+        assert client.state.shown is shown
+        clock.now = shown.at + 10
+        viewer.follow(gaussians, lambda: False)
+        assert client.state.shown is not shown and client.state.shown.share == 1
+
+    def test_memory_that_is_short_does_not_end_the_training(self, viewer, monkeypatch):
+        gaussians, cams = cameras()
+
+        def fails(*_):
+            raise DeviceError("image: needs a buffer of 9 MiB")
+
+        monkeypatch.setattr("clsplat.show.viewer.picture", fails)
+        client = FakeClient(viewer, cams[0])
+        assert viewer.draw(gaussians)
+        assert client.frames[0].shape == (1, 1, 3)
+        assert "needs a buffer" in viewer._drawn
+
+
+def small_training(device, out, progress=lambda record: None, **options):
+    gaussians, cams = cameras()
+    photos = [View(f"{i}.png", c, to_uint8(render(gaussians, c, device=device).rgb)) for i, c in enumerate(cams)]
+    points = gaussians.means[:100].astype(np.float64)
+    scene = Scene(photos, [], points, np.full((100, 3), 128, np.uint8))
+    config = TrainConfig(strategy="adc", size="fixed", iterations=12, max_gaussians=150, eval_every=0, **options)
+    return train(scene, config, device, out, progress=progress)
+
+
+@pytest.mark.parametrize("optimizer", ["device", "numpy"])
+def test_training_has_the_same_bits_with_a_viewer(viewer, device, tmp_path, optimizer):
+    alone = small_training(device, tmp_path / "alone", optimizer=optimizer)
+    cams, client = cameras()[1], FakeClient(viewer, cameras()[1][0])
+
+    def watched(record):
+        viewer._mode = MODES[record["iteration"] % 4]
+        client.state.camera = cams[record["iteration"] % 5]
+        viewer.follow(record["gaussians"], lambda: False)
+
+    beside = small_training(device, tmp_path / "beside", watched, optimizer=optimizer)
+    assert len(client.frames) == 12
+    for name, array in alone.arrays().items():
+        np.testing.assert_array_equal(array, beside.arrays()[name], err_msg=name)
+
+
+def test_a_pause_holds_the_training_until_it_is_resumed_or_interrupted(viewer, device, tmp_path):
+    reached = []
+
+    def resume():
+        wait_for(lambda: viewer._paused and reached, "the pause")
+        time.sleep(0.3)
+        resumed.append(len(reached))
+        viewer._toggle(None)
+
+    def watched(record):
+        reached.append(record["iteration"])
+        if record["iteration"] == 3:
+            viewer._toggle(None)
+        viewer.follow(record["gaussians"], lambda: False)
+
+    resumed = []
+    thread = threading.Thread(target=resume)
+    thread.start()
+    small_training(device, tmp_path / "run", watched)
+    thread.join()
+    assert resumed == [3]
+    assert len(reached) == 12
+    viewer._toggle(None)
+    viewer.follow(cameras()[0], lambda: True)  # would wait for ever, were it not interrupted
+
+
+# What the panel has: a field with the mode, and the last box that can be ticked.
+CLICK_CAMERAS = "[...document.querySelectorAll('input[type=checkbox]')].at(-1).click()"
+MODE_BOX = """(() => {
+    const box = [...document.querySelectorAll('input')].find(i => i.value == 'render').getBoundingClientRect();
+    return [box.x + box.width / 2, box.y + box.height / 2];
+})()"""
+CHOOSE_ALPHA = """(() => {
+    const option = [...document.querySelectorAll('[role=option]')].find(o => o.innerText == 'alpha');
+    option?.click();
+    return Boolean(option);
+})()"""
+
+
+def test_a_browser_shows_our_render_and_jumps_to_a_clicked_camera(viewer, device, tmp_path):
+    gaussians, cams = cameras()
+    stop = threading.Event()
+    owner = threading.Thread(target=viewer.hold, args=(gaussians, stop.is_set))
+    owner.start()
+
+    def seen(page):
+        """The camera whose render the part below the panel shows, if it shows one: with 20 dB or more, where the
+        right one has 24 to 27 (a frame is a JPEG, and frusta are drawn over it) and others up to 15."""
+        shot = page.screenshot()[200:]
+        scores = [psnr(shot, to_uint8(render(gaussians, c, device=device).rgb)[200:]) for c in whole]
+        return int(np.argmax(scores)) if max(scores) > 20 else None
+
+    whole = [camera.resized(640, 480) for camera in cams]
+    try:
+        with browser(tmp_path, viewer.address, 640, 480) as page:
+            wait_for(lambda: viewer._clients, "the browser's connection")
+            (client,) = viewer._clients.values()
+            wait_for(lambda: client.shown and client.shown.share == 1 and seen(page) == 0, "the first camera's frame")
+            np.testing.assert_allclose(client.camera.viewmat, cams[0].viewmat, atol=1e-4)
+            for here, there in pairwise((0, 3, 1)):
+                x, y, z = (whole[here].viewmat @ [*cams[there].position, 1])[:3]
+                where = whole[here].fx * x / z + 320, whole[here].fy * y / z + 240
+
+                def arrived(where=where, there=there):
+                    if np.abs(client.camera.viewmat - cams[there].viewmat).max() > 1e-3:
+                        page.click(*where)  # again, should the page have been busy
+                        time.sleep(1)
+                    return seen(page) == there
+
+                wait_for(arrived, f"the frame of camera {there}, clicked at {where}")
+            page.evaluate(CLICK_CAMERAS)
+            wait_for(lambda: not viewer._server.scene.get_handle_by_name("/cameras").visible, "hidden cameras")
+            page.click(*page.evaluate(MODE_BOX))
+            wait_for(lambda: page.evaluate(CHOOSE_ALPHA), "the list of modes")
+            wait_for(lambda: client.shown.mode == "alpha" and client.shown.share == 1, "a frame of another mode")
+            alpha = picture(device, upload(device, gaussians), whole[1], RenderConfig(), (0.0, 0.0, 0.0), "alpha")[0]
+            # 25 dB: a JPEG; without the frusta, that hide nothing any more.
+            wait_for(lambda: psnr(page.screenshot()[200:], alpha[200:]) > 25, "alpha")
+    finally:
+        stop.set()
+        owner.join()

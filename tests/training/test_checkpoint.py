@@ -1,0 +1,114 @@
+"""Checkpoints: what they hold, and what is left when writing one fails."""
+
+# ruff: noqa: F811 (a fixture is imported and then named as an argument)
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_loop import CONFIG, same, scene  # noqa: F401  (a fixture)
+
+from clsplat.errors import InputError
+from clsplat.scene import Scene
+from clsplat.training.checkpoint import State, load_state, log_file, save_state
+from clsplat.training.densify import Edit
+from clsplat.training.loop import _apply, initial_state
+
+
+def random_state(scene: Scene) -> State:
+    """A state every array of which is unlike that of a fresh one."""
+    state, rng = initial_state(scene, CONFIG), np.random.default_rng(0)
+    for part in (state.moments.first, state.moments.second):
+        for array in part.arrays().values():
+            array[:] = rng.uniform(1, 2, array.shape)
+    for array in state.strategy.statistics.values():
+        array[:] = rng.integers(1, 9, array.shape)
+    return replace(state, iteration=7, seconds=1.5)
+
+
+def test_a_checkpoint_holds_everything(scene: Scene, tmp_path: Path) -> None:
+    state = random_state(scene)
+    save_state(tmp_path / "checkpoint.npz", state, CONFIG)
+    loaded = load_state(tmp_path / "checkpoint.npz", scene.extent, CONFIG)
+    assert (loaded.iteration, loaded.seconds, loaded.extent) == (7, 1.5, scene.extent)
+    assert same(loaded.gaussians, state.gaussians)
+    assert same(loaded.moments.first, state.moments.first)
+    assert same(loaded.moments.second, state.moments.second)
+    for name, array in state.strategy.statistics.items():
+        np.testing.assert_array_equal(loaded.strategy.statistics[name], array)
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_moments_follow_an_edit(scene: Scene, reset: bool) -> None:
+    state = random_state(scene)
+    before = state.moments
+    rows, fresh = np.array([3, 1, 1]), np.array([False, False, True])
+    _apply(Edit(state.gaussians.take(rows), rows, fresh, reset_opacities=reset), state)
+    assert len(state.gaussians) == 3
+    for old, new in ((before.first, state.moments.first), (before.second, state.moments.second)):
+        for name in ("means", "logit_opacities"):
+            kept = 0 if reset and name == "logit_opacities" else getattr(old, name)[rows[:2]]
+            np.testing.assert_array_equal(getattr(new, name)[:2], kept)
+            assert (getattr(new, name)[2] == 0).all()
+
+
+def test_a_failed_write_leaves_the_last_checkpoint(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "checkpoint.npz"
+    state = initial_state(scene, CONFIG)
+    save_state(path, state, CONFIG)
+
+    def full(file: Any, **arrays: Any) -> None:
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez", full)
+        with pytest.raises(InputError, match="No space left"):
+            save_state(path, replace(state, iteration=7), CONFIG)
+    loaded = load_state(path, scene.extent, CONFIG)
+    assert loaded.iteration == 0
+    assert same(loaded.gaussians, state.gaussians)
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.npz"]
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file/out: expected a folder that can be written to, found: Not a"):
+        with log_file(tmp_path / "file" / "out" / "log.jsonl", 0):
+            pass
+
+
+def test_the_log_is_also_written_for_tensorboard(tmp_path: Path) -> None:
+    """A resumed run's first step says that what was there from it on no longer counts."""
+    event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
+    for begin, end in ((0, 20), (10, 30)):
+        with log_file(tmp_path / "log.jsonl", begin) as append:
+            for iteration in range(begin + 10, end + 1, 10):
+                append({"iteration": iteration, "loss": iteration / 100})
+    found = []
+    for path in sorted((tmp_path / "tensorboard").iterdir(), key=lambda p: int(p.suffix[1:])):
+        content, at = path.read_bytes(), 0
+        while at < len(content):  # length, its check, the event, its check
+            length = int.from_bytes(content[at : at + 8], "little")
+            event = event_pb2.Event.FromString(content[at + 12 : at + 12 + length])
+            at += 16 + length
+            found += [(value.tag, event.step, value.simple_value) for value in event.summary.value]
+            found += ["start"] * (event.session_log.status == event.session_log.START)
+    losses = [("loss", step, pytest.approx(step / 100)) for step in (10, 20, 20, 30)]
+    assert found == [*losses[:2], "start", *losses[2:]]
+
+
+def test_the_log_drops_what_a_resumed_run_repeats(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_text('{"iteration": 10}\n{"iteration": 20}\n{"iteration": 30}\n{"iter')
+    with log_file(path, 20) as append:
+        append({"iteration": 30, "again": 1})
+    assert [json.loads(line) for line in path.read_text().splitlines()] == [
+        {"iteration": 10},
+        {"iteration": 20},
+        {"iteration": 30, "again": 1},
+    ]

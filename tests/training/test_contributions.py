@@ -1,0 +1,52 @@
+"""Contributions of Gaussians to photos, against the float64 twins splat by splat."""
+
+import numpy as np
+import pytest
+
+from clsplat.config import RenderConfig
+from clsplat.device import Device
+from clsplat.metrics import to_uint8
+from clsplat.reference.composite import hits
+from clsplat.render import forward, render, upload
+from clsplat.scene import View
+from clsplat.testing import synthetic_scene
+from clsplat.training.contributions import contributions
+from clsplat.training.densify import Contributions
+
+N, BACKGROUND = 30, (0.2, 0.4, 0.1)
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+@pytest.mark.parametrize("masked", [False, True])
+def test_weights_and_errors_are_those_of_the_pixels(device: Device, on_device: bool, masked: bool) -> None:
+    gaussians, camera = synthetic_scene(N, seed=2)
+    gaussians = gaussians.astype(np.float32)
+    rng = np.random.default_rng(0)
+    image = to_uint8(
+        render(gaussians, camera, background=BACKGROUND).rgb + rng.normal(0, 0.2, (camera.height, camera.width, 3))
+    )
+    mask = rng.random((camera.height, camera.width)) < 0.5 if masked else None
+    views = [View("a.png", camera, image, mask), View("b.png", camera, 255 - image)]
+    given = upload(device, gaussians) if on_device else gaussians
+    found = contributions(device, given, views, RenderConfig(), np.array(BACKGROUND), 3)
+
+    run = forward(None, upload(None, gaussians), camera, RenderConfig(), np.array(BACKGROUND), 3)
+    expected = Contributions(np.zeros(N), np.zeros(N), np.zeros(N))
+    for view in views:
+        residuals = run.image.image - view.image / 255
+        counted = np.ones(residuals.shape[:2]) if view.mask is None else view.mask.astype(float)
+        squares = (residuals**2).sum(axis=2) * counted
+        transmittance = np.empty(squares.shape)
+        for hit in hits(run.splats, run.bins, transmittance):
+            weight = hit.alpha * hit.before
+            expected.weights[hit.splat] += (weight * counted[hit.box]).sum()
+            expected.errors[hit.splat] += (weight * squares[hit.box]).sum()
+        for i in range(0, N, 7):
+            without = gaussians.take(np.delete(np.arange(N), i))
+            left = render(without, camera, background=BACKGROUND).rgb - view.image / 255
+            expected.prices[i] += ((left**2).sum(axis=2) * counted).sum() - squares.sum()
+    assert (expected.weights > 0).any()
+    # float32: sums over some thousand pixels; of each a fraction of the largest.
+    for actual, wanted in zip(found[:3], expected[:3], strict=True):
+        some = slice(0, N, 7) if wanted is expected.prices else slice(None)
+        np.testing.assert_allclose(actual[some], wanted[some], rtol=1e-4, atol=1e-5 * np.abs(wanted).max())

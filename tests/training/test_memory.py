@@ -1,0 +1,211 @@
+"""Device memory: the prediction is what is allocated, a limit is kept, the steady state allocates nothing."""
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from clsplat.camera import Camera
+from clsplat.config import AdcConfig, ErrorConfig, McmcConfig, OptimConfig, RenderConfig, TrainConfig
+from clsplat.device import Device
+from clsplat.errors import DeviceError, InputError
+from clsplat.gaussians import Gaussians
+from clsplat.render import render_views
+from clsplat.scene import Scene, View
+from clsplat.training.checkpoint import load_state
+from clsplat.training.densify import STRATEGIES
+from clsplat.training.loop import train
+from clsplat.training.memory import INTERSECTIONS, Footprint, Photos, parse_size
+
+FIXED_N = AdcConfig(stop_fraction=0)
+"""No densification."""
+
+
+def make_scene(n: int, width: int, height: int, views: int = 4) -> Scene:
+    """Random points in photos of noise, from unlike distances, so that intersections differ."""
+    rng = np.random.default_rng(0)
+    cameras = [
+        Camera.look_at(
+            [(2.5 + i / 3) * np.sin(i), -0.5, (2.5 + i / 3) * np.cos(i)], [0, 0, 0], [0, -1, 0], width, width, height
+        )
+        for i in range(views)
+    ]
+    photos = [View(f"{i}", c, rng.integers(0, 256, (height, width, 3), np.uint8)) for i, c in enumerate(cameras)]
+    return Scene(photos, [], rng.uniform(-1, 1, (n, 3)), rng.integers(0, 256, (n, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("4GB", 4 * 10**9), ("512MiB", 2**29), ("1.5 GB", 15 * 10**8), (".5GiB", 2**29), ("7MB", 7 * 10**6)],
+)
+def test_sizes(text: str, expected: int) -> None:
+    assert parse_size(text, "--memory-limit") == expected
+
+
+@pytest.mark.parametrize("text", ["4", "GB", "4gb", "-1GB", "0GB", "4GB more", "1e9MB", "4.5.6GB", ""])
+def test_no_size(text: str) -> None:
+    with pytest.raises(InputError, match=r"^--memory-limit: expected a size such as 4GB or 512MiB, found"):
+        parse_size(text, "--memory-limit")
+
+
+@pytest.mark.parametrize("sort", ["auto", "per_tile"])
+@pytest.mark.parametrize("gpu", [False, True], ids=["as it is", "as a GPU"])
+@pytest.mark.parametrize(("n", "width", "height"), [(20_000, 160, 120), (5_000, 400, 300)])
+def test_what_is_predicted_is_allocated(
+    tmp_path: Path, gpu: bool, n: int, width: int, height: int, sort: Literal["auto", "per_tile"]
+) -> None:
+    device = Device()
+    if gpu:
+        device.is_cpu = False  # type: ignore[misc]  # shadows the cached property
+    scene = make_scene(n, width, height)
+    config = TrainConfig(
+        strategy="adc",
+        size="fixed",
+        iterations=6,
+        eval_every=3,
+        adc=FIXED_N,
+        render=RenderConfig(sort=sort),
+        exposure=gpu,
+    )
+
+    def evaluate(gaussians: Gaussians) -> dict[str, float]:
+        return {"mean": float(np.mean([r.rgb.mean() for r in render_views(gaussians, cameras, device=device)]))}
+
+    cameras = [view.camera for view in scene.train]
+    train(scene, config, device, tmp_path, evaluate=evaluate)
+    met = load_state(tmp_path / "checkpoint.npz", scene.extent, config).intersections
+    photos = sum(view.image.nbytes for view in scene.train)
+    predicted = Footprint.of(scene, config, device).total(n, met) + photos
+    assert device.memory_peak <= predicted <= 1.2 * device.memory_peak
+
+
+def test_a_million_gaussians_fit_4_gb() -> None:
+    """At 1280x720, with intersections to spare and an evaluation's copy."""
+    for gpu in (False, True):
+        assert Footprint(1280, 720, 3, gpu).total(1_000_000, 2 * INTERSECTIONS) < 4e9
+
+
+def test_the_steady_state_allocates_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = Device()
+    done: list[int] = []
+    new: list[int] = []
+    allocate = Device._allocate
+
+    def counted(self: Device, what: str, nbytes: int) -> Any:
+        before = self.memory
+        block = allocate(self, what, nbytes)
+        if self.memory != before:
+            new.append(len(done))
+        return block
+
+    monkeypatch.setattr(Device, "_allocate", counted)
+    still = OptimConfig(1e-9, 1e-9, log_scales_lr=0, quats_lr=0, logit_opacities_lr=0)  # lists stay as they are
+    config = TrainConfig(strategy="adc", size="fixed", iterations=30, adc=FIXED_N, optim=still)
+    train(make_scene(2000, 96, 64, 6), config, device, tmp_path, progress=lambda _: done.append(1))
+    # Each of the 6 views comes for the first time, with lists of its own length.
+    assert set(new) > {0} and max(new) < 6
+
+
+def test_most_gaussians_is_the_inverse_of_total() -> None:
+    need = Footprint(640, 480, 3, False)
+    for limit in (10**9, 123_456_789):
+        n = need.most_gaussians(limit)
+        assert need.total(n) <= limit < need.total(n + 2)
+    assert need.most_gaussians(need.fixed) == need.most_gaussians(0) == 0
+
+
+def test_a_start_that_does_not_fit_says_what_would() -> None:
+    need = Footprint(1600, 1200, 3, False)
+    assert "enough for" in need.describe(100, 1000, 10**9)
+    with pytest.raises(InputError, match=r"^--memory-limit: expected at least") as error:
+        need.describe(200_000, 10**6, 400_000_000)
+    assert f"{need.most_gaussians(400_000_000)} Gaussians with all of them: --downscale 2" in str(error.value)
+    with pytest.raises(InputError) as error:
+        need.describe(10**6, 10**6, 300_000_000)
+    assert "downscale" not in str(error.value)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_growth_stops_where_memory_ends(tmp_path: Path, strategy: str) -> None:
+    scene = make_scene(1500, 96, 64)
+    adc = AdcConfig(start=1, every=5, grad_threshold=1e-7, stop_fraction=1)
+    config = TrainConfig(
+        size="fixed",
+        iterations=30,
+        strategy=strategy,
+        max_gaussians=12_000,
+        adc=adc,
+        mcmc=McmcConfig(start=1, every=5),
+        error=ErrorConfig(start=1, every=5, stop_fraction=1),
+    )
+    free = Device()
+    grown = len(train(scene, config, free, tmp_path))
+    limit = round(free.memory_peak / 2)
+    device = Device(memory_limit=limit)
+    with pytest.warns(UserWarning, match=r"no more than \d+ Gaussians fit the memory: growth stops"):
+        held = train(scene, config, device, tmp_path)
+    assert 1500 < len(held) < 0.7 * grown
+    assert device.memory_peak <= limit
+    numbers = [json.loads(line)["num_gaussians"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert numbers[-1] == len(held)
+
+
+def test_photos_stay_within_their_budget(device: Device) -> None:
+    views = make_scene(1, 32, 16).train
+    size = views[0].image.nbytes
+    photos = Photos(device)
+    photos.keep_within(2 * size)
+    first = [photos(view)[0] for view in views]
+    again = [photos(view)[0] for view in views]
+    assert [a is b for a, b in zip(first, again, strict=True)] == [True, True, False, False]
+    for view, photo in zip(views, first, strict=True):
+        np.testing.assert_array_equal(photo.get(), view.image)
+    photos.keep_within(size)
+    assert [photos(view)[0] is a for view, a in zip(views, first, strict=True)] == [True, False, False, False]
+    photos.keep_within(-1)
+    assert photos(views[0])[0] is not first[0]
+
+
+def test_masks_count_too(device: Device) -> None:
+    views = [replace(v, mask=np.ones((16, 32), bool)) for v in make_scene(1, 32, 16).train]
+    photos = Photos(device)
+    photos.keep_within(views[0].image.nbytes + 32 * 16 - 1)
+    assert photos(views[0])[0] is not photos(views[0])[0]
+
+
+def test_running_out_of_memory_leaves_the_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, device = make_scene(300, 48, 32), Device()
+    config = TrainConfig(strategy="adc", size="fixed", iterations=12, checkpoint_every=5, adc=FIXED_N)
+    done: list[int] = []
+    allocate = Device._allocate
+
+    def full(self: Device, what: str, nbytes: int) -> Any:
+        if len(done) == 7:
+            raise DeviceError(f"{what}: no memory left")
+        return allocate(self, what, nbytes)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Device, "_allocate", full)
+        with pytest.raises(
+            DeviceError, match=r"^iteration 8: .*: no memory left; the last checkpoint in .* is intact"
+        ):
+            train(scene, config, device, tmp_path, progress=lambda record: done.append(record["iteration"]))
+    assert load_state(tmp_path / "checkpoint.npz", scene.extent, config).iteration == 5
+    resumed = train(scene, replace(config, memory_limit="1GB"), device, tmp_path, resume=True)
+    expected = train(scene, config, device, tmp_path)
+    assert all((a == b).all() for a, b in zip(resumed.arrays().values(), expected.arrays().values(), strict=True))
+
+
+def test_a_limit_does_not_change_the_result_where_it_holds_nothing_back(tmp_path: Path) -> None:
+    scene, config = make_scene(300, 48, 32), TrainConfig(strategy="adc", size="fixed", iterations=8, adc=FIXED_N)
+    free = Device()
+    expected = train(scene, config, free, tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Too little for the photos beside the rest: they are uploaded anew each time.
+        result = train(scene, config, Device(memory_limit=free.memory_peak), tmp_path)
+    assert all((a == b).all() for a, b in zip(result.arrays().values(), expected.arrays().values(), strict=True))
