@@ -3,7 +3,7 @@
 >>> import clsplat
 >>> from clsplat.testing import synthetic_scene
 >>> gaussians, camera = synthetic_scene(20)
->>> rendering = clsplat.render(gaussians, camera)  # in NumPy; device=clsplat.Device() for kernels
+>>> rendering = clsplat.render(gaussians, camera)  # device="reference" renders without OpenCL
 >>> rendering.rgb.shape
 (29, 37, 3)
 >>> rendering.backward(rendering.rgb).gaussians.means.shape
@@ -20,8 +20,10 @@ from clsplat.formats import load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.rasterization import rasterization
 from clsplat.render import Rendering, render, render_views
+from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
 from clsplat.training.loop import train
+from clsplat.training.preparation import prepare
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -32,12 +34,14 @@ __all__ = [
     "Device",
     "Gaussians",
     "RenderConfig",
+    "Renderer",
     "Rendering",
     "Scene",
     "TrainConfig",
     "View",
     "load_gaussians",
     "load_scene",
+    "prepare",
     "rasterization",
     "render",
     "render_views",

@@ -1,4 +1,4 @@
-"""Evaluation: render views, compare them with their photos, and leave figures and a page to look at."""
+"""Evaluation: render views, compare them with their photos, and write metrics and a page of pictures."""
 
 import json
 import math
@@ -7,22 +7,19 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
-from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, psnr_fitted, ssim, to_uint8
-from clsplat.render import Color, render_views
+from clsplat.render import renderings
+from clsplat.renderer import Renderer
 from clsplat.scene import View
 from clsplat.show.evaluation_page import save_difference, save_png, write_page
-
-if TYPE_CHECKING:
-    from clsplat.device import Device
 
 Result = TypeVar("Result")
 Metric = Callable[..., float | None]
@@ -31,15 +28,15 @@ Metric = Callable[..., float | None]
 def mean_metrics(
     gaussians: Gaussians,
     views: Iterable[View],
-    config: RenderConfig = RenderConfig(),
-    device: "Device | None" = None,
-    background: Color = (0.0, 0.0, 0.0),
+    renderer: Renderer,
     metrics: Iterable[Metric] = (psnr, ssim),
 ) -> dict[str, Any]:
-    """Mean metrics over views, for the log of a training run; parameters as of `evaluate`.
+    """Mean metrics over views, for the log of a training run.
 
     Parameters
     ----------
+    gaussians, views, renderer
+        As given to `evaluate`.
     metrics : iterable of functions of `clsplat.metrics`
 
     Returns
@@ -52,7 +49,7 @@ def mean_metrics(
     def compare(_: int, view: View, image: NDArray[np.uint8]) -> list[float | None]:
         return [metric(image, view.image, view.mask) for metric in metrics]
 
-    figures = zip(*_compared(compare, gaussians, list(views), config, device, background), strict=True)
+    figures = zip(*_compared(compare, gaussians, list(views), renderer), strict=True)
     return {m.__name__: _mean(values) for m, values in zip(metrics, figures, strict=True)}
 
 
@@ -60,34 +57,28 @@ def evaluate(
     gaussians: Gaussians,
     views: Iterable[View],
     out: Path,
-    config: RenderConfig = RenderConfig(),
-    device: "Device | None" = None,
-    background: Color = (0.0, 0.0, 0.0),
+    renderer: Renderer,
 ) -> dict[str, Any]:
     """Render views and compare them with their photos.
 
     Parameters
     ----------
     gaussians : Gaussians
-        In the coordinates of the views.
+        In the coordinates of the views, on the host or on the renderer's device.
     views : iterable of View
         At least one; usually a scene's held-out views.
     out : Path
-        Folder, made where it is missing, for metrics.json, index.html, and the pictures in truth/, render/ and
-        difference/.
-    config : RenderConfig
-    device : Device, optional
-        None renders with the float64 twins.
-    background : (3,) floats
-        RGB behind the Gaussians: that of the photos where they were transparent.
+        Folder for metrics.json, index.html, and the pictures in truth/, render/ and difference/; created if missing.
+    renderer : Renderer
+        Its background is that of the photos where they were transparent.
 
     Returns
     -------
     dict
-        The content of metrics.json. ``mean`` holds psnr (dB), psnr_fitted (after an affine fit of the colours), ssim
-        and flip: the means of the views' figures;
-        ``views`` has those of each view, its size and the paths of its pictures. None (null) stands for a PSNR
-        that is infinite, as between equal images, and for FLIP where flip-evaluator is not installed.
+        The content of metrics.json. ``mean`` holds the means over the views of psnr (dB), psnr_fitted (dB, after an
+        affine fit of the colours), ssim and flip; ``views`` holds the same of each view, its size and the paths of
+        its pictures. None (null) stands for an infinite PSNR, as between equal images, and for FLIP where
+        flip-evaluator is not installed.
 
     Raises
     ------
@@ -99,7 +90,7 @@ def evaluate(
         for kind in kinds:
             (out / kind).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{out}: expected a folder that can be written to, found: {error.strerror}") from error
+        raise InputError(f"cannot create {out}: {error.strerror}") from error
     views = list(views)
     names = _file_names(views)
 
@@ -116,15 +107,15 @@ def evaluate(
         size = {"width": view.camera.width, "height": view.camera.height}
         return {"name": view.name, **metrics, **size, **files}
 
-    records = _compared(compare, gaussians, views, config, device, background)
+    records = _compared(compare, gaussians, views, renderer)
 
     result = {
         "mean": {metric: _mean([r[metric] for r in records]) for metric in ("psnr", "psnr_fitted", "ssim", "flip")},
         "num_gaussians": len(gaussians),
         "sh_degree": gaussians.sh_degree,
-        "mode": config.mode,
+        "mode": renderer.config.mode,
         "resolution": ", ".join(sorted({f"{r['width']}x{r['height']}" for r in records})),
-        "device": "float64 reference, no OpenCL" if device is None else device.label,
+        "device": renderer.label,
         "views": records,
     }
     with replacing(out / "metrics.json") as file:
@@ -142,11 +133,9 @@ def _compared(
     compare: Callable[[int, View, NDArray[np.uint8]], Result],
     gaussians: Gaussians,
     views: list[View],
-    config: RenderConfig,
-    device: "Device | None",
-    background: Color,
+    renderer: Renderer,
 ) -> list[Result]:
-    """What `compare` finds of each view, from its index and its render in 8 bits; on threads."""
+    """Call `compare` for each view, with its index and its render in 8 bits, on threads."""
     if not views:
         raise InputError("views: expected at least one view to evaluate, found none")
     for view in views:
@@ -154,13 +143,13 @@ def _compared(
         if view.image.shape != shape:
             raise InputError(f"{view.name}: expected a photo of its camera's size, {shape}, found {view.image.shape}")
     cameras = [view.camera for view in views]
-    renderings = render_views(gaussians, cameras, config, device, background=background)
+    images = (to_uint8(rendering.rgb) for rendering in renderings(renderer, gaussians, cameras))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(compare, range(len(views)), views, (to_uint8(r.rgb) for r in renderings)))
+        return list(pool.map(compare, range(len(views)), views, images))
 
 
 def _file_names(views: list[View]) -> list[str]:
-    """Names of PNGs for the views: safe in any file system and unlike each other."""
+    """File names of PNGs for the views: valid in any file system and different from each other."""
     names: list[str] = []
     taken: set[str] = set()
     for view in views:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsplat.camera import Camera, CameraModel
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
-from clsplat.render import download, stage_functions, upload
+from clsplat.renderer import Renderer, download
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -37,7 +37,7 @@ def rasterization(
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     camera_model: Literal["pinhole", "ortho", "fisheye"] = "pinhole",
     radial_coeffs: ArrayLike | None = None,
-    device: "Device | None" = None,
+    device: "Device | Literal['reference'] | None" = None,
 ) -> tuple[NDArray[Any], NDArray[Any], dict[str, Any]]:
     """Render a batch of cameras from activated parameters, with gsplat's arguments.
 
@@ -73,8 +73,8 @@ def rasterization(
         As `Camera` defines them.
     radial_coeffs : (C, 4), optional
         k1 to k4 of fisheyes; default 0.
-    device : Device, optional
-        None renders with the float64 twins.
+    device : Device, "reference" or None
+        None takes the default OpenCL device; "reference" the float64 twins, slowly.
 
     Returns
     -------
@@ -127,23 +127,22 @@ def rasterization(
     behind = np.zeros((cameras, channels)) if backgrounds is None else np.asarray(backgrounds, dtype=np.float64)
     _check_shape("backgrounds", behind, (cameras, channels))
 
-    stage = stage_functions(device)
-    parameters = upload(device, gaussians)
+    renderer = Renderer(device)
+    stages, parameters = renderer.stages, renderer.place(gaussians)
     renders, alphas, metas = [], [], []
     for i in range(cameras):
         intrinsics = Ks[i, 0, 0], Ks[i, 1, 1], Ks[i, 0, 2], Ks[i, 1, 2], width, height
         camera = Camera(viewmats[i], *intrinsics, CAMERA_MODELS[camera_model], tuple(distortions[i].tolist()))
-        splats = stage.project_fwd(parameters, camera, sh_degree or 0, antialiased=rasterize_mode == "antialiased")
-        edge = max(width, height) if device is None else tile_size
-        bins = stage.bin_splats(splats, width, height, edge, gradients=False)
+        splats = stages.project_fwd(parameters, camera, sh_degree or 0, antialiased=rasterize_mode == "antialiased")
+        edge = max(width, height) if renderer.device is None else tile_size
+        bins = stages.bin_splats(splats, width, height, edge, gradients=False)
         values = colors[i] if sh_degree is None else download(splats.colors)
         values = _with_depth(values, download(splats.depths), render_mode)
         background = np.zeros(values.shape[1])
         if "RGB" in render_mode:
             background[:channels] = behind[i]
-        values = values if device is None else device.upload("colors", values)
-        image = stage.composite_fwd(splats._replace(colors=values), bins, background)
-        render, alpha = np.array(download(image.image)), download(image.alpha)[:, :, None]
+        image = stages.composite_fwd(splats._replace(colors=renderer.upload("colors", values)), bins, background)
+        render, alpha = np.array(download(image.rgb)), download(image.alpha)[:, :, None]
         if "ED" in render_mode:
             render[:, :, -1:] = np.divide(render[:, :, -1:], alpha, out=np.zeros_like(alpha), where=alpha > 0)
         renders.append(render)

@@ -1,21 +1,19 @@
-"""Rendering and its gradients: the stages in their order, on a device or by the float64 twins."""
+"""Rendered images that know their gradients: `render`, `render_views` and the `Rendering` they return."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from functools import partial
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat import display, panorama, reference
+from clsplat import display, panorama
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.renderer import BLACK, Gradients, Pass, Renderer, download, fetch
 from clsplat.scene import Color
-from clsplat.stages import Bins, Dropout, Image, SplatGrads, Splats
+from clsplat.stages import Image
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -23,134 +21,8 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 
-class Gradients(NamedTuple):
-    """Gradients of a scalar with respect to what was rendered.
-
-    gaussians: per field of `Gaussians`, pre-activation; means2d (N, 2): per pixel, the statistic of densification;
-    viewmat (4, 4): each entry as an independent variable; intrinsics (4,): fx, fy, cx, cy; None if not asked for.
-    """
-
-    gaussians: Gaussians
-    means2d: Any
-    viewmat: NDArray[np.float64] | None
-    intrinsics: NDArray[np.float64] | None
-
-
-def stage_functions(device: "Device | None") -> Any:
-    """Namespace of the stage functions: `clsplat.ops` bound to `device`, or `clsplat.reference` for None."""
-    if device is None:
-        return reference
-    from clsplat import ops
-
-    return SimpleNamespace(**{name: partial(getattr(ops, name), device) for name in ops.__all__})
-
-
-@dataclass(frozen=True)
-class Pass:
-    """A forward pass: what `backward` needs of it. Arrays live where the stages ran.
-
-    disparities: of the splats, where pixels are sorted.
-    """
-
-    gaussians: Gaussians
-    camera: Camera
-    config: RenderConfig
-    sh_degree: int
-    splats: Splats
-    bins: Bins
-    image: Image
-    disparities: Any = None
-    dropout: Dropout | None = None
-
-
-def forward(
-    device: "Device | None",
-    gaussians: Gaussians,
-    camera: Camera,
-    config: RenderConfig,
-    background: Any,
-    sh_degree: int,
-    *,
-    gradients: bool = True,
-    dropout: Dropout | None = None,
-) -> Pass:
-    """Run the stages from Gaussians to an image.
-
-    Parameters
-    ----------
-    device : Device or None
-        None runs the twins.
-    gaussians : Gaussians of N >= 1 rows, arrays of the device
-    background : (C,) array on the host
-        Its length is the number of channels: 3 for RGB, 4 to composite the depth too.
-    gradients : bool
-        Whether `backward` will follow: its lists of intersections are left out otherwise.
-    dropout : Dropout, optional
-        Which splats are left out while training.
-    """
-    stage = stage_functions(device)
-    if config.near is not None:
-        camera = replace(camera, near=config.near)
-    antialiased = config.mode == "antialiased"
-    splats = stage.project_fwd(gaussians, camera, sh_degree, antialiased=antialiased, channels=len(background))
-    if dropout:
-        stage.dropout_fwd(splats, dropout)
-    # The twins work splat by splat and gain nothing from tiles.
-    tile_size = max(camera.width, camera.height) if device is None else config.tile_size
-    by_pixel = config.sort == "pixel"
-    scheme = "auto" if by_pixel else config.sort
-    bins = stage.bin_splats(splats, camera.width, camera.height, tile_size, gradients=gradients, scheme=scheme)
-    disparities = stage.project_disparities(gaussians, camera, splats) if by_pixel else None
-    image = stage.composite_fwd(splats, bins, background, compositor=config.compositor, disparities=disparities)
-    return Pass(gaussians, camera, config, sh_degree, splats, bins, image, disparities, dropout)
-
-
-def backward_to_splats(device: "Device | None", run: Pass, v_image: Image) -> SplatGrads:
-    """The first half of `backward`: gradients with respect to the splats."""
-    stage = stage_functions(device)
-    v_splats: SplatGrads = stage.composite_bwd(
-        run.splats, run.bins, run.image, v_image, compositor=run.config.compositor, disparities=run.disparities
-    )
-    if run.dropout:
-        stage.dropout_bwd(v_splats, run.dropout)
-    return v_splats
-
-
-def backward(device: "Device | None", run: Pass, v_image: Image, *, camera_grad: bool = False) -> Gradients:
-    """Gradients of a forward pass, from the gradients with respect to its image and alpha."""
-    v_splats = backward_to_splats(device, run, v_image)
-    v_gaussians, v_camera = stage_functions(device).project_bwd(
-        run.gaussians,
-        run.camera,
-        run.sh_degree,
-        run.splats,
-        v_splats,
-        antialiased=run.config.mode == "antialiased",
-        camera_grad=camera_grad,
-    )
-    return Gradients(v_gaussians, v_splats.means2d, *(v_camera or (None, None)))
-
-
-def upload(device: "Device | None", gaussians: Gaussians) -> Gaussians:
-    """The Gaussians on the device; as float64 for None."""
-    if device is None:
-        return gaussians.astype(np.float64)
-    arrays: dict[str, Any] = {name: device.upload(name, array) for name, array in gaussians.arrays().items()}
-    return Gaussians(**arrays)
-
-
-def download(array: Any) -> Array:
-    """A device array on the host; a NumPy array as it is."""
-    return array if isinstance(array, np.ndarray) else array.get()
-
-
-def fetch(gaussians: Gaussians) -> Gaussians:
-    """Gaussians of the device on the host; those of the host as they are."""
-    return Gaussians(**{name: download(array) for name, array in gaussians.arrays().items()})
-
-
 class Rendering:
-    """A rendered image that knows how to differentiate itself; made by `render` and, without that, `render_views`.
+    """A rendered image that can differentiate itself; made by `render` and, without gradients, by `render_views`.
 
     Attributes
     ----------
@@ -163,8 +35,8 @@ class Rendering:
         weighted as the colours are; 0 where alpha is 0. None unless asked for.
     """
 
-    def __init__(self, device: "Device | None", run: Pass | None, gaussians: Gaussians, image: Array, alpha: Array):
-        self._device, self._run, self._gaussians = device, run, gaussians
+    def __init__(self, renderer: Renderer, run: Pass | None, gaussians: Gaussians, image: Array, alpha: Array):
+        self._renderer, self._run, self._gaussians = renderer, run, gaussians
         self.rgb, self.alpha = image[:, :, :3], alpha
         self.depth: Array | None = None
         if image.shape[2] == 4:
@@ -187,7 +59,7 @@ class Rendering:
         Parameters
         ----------
         v_rgb, v_alpha, v_depth : arrays of the shapes of rgb, alpha and depth, optional
-            The scalar's gradients with respect to them; left out: 0.
+            The scalar's gradients with respect to them; default: 0.
         viewmat_grad, intrinsics_grad : bool
             Also return the gradient with respect to the viewmat, and to fx, fy, cx, cy.
 
@@ -199,9 +71,24 @@ class Rendering:
         Raises
         ------
         InputError
-            If a shape does not fit, v_depth is given though no depth was rendered, or it was rendered without
+            If a shape does not fit, v_depth is given though no depth was rendered, or the rendering was made without
             gradients.
         """
+        self._check(v_rgb, v_alpha, v_depth)
+        if self._run is None:
+            zeros = Gaussians(**{k: np.zeros_like(a) for k, a in self._gaussians.arrays().items()})
+            result = Gradients(zeros, np.zeros((0, 2)), np.zeros((4, 4)), np.zeros(4))
+        else:
+            v_image = self._image_gradients(v_rgb, v_alpha, v_depth)
+            v_image = Image(*(self._renderer.upload("v_image", array) for array in v_image))
+            result = self._renderer.backward(self._run, v_image, camera_grad=viewmat_grad or intrinsics_grad)
+            result = result._replace(gaussians=fetch(result.gaussians), means2d=download(result.means2d))
+        return result._replace(
+            viewmat=result.viewmat if viewmat_grad else None,
+            intrinsics=result.intrinsics if intrinsics_grad else None,
+        )
+
+    def _check(self, v_rgb: Array | None, v_alpha: Array | None, v_depth: Array | None) -> None:
         if self._run is None and len(self._gaussians):
             raise InputError(
                 "gradients: expected a rendering made with gradients=True of a camera that is not equirectangular, "
@@ -214,11 +101,9 @@ class Rendering:
         ):
             if v is not None and np.shape(v) != shape:
                 raise InputError(f"{name}: expected shape {shape}, found {np.shape(v)}")
-        if self._run is None:
-            zeros = Gaussians(**{k: np.zeros_like(a) for k, a in self._gaussians.arrays().items()})
-            v_viewmat, v_intrinsics = np.zeros((4, 4)), np.zeros(4)
-            result = Gradients(zeros, np.zeros((0, 2)), v_viewmat, v_intrinsics)
-            return _asked_for(result, viewmat_grad, intrinsics_grad)
+
+    def _image_gradients(self, v_rgb: Array | None, v_alpha: Array | None, v_depth: Array | None) -> Image:
+        """Gradients with respect to the composited channels; the depth is the fourth channel over alpha."""
         # Filled on the host: its dtype is that of the image.
         v_image = np.zeros((*self.alpha.shape, 3 if self.depth is None else 4), dtype=self.alpha.dtype)
         v_total_alpha = np.zeros_like(self.alpha) if v_alpha is None else np.array(v_alpha, dtype=self.alpha.dtype)
@@ -227,27 +112,16 @@ class Rendering:
         if v_depth is not None and self.depth is not None:
             v_image[:, :, 3] = np.divide(v_depth, self.alpha, out=np.zeros_like(self.alpha), where=self.alpha > 0)
             v_total_alpha -= v_image[:, :, 3] * self.depth
-        v_run = Image(v_image, v_total_alpha)
-        if self._device is not None:
-            v_run = Image(*(self._device.upload("v_image", a) for a in v_run))
-        result = backward(self._device, self._run, v_run, camera_grad=viewmat_grad or intrinsics_grad)
-        result = result._replace(gaussians=fetch(result.gaussians), means2d=download(result.means2d))
-        return _asked_for(result, viewmat_grad, intrinsics_grad)
-
-
-def _asked_for(gradients: Gradients, viewmat: bool, intrinsics: bool) -> Gradients:
-    return gradients._replace(
-        viewmat=gradients.viewmat if viewmat else None, intrinsics=gradients.intrinsics if intrinsics else None
-    )
+        return Image(v_image, v_total_alpha)
 
 
 def render(
     gaussians: Gaussians,
     camera: Camera,
     config: RenderConfig = RenderConfig(),
-    device: "Device | None" = None,
+    device: "Device | Literal['reference'] | None" = None,
     *,
-    background: Color = (0.0, 0.0, 0.0),
+    background: Color = BLACK,
     sh_degree: int | None = None,
     depth: bool = False,
     gradients: bool = True,
@@ -261,8 +135,9 @@ def render(
     camera : Camera
         An equirectangular one is resampled from six faces of a cube, and has no gradients.
     config : RenderConfig
-    device : Device, optional
-        None renders with the float64 twins: exact and slow.
+    device : Device, "reference" or None
+        None takes the default OpenCL device, opened once and kept; "reference" the float64 twins, which are exact,
+        slow and need no OpenCL.
     background : (3,) floats
         RGB behind the Gaussians.
     sh_degree : int, optional
@@ -279,21 +154,21 @@ def render(
     Raises
     ------
     InputError
-        If the Gaussians' shapes do not fit each other or sh_degree exceeds what is stored.
+        If the Gaussians' shapes do not fit each other, sh_degree exceeds what is stored, or `device` is another text.
     DeviceError
-        If a buffer exceeds the device's limits.
+        If there is no OpenCL device, or a buffer exceeds its limits.
     """
-    behind, degree = _checked(gaussians, background, sh_degree, depth)
-    return next(_renderings(gaussians, [camera], config, device, behind, degree, gradients=gradients))
+    renderer = Renderer(device, config, background)
+    return next(renderings(renderer, gaussians, [camera], sh_degree, depth=depth, gradients=gradients))
 
 
 def render_views(
     gaussians: Gaussians,
     cameras: Iterable[Camera],
     config: RenderConfig = RenderConfig(),
-    device: "Device | None" = None,
+    device: "Device | Literal['reference'] | None" = None,
     *,
-    background: Color = (0.0, 0.0, 0.0),
+    background: Color = BLACK,
     sh_degree: int | None = None,
     depth: bool = False,
 ) -> Iterator[Rendering]:
@@ -302,69 +177,70 @@ def render_views(
     Parameters
     ----------
     cameras : iterable of Camera
-        Of any sizes; each is asked for when its image is.
+        Cameras of any sizes; each is asked for when its image is.
     gaussians, config, device, background, sh_degree, depth
         As given to `render`, which has the errors too.
 
     Yields
     ------
     Rendering
-        Per camera; without gradients.
+        One per camera, without gradients.
     """
-    behind, degree = _checked(gaussians, background, sh_degree, depth)
-    return _renderings(gaussians, cameras, config, device, behind, degree, gradients=False)
+    return renderings(Renderer(device, config, background), gaussians, cameras, sh_degree, depth=depth)
 
 
-def _checked(gaussians: Gaussians, background: Color, sh_degree: int | None, depth: bool) -> tuple[Array, int]:
-    """What is behind each channel, and the degree that is evaluated."""
-    gaussians.validate()
+def renderings(
+    renderer: Renderer,
+    gaussians: Gaussians,
+    cameras: Iterable[Camera],
+    sh_degree: int | None = None,
+    *,
+    depth: bool = False,
+    gradients: bool = False,
+) -> Iterator[Rendering]:
+    """Render with a renderer that exists; arguments and errors as of `render`.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        On the host or on the renderer's device.
+    """
+    if isinstance(gaussians.means, np.ndarray):
+        gaussians.validate()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= gaussians.sh_degree:
         raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree} (what is stored), found {degree}")
-    return np.array([*background, 0.0] if depth else background), degree
+    return _renderings(renderer, gaussians, cameras, degree, depth, gradients)
 
 
 def _renderings(
-    gaussians: Gaussians,
-    cameras: Iterable[Camera],
-    config: RenderConfig,
-    device: "Device | None",
-    background: Array,
-    sh_degree: int,
-    *,
-    gradients: bool,
+    renderer: Renderer, gaussians: Gaussians, cameras: Iterable[Camera], degree: int, depth: bool, gradients: bool
 ) -> Iterator[Rendering]:
-    uploaded = upload(device, gaussians) if len(gaussians) else gaussians
+    """A generator, apart from `renderings` so that this one's errors come before the first image is asked for."""
+    placed = renderer.place(gaussians) if len(gaussians) else gaussians
     for camera in cameras:
-        run, image, alpha = _rendered(device, uploaded, camera, config, background, sh_degree, gradients=gradients)
-        yield Rendering(device, run if gradients else None, gaussians, image, alpha)
+        run, image, alpha = _rendered(renderer, placed, camera, degree, depth, gradients)
+        yield Rendering(renderer, run if gradients else None, gaussians, image, alpha)
 
 
 def _rendered(
-    device: "Device | None",
-    gaussians: Gaussians,
-    camera: Camera,
-    config: RenderConfig,
-    background: Array,
-    sh_degree: int,
-    *,
-    gradients: bool,
+    renderer: Renderer, gaussians: Gaussians, camera: Camera, degree: int, depth: bool, gradients: bool
 ) -> tuple[Pass | None, Array, Array]:
     """The pass, where there is one, its image and its alpha, on the host."""
     if len(gaussians) == 0:
-        dtype = np.float64 if device is None else device.real
-        image: Array = np.broadcast_to(background.astype(dtype), (camera.height, camera.width, len(background)))
-        return None, image, np.zeros(image.shape[:2], dtype)
+        behind = np.array([*renderer.background, *[0.0] * depth], renderer.real)
+        image: Array = np.broadcast_to(behind, (camera.height, camera.width, len(behind)))
+        return None, image, np.zeros(image.shape[:2], renderer.real)
     if camera.model == "equirectangular":
         layers = []
         for face in panorama.faces(camera):
-            _, image, alpha = _rendered(device, gaussians, face, config, background, sh_degree, gradients=False)
-            if len(background) == 4:  # from depths to distances
+            _, image, alpha = _rendered(renderer, gaussians, face, degree, depth, gradients=False)
+            if depth:  # from depths to distances
                 u, v = np.meshgrid(np.arange(face.width) + 0.5, np.arange(face.height) + 0.5)
                 image = image.copy()
                 image[:, :, 3] /= face.rays(u, v)[:, :, 2]
             layers.append(np.concatenate([image, alpha[:, :, None]], axis=2))
         whole = panorama.assemble(camera, layers)
         return None, whole[:, :, :-1], whole[:, :, -1]
-    run = forward(device, gaussians, camera, config, background, sh_degree, gradients=gradients)
-    return run, download(run.image.image), download(run.image.alpha)
+    run = renderer.forward(gaussians, camera, degree, depth=depth, gradients=gradients)
+    return run, download(run.image.rgb), download(run.image.alpha)

@@ -1,16 +1,24 @@
-"""What flows between the stages: one set of containers for device arrays (`clsplat.ops`) and NumPy
-(`clsplat.reference`).
+"""The stages of the pipeline: the functions of each, and the containers of arrays that flow between them.
 
-N Gaussians, M intersections of a splat with a tile, T tiles, C colour channels, H x W pixels.
+`clsplat.ops` implements `Stages` with kernels on device arrays, `clsplat.reference` in NumPy; both use the same
+containers. N Gaussians, M intersections of a splat with a tile, T tiles, C colour channels, H x W pixels.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+if TYPE_CHECKING:
+    from clsplat.camera import Camera
+    from clsplat.gaussians import Gaussians
+
+Array = Any
+"""An array of the device, or of NumPy."""
 
 ERANK_SLACK = 1e-5
-"""Bounds the penalty of needles: at an effective rank of 1 it is 11.5 (Hyung et al. 2024)."""
+"""Offset of the effective rank in the penalty of needles, which bounds it by 11.5 (Hyung et al. 2024)."""
 
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
-"""Noise on the means fades out where the opacity rises above 0.005, over some hundredths (original code of Kheradmand
+"""Slope and centre of the sigmoid of the opacity that fades out the noise on the means (original code of Kheradmand
 et al. 2024)."""
 
 
@@ -50,7 +58,7 @@ class CameraGrads(NamedTuple):
 
 
 class Dropout(NamedTuple):
-    """Which splats are left out of an image: `rate` of them, in [0, 1), drawn anew for each seed and iteration."""
+    """The splats left out of an image: a fraction `rate` of them, in [0, 1), drawn for each seed and iteration."""
 
     rate: float
     seed: int
@@ -63,7 +71,7 @@ class Dropout(NamedTuple):
 
     @property
     def threshold(self) -> int:
-        """Of 32-bit draws: those below it are dropped."""
+        """Bound on 32-bit draws, below which a splat is dropped."""
         return round(self.rate * 2**32)
 
 
@@ -87,14 +95,15 @@ class Bins(NamedTuple):
 
 
 class Image(NamedTuple):
-    """What compositing yields: image (H, W, C), background included, and alpha (H, W)."""
+    """Result of compositing: rgb (H, W, C), background included, with the depth as a fourth channel where it was
+    asked for; and alpha (H, W)."""
 
-    image: Any
+    rgb: Any
     alpha: Any
 
 
 class Removal(NamedTuple):
-    """What becomes of an image's squared error, summed over pixels and channels, if one splat alone changes.
+    """Changes of an image's squared error, summed over pixels and channels, if one splat alone changes.
 
     errors (N,): by how much it grows if the splat is removed; differences (N,): the squared difference that this
     makes to the image, the same if the image is its own target; weights (N,), squares (N,): sums of the weight
@@ -112,8 +121,8 @@ class Removal(NamedTuple):
 class AdamStep(NamedTuple):
     """One step of the optimiser: its number, counted from 1, and its constants.
 
-    rates: learning rate by field of `clsplat.gaussians.Gaussians`, with sh0 and sh_rest in the place of sh.
-    sh_degree: bands above it have had no gradient yet, and are left alone. penalties: weights in the loss of the sum
+    rates: learning rate by field of `clsplat.gaussians.Gaussians`, with sh0 and sh_rest instead of sh. sh_degree: the
+    bands above it have had no gradient yet and do not change. penalties: weights in the loss of the sum
     of all opacities, of that of all scales, and of that of max(-ln(erank - 1 + ERANK_SLACK), 0), whose gradients
     are added to those given; erank is a Gaussian's effective rank: 1 for a needle, 2 for a disc, 3 for a ball.
     """
@@ -125,3 +134,100 @@ class AdamStep(NamedTuple):
     eps: float
     sh_degree: int
     penalties: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class Stages(Protocol):
+    """The functions of all stages, on a device (`clsplat.ops.Launches`) or in NumPy (the module `clsplat.reference`).
+
+    This is the only list of their names. Each function's docstring is with its launch in `clsplat.ops`.
+    """
+
+    def project_fwd(
+        self,
+        gaussians: "Gaussians",
+        camera: "Camera",
+        sh_degree: int,
+        *,
+        antialiased: bool = False,
+        channels: int = 3,
+    ) -> Splats: ...
+    def project_disparities(self, gaussians: "Gaussians", camera: "Camera", splats: Splats) -> Array: ...
+    def project_bwd(
+        self,
+        gaussians: "Gaussians",
+        camera: "Camera",
+        sh_degree: int,
+        splats: Splats,
+        v_splats: SplatGrads,
+        *,
+        antialiased: bool = False,
+        camera_grad: bool = False,
+    ) -> tuple["Gaussians", CameraGrads | None]: ...
+    def project_bwd_adam(
+        self,
+        gaussians: "Gaussians",
+        moments: tuple["Gaussians", "Gaussians"],
+        camera: "Camera",
+        splats: Splats,
+        v_splats: SplatGrads,
+        step: AdamStep,
+        *,
+        antialiased: bool = False,
+        camera_grad: bool = False,
+    ) -> CameraGrads | None: ...
+    def dropout_fwd(self, splats: Splats, dropout: Dropout) -> None: ...
+    def dropout_bwd(self, v_splats: SplatGrads, dropout: Dropout) -> None: ...
+    def bin_splats(
+        self,
+        splats: Splats,
+        width: int,
+        height: int,
+        tile_size: int,
+        *,
+        gradients: bool = True,
+        scheme: str = "auto",
+    ) -> Bins: ...
+    def composite_fwd(
+        self, splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto", disparities: Array = None
+    ) -> Image: ...
+    def composite_bwd(
+        self,
+        splats: Splats,
+        bins: Bins,
+        image: Image,
+        v_image: Image,
+        *,
+        compositor: str = "auto",
+        disparities: Array = None,
+    ) -> SplatGrads: ...
+    def count_pairs(self, splats: Splats, bins: Bins) -> tuple[Array, Array]: ...
+    def removal(
+        self, splats: Splats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
+    ) -> Removal: ...
+    def exposure_fwd(self, image: Array, affine: Any, photo: Array) -> Array: ...
+    def exposure_bwd(self, image: Array, affine: Any, photo: Array, v_image: Array) -> Any: ...
+    def l1_ssim(self, image: Array, photo: Array, ssim_weight: float, mask: Array = None) -> tuple[float, Array]: ...
+    def observe(
+        self, extents: Array, v_means2d: Array, width: int, height: int, grad_sum: Array, seen: Array
+    ) -> None: ...
+    def adam_step(
+        self,
+        gaussians: "Gaussians",
+        gradients: "Gaussians",
+        first: "Gaussians",
+        second: "Gaussians",
+        step: AdamStep,
+    ) -> None: ...
+    def add_noise(self, gaussians: "Gaussians", size: float, seed: int, iteration: int) -> None: ...
+    def pixel_sizes(self, gaussians: "Gaussians", cameras: Iterable["Camera"]) -> Array: ...
+    def filter_fwd(self, gaussians: "Gaussians", pixels: Array) -> "Gaussians": ...
+    def filter_bwd(self, gaussians: "Gaussians", pixels: Array, v: "Gaussians") -> "Gaussians": ...
+    def exclusive_scan(self, values: Array, what: str = "scan") -> tuple[Array, int]: ...
+    def argsort(
+        self, keys: Array, bits: int, method: str = "auto", *, values: Array = None
+    ) -> tuple[Array, Array]: ...
+    def argsort_segments(self, keys: Array, bits: int, ranges: Array, values: Array = None) -> Array: ...
+
+
+STAGES: tuple[str, ...] = tuple(name for name in vars(Stages) if not name.startswith("_"))
+"""Names of the functions of `Stages`, in the order of the pipeline."""

@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from clsplat import ops
 from clsplat.bench.environment import describe
 from clsplat.bench.roof import measure_roof
-from clsplat.bench.timing import STILL, Clock, clock, quartiles, training_step
+from clsplat.bench.timing import STILL, Clock, clock, quartiles, run_step, training_of
 from clsplat.bench.workloads import Workload
-from clsplat.config import BACKGROUNDS, RenderConfig, TrainConfig
+from clsplat.config import RenderConfig, TrainConfig
 from clsplat.device import Device
-from clsplat.render import forward, upload
+from clsplat.renderer import Renderer
+from clsplat.stages import STAGES
+from clsplat.training.loop import Training
 
 WARM_UP = 2
 """Steps of each kind before those that count: they build kernels and fill the pool of buffers."""
@@ -34,9 +35,10 @@ class _Spent:
 
 
 @contextmanager
-def _watched(device: Device, kernels: bool) -> Iterator[_Spent]:
-    """Time the functions of `clsplat.ops`, or the kernels they launch as STAGE/KERNEL, by waiting after each."""
-    spent, stages = _Spent(), {name: getattr(ops, name) for name in ops.__all__}
+def _watched(training: Training, kernels: bool) -> Iterator[_Spent]:
+    """Time a training's stages, or the kernels they launch as STAGE/KERNEL, by waiting after each."""
+    device, launches = training.device, training.renderer.stages
+    spent, functions = _Spent(), {name: getattr(launches, name) for name in STAGES}
     launch, stage = device.launch, ""
 
     def timed(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -55,16 +57,16 @@ def _watched(device: Device, kernels: bool) -> Iterator[_Spent]:
     def timed_launch(folder: str, kernel: str, *args: Any, **kwargs: Any) -> None:
         timed(f"{stage}/{kernel}", launch, folder, kernel, *args, **kwargs)
 
-    for name, function in stages.items():
-        setattr(ops, name, partial(entered if kernels else timed, name, function))
+    for name, function in functions.items():
+        setattr(launches, name, partial(entered if kernels else timed, name, function))
     if kernels:
         vars(device)["launch"] = timed_launch  # shadows the method
     try:
         yield spent
     finally:
         vars(device).pop("launch", None)
-        for name, function in stages.items():
-            setattr(ops, name, function)
+        for name, function in functions.items():
+            setattr(launches, name, function)
 
 
 def stage_bytes(n: int, sh_degree: int, pixels: int, intersections: int) -> dict[str, int]:
@@ -112,9 +114,10 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
     """
     gaussians, view = workload.gaussians, workload.view
     config = TrainConfig(strategy="adc", size="fixed", render=render, optim=STILL)
-    background = BACKGROUNDS[config.data.background]
-    run = forward(device, upload(device, gaussians), view.camera, render, background, gaussians.sh_degree)
-    evaluated, accepted = (int(a.get().sum(dtype=np.uint64)) for a in ops.count_pairs(device, run.splats, run.bins))
+    renderer = Renderer(device, render)
+    run = renderer.forward(gaussians, view.camera)
+    pairs = renderer.stages.count_pairs(run.splats, run.bins)
+    evaluated, accepted = (int(a.get().sum(dtype=np.uint64)) for a in pairs)
     counts = {
         "visible": int((run.splats.extents.get()[:, 0] > 0).sum()),
         "intersections": int(run.bins.gauss_ids.shape[0]),
@@ -123,17 +126,17 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
     }
     del run
 
-    one_step = training_step(workload, config, device)
+    training = training_of(workload, config, device)
     steps: list[Clock] = []
     samples: defaultdict[str, list[Clock]] = defaultdict(list)
     calls: dict[str, int] = {}
     for repeat in range(-WARM_UP, repeats):
         start = clock()
-        one_step()
+        run_step(training)
         whole = clock() - start
         for kernels in (False, True):
-            with _watched(device, kernels) as spent:
-                one_step()
+            with _watched(training, kernels) as spent:
+                run_step(training)
             if repeat >= 0:
                 calls |= spent.calls
                 for name, time in spent.time.items():

@@ -2,20 +2,21 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.bench.environment import describe
-from clsplat.bench.timing import STILL, Clock, clock, quartiles, training_step
+from clsplat.bench.timing import STILL, Clock, clock, quartiles, run_step, training_of
 from clsplat.bench.workloads import Workload
-from clsplat.config import BACKGROUNDS, RenderConfig, TrainConfig
+from clsplat.config import RenderConfig, TrainConfig
 from clsplat.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import with_degree
-from clsplat.render import download, forward, upload
+from clsplat.renderer import Renderer, download
 
 ALPHA_MINS = (0.5 * ALPHA_MIN, 2 * ALPHA_MIN, 4 * ALPHA_MIN, 8 * ALPHA_MIN)
 TRANSMITTANCE_MINS = (0.1 * TRANSMITTANCE_MIN, 10 * TRANSMITTANCE_MIN, 100 * TRANSMITTANCE_MIN)
@@ -90,27 +91,25 @@ class _Run:
         if setting.sh_degree is not None:
             gaussians = with_degree(gaussians, setting.sh_degree)
         self.device = Device(device.cl_device, setting.real, device.memory_limit, setting.model)
-        self.config, self.camera, self.degree = setting.render, workload.view.camera, gaussians.sh_degree
-        self.gaussians = upload(self.device, gaussians)
+        self.renderer, self.camera = Renderer(self.device, setting.render), workload.view.camera
+        self.gaussians = self.renderer.place(gaussians)
         if setting.trains:
             config = TrainConfig(
                 strategy="adc", size="fixed", render=setting.render, optim=STILL, optimizer=setting.optimizer
             )
-            self.step = training_step(replace(workload, gaussians=gaussians), config, self.device)
+            training = training_of(replace(workload, gaussians=gaussians), config, self.device)
+            self.step = partial(run_step, training)
 
     def render(self) -> Any:
         """The image, on the device and finished."""
-        black = BACKGROUNDS["black"]
-        run = forward(self.device, self.gaussians, self.camera, self.config, black, self.degree, gradients=False)
+        run = self.renderer.forward(self.gaussians, self.camera, gradients=False)
         self.device.queue.finish()
-        return run.image.image
+        return run.image.rgb
 
 
 def twin_image(gaussians: Gaussians, workload: Workload, base: RenderConfig) -> Image:
     """What everything is held against: the float64 twin with the default constants and all spherical harmonics."""
-    black = BACKGROUNDS["black"]
-    host, camera = upload(None, gaussians), workload.view.camera
-    image: Image = forward(None, host, camera, base, black, gaussians.sh_degree, gradients=False).image.image
+    image: Image = Renderer("reference", base).forward(gaussians, workload.view.camera, gradients=False).image.rgb
     return image
 
 

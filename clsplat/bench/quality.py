@@ -18,16 +18,18 @@ from tqdm import tqdm
 from clsplat.bench.environment import describe
 from clsplat.bench.results import KEYS, Record, append_record, read_records, write_records
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
-from clsplat.dataset import load_scene, with_points
+from clsplat.dataset import load_scene
 from clsplat.device import Device
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluate import mean_metrics
 from clsplat.formats import save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, ssim
-from clsplat.render import render_views
+from clsplat.render import renderings
+from clsplat.renderer import Renderer, fetch
 from clsplat.scene import Scene, View
 from clsplat.training.loop import train
+from clsplat.training.preparation import prepare
 from clsplat.training.presets import YAML, load_config, load_preset, with_settings
 
 SAMPLES = 8
@@ -254,8 +256,8 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
                 scene = _load(source)
             if not isinstance(scene, Scene):
                 raise scene or ClsplatError(f"{cell.source.path}: could not be read, see above")
-            start = with_points(scene, source.path, source.data) if cell.config.init.triangulate else scene
-            last = run_cell(cell, start, device, record)
+            start, config = prepare(source.path, cell.config, scene=scene)
+            last = run_cell(config, start, device, record)
             flips = "" if last["flip"] is None else f", FLIP {last['flip']:.3f}"
             say(
                 f"    {last['psnr']:.2f} dB, SSIM {last['ssim']:.3f}{flips}; {last['seconds']:.0f} s, "
@@ -287,22 +289,21 @@ def _finished(cell: Cell, records: list[Record], device: str) -> bool:
     return any("fps" in r and {k: r.get(k) for k in wanted} == wanted for r in records)
 
 
-def run_cell(cell: Cell, scene: Scene, evaluator: Device, record: Callable[[Record], None]) -> Record:
+def run_cell(config: TrainConfig, scene: Scene, evaluator: Device, record: Callable[[Record], None]) -> Record:
     """Train once; hand each sample to `record`, and return the last, which has the rate of frames.
 
     Parameters
     ----------
-    cell : Cell
+    config : TrainConfig
     scene : Scene
-        With held-out photos.
+        With held-out photos; both as `prepare` returns them.
     evaluator : Device
         Renders the held-out views: apart from the device that trains, whose memory is measured.
     record : callable
     """
-    from clsplat.training.memory import parse_size
+    from clsplat.training.memory import parse_bytes
 
-    config = cell.config
-    limit = None if config.memory_limit is None else parse_size(config.memory_limit, "--memory-limit")
+    limit = None if config.memory_limit is None else parse_bytes(config.memory_limit, "--memory-limit")
     views = scene.train + scene.test
     facts = {
         "train": len(scene.train),
@@ -311,12 +312,13 @@ def run_cell(cell: Cell, scene: Scene, evaluator: Device, record: Callable[[Reco
         "height": max(view.camera.height for view in views),
     }
     at = sample_iterations(config.iterations)
+    renderer = Renderer(evaluator, config.render, BACKGROUNDS[config.data.background])
     device = Device(evaluator.cl_device, memory_limit=limit)
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         # Of what a file format cannot hold: once per cell would be too often.
         warnings.simplefilter("ignore")
         out = Path(folder)
-        train(scene, replace(config, iterations=WARM_UP, strategy="adc", size="fixed"), device, out)
+        train(scene, replace(config, iterations=WARM_UP, strategy="adc", size="fixed"), out, device)
         clocks = time.perf_counter, time.process_time
         evaluating = np.zeros(2)
         pending = iter(at)
@@ -327,7 +329,7 @@ def run_cell(cell: Cell, scene: Scene, evaluator: Device, record: Callable[[Reco
             now = np.array([clock() for clock in clocks])
             seconds, cpu_seconds = map(float, now - started - evaluating)
             values = facts | {"iteration": iteration, "seconds": seconds, "cpu_seconds": cpu_seconds}
-            values |= measure(gaussians, scene.test, config, evaluator, out)
+            values |= measure(fetch(gaussians), scene.test, renderer, out)
             values |= {"memory_bytes": device.memory_peak}
             evaluating += np.array([clock() for clock in clocks]) - now
             return values
@@ -344,10 +346,10 @@ def run_cell(cell: Cell, scene: Scene, evaluator: Device, record: Callable[[Reco
                 bar.update(now["iteration"] - bar.n)
 
             gaussians = train(
-                scene, config, device, out, evaluate=evaluate, evaluate_after=set(at[:-1]), progress=progress
+                scene, config, out, device, evaluate=evaluate, evaluate_after=set(at[:-1]), progress=progress
             )
         values = sample(config.iterations, gaussians)
-        values |= {"fps": frames_per_second(gaussians, scene.test, config, evaluator)}
+        values |= {"fps": frames_per_second(gaussians, scene.test, renderer)}
         record(values)
     return values
 
@@ -357,29 +359,27 @@ def sample_iterations(iterations: int) -> list[int]:
     return sorted({int(i) for i in np.rint(np.geomspace(max(1, FIRST_SAMPLE * iterations), iterations, SAMPLES))})
 
 
-def measure(gaussians: Gaussians, views: list[View], config: TrainConfig, device: Device, folder: Path) -> Record:
+def measure(gaussians: Gaussians, views: list[View], renderer: Renderer, folder: Path) -> Record:
     """Quality on held-out views, and size: in Gaussians, and in bytes of the files that `folder` is for."""
-    background = BACKGROUNDS[config.data.background]
-    figures = mean_metrics(gaussians, views, config.render, device, background, metrics=(psnr, ssim, flip))
+    figures = mean_metrics(gaussians, views, renderer, metrics=(psnr, ssim, flip))
     sizes = {}
     for suffix in ("ply", "spz"):
         path = folder / f"sample.{suffix}"
-        save_gaussians(path, gaussians, config.render.mode)
+        save_gaussians(path, gaussians, renderer.config.mode)
         sizes[f"{suffix}_bytes"] = path.stat().st_size
     finite = {name: value if value is not None and math.isfinite(value) else None for name, value in figures.items()}
     return {"num_gaussians": len(gaussians), "sh_degree": gaussians.sh_degree, **sizes, **finite}
 
 
-def frames_per_second(gaussians: Gaussians, views: list[View], config: TrainConfig, device: Device) -> float:
+def frames_per_second(gaussians: Gaussians, views: list[View], renderer: Renderer) -> float:
     """Images per second: one over the median time from a camera to its image in the host's memory."""
     cameras = [view.camera for view in views]
-    background = BACKGROUNDS[config.data.background]
     # Once more than is timed: what is first for the device is done in the first round.
-    renderings = render_views(gaussians, cameras * (FRAMES + 1), config.render, device, background=background)
+    images = renderings(renderer, gaussians, cameras * (FRAMES + 1))
     seconds = []
     while True:
         started = time.perf_counter()
-        if next(renderings, None) is None:
+        if next(images, None) is None:
             break
         seconds.append(time.perf_counter() - started)
     return 1 / float(np.median(seconds[len(cameras) :]))

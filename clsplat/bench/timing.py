@@ -1,7 +1,6 @@
 """Clocks, what becomes of their readings, and the training step that is timed."""
 
 import time
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +8,13 @@ from numpy.typing import NDArray
 from clsplat.bench.workloads import Workload
 from clsplat.config import OptimConfig, TrainConfig
 from clsplat.device import Device
-from clsplat.training.checkpoint import State, move
+from clsplat.scene import Scene
 from clsplat.training.densify import STRATEGIES
-from clsplat.training.loop import step
-from clsplat.training.memory import Photos
+from clsplat.training.loop import Training
 from clsplat.training.optimizer import Moments
+from clsplat.training.rows import Rows
+from clsplat.training.state import State
+from clsplat.training.step import step
 
 ITERATION = 3001
 """Of a default run: all bands of the spherical harmonics are trained, densification watches, and no edit is due."""
@@ -40,18 +41,18 @@ def quartiles(samples: list[Clock], cores: int | None) -> dict[str, float]:
     return {key: round(float(value), 4) for key, value in result.items()}  # to 0.1 us
 
 
-def training_step(workload: Workload, config: TrainConfig, device: Device) -> Callable[[], None]:
-    """A function that runs the same step of training on a workload, whole and to its end, each time it is called."""
-    photos = Photos(device)
-    photos.keep_within(4 * workload.view.image.nbytes)  # the photo and its mask stay on the device
+def training_of(workload: Workload, config: TrainConfig, device: Device) -> Training:
+    """A training on the photo of a workload, before the iteration `ITERATION`."""
     strategy = STRATEGIES[config.strategy](config, workload.extent, len(workload.gaussians))
-    moments = Moments.zeros(workload.gaussians)
-    state = State(ITERATION - 1, 0.0, workload.extent, workload.gaussians, moments, strategy)
-    if config.optimizer == "device":
-        move(state, device)
+    rows = Rows(workload.gaussians, Moments.zeros(workload.gaussians), strategy)
+    scene = Scene([workload.view], [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    training = Training(scene, config, device, State(ITERATION - 1, 0.0, workload.extent, rows))
+    training.photos.keep_within(4 * workload.view.image.nbytes)  # the photo and its mask stay on the device
+    return training
 
-    def one_step() -> None:
-        step(state, ITERATION, workload.view, photos, config, device)
-        device.queue.finish()
 
-    return one_step
+def run_step(training: Training) -> None:
+    """Run one step of a training, to its end on the device; each call does the same work."""
+    training.state.iteration = ITERATION - 1
+    step(training, training.scene.train[0])
+    training.device.queue.finish()

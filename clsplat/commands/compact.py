@@ -13,9 +13,9 @@ from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
 from clsplat.errors import InputError
 
 if TYPE_CHECKING:
-    from clsplat.device import Device
     from clsplat.gaussians import Gaussians
     from clsplat.pruning.compaction import Limits
+    from clsplat.renderer import Renderer
     from clsplat.scene import Scene, View
 
 HELD_OUT = 6
@@ -53,8 +53,9 @@ class Compact:
         """Run the command."""
         from clsplat.dataset import load_scene
         from clsplat.formats import load_gaussians, save_gaussians, suffix_of
-        from clsplat.pruning.compaction import ASSUMED_PSNR, Judge, compact
-        from clsplat.training.memory import size_text
+        from clsplat.pruning.compaction import ASSUMED_PSNR, LossMeter, compact
+        from clsplat.renderer import Renderer
+        from clsplat.training.memory import bytes_text
 
         limits = self._limits()
         suffix = suffix_of(self.out)
@@ -64,15 +65,16 @@ class Compact:
             raise InputError("--cameras, --photos: expected one of them, found both; --photos has cameras as well")
         gaussians, mode, offset = load_gaussians(self.scene)
         device = open_device(self.device)
-        config, background = replace(self.render, mode=mode), BACKGROUNDS[self.data_config.background]
+        background = BACKGROUNDS[self.data_config.background]
+        renderer = Renderer(device, replace(self.render, mode=mode), background)
         scene = None
         dataset = self.photos or self.cameras
         if dataset is not None:
             scene = load_scene(dataset, self.data_config)
             gaussians, offset = moved(gaussians, offset - scene.offset), scene.offset
-        priced, judging = self._views(gaussians, scene, config, device)
+        priced, judging = self._views(gaussians, scene, renderer)
         say(f"views: {len(priced)} price the Gaussians, {len(judging)} judge the loss")
-        judge = Judge(gaussians, judging, self.photos is not None, config, device, background)
+        loss = LossMeter(gaussians, judging, self.photos is not None, renderer)
 
         def stored(version: "Gaussians") -> "tuple[Gaussians, int]":
             with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
@@ -81,13 +83,13 @@ class Compact:
                 save_gaussians(path, version, mode, offset)
                 return load_gaussians(path)[0], path.stat().st_size
 
-        found = compact(gaussians, priced, judge, limits, stored, config, device, background)
+        found = compact(gaussians, priced, loss, limits, stored, renderer)
         save_gaussians(self.out, found.gaussians, mode, offset)
         size = self.scene.stat().st_size if self.scene.is_file() else stored(gaussians)[1]
         say(
-            f"{self.scene}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, {size_text(size)}\n"
+            f"{self.scene}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, {bytes_text(size)}\n"
             f"{self.out}: {len(found.gaussians)} Gaussians of degree {found.gaussians.sh_degree}, "
-            f"{size_text(self.out.stat().st_size)}"
+            f"{bytes_text(self.out.stat().st_size)}"
         )
         if self.photos is not None:
             say(f"loss: {found.loss:.3f} dB of PSNR against the photos that judge")
@@ -96,9 +98,9 @@ class Compact:
 
     def _limits(self) -> "Limits":
         from clsplat.pruning.compaction import Limits
-        from clsplat.training.memory import parse_size
+        from clsplat.training.memory import parse_bytes
 
-        size = None if self.max_bytes is None else parse_size(self.max_bytes, "--max-bytes")
+        size = None if self.max_bytes is None else parse_bytes(self.max_bytes, "--max-bytes")
         if self.max_gaussians is None and size is None and self.max_psnr_loss is None:
             raise InputError(
                 "--max-gaussians, --max-bytes, --max-psnr-loss: expected how small or how good, found none"
@@ -110,19 +112,18 @@ class Compact:
         return Limits(self.max_gaussians, size, self.max_psnr_loss)
 
     def _views(
-        self, gaussians: "Gaussians", scene: "Scene | None", config: RenderConfig, device: "Device"
+        self, gaussians: "Gaussians", scene: "Scene | None", renderer: "Renderer"
     ) -> "tuple[list[View], list[View]]":
         """Views that price, and views that judge."""
         from clsplat.pruning.viewpoints import automatic_cameras, own_views
 
-        background = BACKGROUNDS[self.data_config.background]
         if scene is None:
-            cameras = automatic_cameras(gaussians, config, device, background)
+            cameras = automatic_cameras(gaussians, renderer)
             held_out: set[str] = set()
         else:
             cameras = {view.name: view.camera for view in scene.train + scene.test}
             held_out = {view.name for view in scene.test}
-        views = own_views(gaussians, cameras, config, device, background)
+        views = own_views(gaussians, cameras, renderer)
         if len(views) < len(cameras):
             warnings.warn(f"{len(cameras) - len(views)} of {len(cameras)} views show nothing; left out", stacklevel=2)
         if self.photos is not None and scene is not None:

@@ -34,6 +34,7 @@ class Eval:
         from clsplat.dataset import load_scene
         from clsplat.evaluate import evaluate
         from clsplat.formats import load_gaussians
+        from clsplat.renderer import Renderer
 
         gaussians, mode, offset = load_gaussians(self.scene)
         device = open_device(self.device)
@@ -43,8 +44,8 @@ class Eval:
         gaussians = moved(gaussians, offset - scene.offset)
         new_folder(self.out)
         background = BACKGROUNDS[self.data_config.background]
-        config = replace(self.render, mode=mode)
-        say_scores(evaluate(gaussians, scene.test, self.out, config, device, background=background), self.out)
+        renderer = Renderer(device, replace(self.render, mode=mode), background)
+        say_scores(evaluate(gaussians, scene.test, self.out, renderer), self.out)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,7 +17,6 @@ from clsplat.commands.console import (
     STARTED,
     Out,
     new_folder,
-    open_device,
     say,
     say_cameras,
     say_scores,
@@ -31,6 +30,7 @@ from clsplat.training.presets import DATA_PATH, PRESETS, load_config, load_prese
 if TYPE_CHECKING:
     from clsplat.device import Device
     from clsplat.gaussians import Gaussians
+    from clsplat.renderer import Renderer
     from clsplat.scene import Scene
     from clsplat.show.viewer import Viewer
 
@@ -40,23 +40,23 @@ class Train:
     """Train Gaussians on photos: a folder of them, a video, a COLMAP model with its photos, or a transforms.json."""
 
     data: tyro.conf.Positional[Path]
-    """Folder of the dataset, or of photos alone; or a video, of which the sharpest two frames of each second are put
-    into the folder `frames` of OUT (`clsplat frames` takes more or fewer)."""
+    """Folder of the dataset, or of photos alone; or a video, the two sharpest frames of each second of
+    which are written to the folder `frames` of OUT (`clsplat frames` takes more or fewer)."""
     out: Out
-    """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians (*.spz, say) to write as well,
-    whose name without the suffix becomes the folder."""
+    """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians, such as scene.spz, which is
+    written as well; its name without the suffix becomes the folder."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
     viewer: bool = False
     """Watch and pause the training in the browser; needs the extra `viewer`."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
-    """A named set of settings to start from, in the place of the defaults; flags given beside it count."""
+    """Named settings to start from instead of the defaults; flags override them."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """The config.json of an earlier run, or a part of one, to start from; flags given beside it count."""
+    """The config.json of an earlier run, or a part of one, to start from; flags override it."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def base(self) -> TrainConfig | None:
-        """The settings that preset or file bring, in which flags are yet to be put; None where neither is given."""
+        """The settings of the preset or the file, before flags override them; None if neither is given."""
         if self.preset is not None and self.config is not None:
             raise InputError("--preset and --config: expected one of them, found both")
         if self.preset is not None:
@@ -65,54 +65,22 @@ class Train:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.dataset import load_scene, with_points
-        from clsplat.dataset.video import extract_frames, is_video
         from clsplat.formats import save_gaussians, suffix_of
-        from clsplat.training import few_views
-        from clsplat.training.initialize import start_size
-        from clsplat.training.loop import start_config
-        from clsplat.training.memory import Footprint, parse_size
+        from clsplat.training.checkpoint import CHECKPOINT
 
         suffix = "" if self.out.is_dir() else suffix_of(self.out)
         out = self.out.with_name(self.out.name[: -len(suffix)]) if suffix else self.out
-        if not self.resume and (out / "checkpoint.npz").exists():
+        if not self.resume and (out / CHECKPOINT).exists():
             raise InputError(
                 f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
             )
-        config = self.settings
-        if config.data.masks is not None:
-            config = replace(config, data=replace(config.data, masks=str(Path(config.data.masks).resolve())))
-        limit = None if config.memory_limit is None else parse_size(config.memory_limit, "--memory-limit")
-        device = open_device(config.device, limit)
-        data = self.data
-        if is_video(data):
-            data = out / "frames"
-            say(f"{data}: {extract_frames(self.data, data)} frames of {self.data.name}")
-        verbose = console.loudness == "verbose"
-        scene = load_scene(data, config.data, verbose)
-        say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
-        if config.init.triangulate and not len(scene.points) and not (out / "checkpoint.npz").exists():
-            scene = with_points(scene, data, config.data, verbose)
-            found = f"{len(scene.points)} points, from photos and poses" if len(scene.points) else "random"
-            say(f"start: {found} (--init.no-triangulate: random)")
-        adapted = few_views.adapted(config, scene)
-        if adapted != config:
-            config = adapted
-            say(
-                f"few views: with fewer than {config.few.below} photos Gaussians are fewer and simpler, and some are "
-                "left out of each image (--few.below 0 trains as with many)"
-            )
-        need = Footprint.of(scene, config, device)
-        start = start_size(scene, start_config(config), config.max_gaussians)
-        say(need.describe(start, config.max_gaussians, device.memory_limit))
-        new_folder(out)
-        write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
-        say_cameras(data, out / "cameras.png")
+        device = open_and_name(self.settings)
+        scene, config = self.prepared(out, device)
         viewer = open_viewer(scene, config, device) if self.viewer else None
         try:
             gaussians = train_and_report(scene, config, device, out, self.resume, viewer)
         except KeyboardInterrupt:
-            if (out / "checkpoint.npz").is_file():
+            if (out / CHECKPOINT).is_file():
                 again = sys.argv[1:] + ([] if self.resume else ["--resume"])
                 warn(f"to continue: {shlex.join(['clsplat', *again])}")
             raise
@@ -125,17 +93,57 @@ class Train:
                 viewer.hold(gaussians)
             viewer.close()
 
+    def prepared(self, out: Path, device: "Device") -> "tuple[Scene, TrainConfig]":
+        """Prepare scene and configuration, check that they fit the device, and write the configuration to `out`."""
+        from clsplat.dataset.video import extract_frames, is_video
+        from clsplat.training.checkpoint import CHECKPOINT
+        from clsplat.training.initialize import start_count
+        from clsplat.training.memory import Footprint
+        from clsplat.training.preparation import prepare
+        from clsplat.training.state import start_config
+
+        data = self.data
+        if is_video(data):
+            data = out / "frames"
+            say(f"{data}: {extract_frames(self.data, data)} frames of {self.data.name}")
+        scene, config = prepare(
+            data,
+            self.settings,
+            resume=(out / CHECKPOINT).exists(),
+            verbose=console.loudness == "verbose",
+            tell=say,
+        )
+        need, start = (
+            Footprint.of(scene, config, device),
+            start_count(scene, start_config(config), config.max_gaussians),
+        )
+        need.check(start, device.memory_limit)
+        say(need.describe(start, config.max_gaussians, device.memory_limit))
+        new_folder(out)
+        write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
+        say_cameras(data, out / "cameras.png")
+        return scene, config
+
+
+def open_and_name(config: TrainConfig) -> "Device":
+    """Open the device of a configuration, and report its name."""
+    from clsplat.training.preparation import open_device
+
+    device = open_device(config)
+    say(f"device: {device.label}")
+    return device
+
 
 def open_viewer(scene: "Scene", config: TrainConfig, device: "Device") -> "Viewer":
     """A viewer of a training, at its first photo."""
+    from clsplat.renderer import Renderer
     from clsplat.show.camera_paths import first_photo
     from clsplat.show.viewer import Viewer
 
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
     start = first_photo([view.camera for view in scene.train])
-    background = BACKGROUNDS[config.data.background]
-    viewer = Viewer(device, config.render, start, scene.train, background)
+    viewer = Viewer(Renderer(device, config.render, BACKGROUNDS[config.data.background]), start, scene.train)
     say(f"viewer: open {viewer.address} in a browser")
     return viewer
 
@@ -144,20 +152,33 @@ def train_and_report(
     scene: "Scene", config: TrainConfig, device: "Device", out: Path, resume: bool, viewer: "Viewer | None" = None
 ) -> "Gaussians":
     """Train with a progress bar; write scene.ply, the evaluation and the training curve to `out`."""
+    from clsplat.formats import save_gaussians
+    from clsplat.renderer import Renderer
+    from clsplat.show.evaluation_page import training_curve
+
+    renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
+    gaussians = train_with_progress(scene, config, renderer, out, resume, viewer)
+    save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
+    say(f"{out / 'scene.ply'}: {len(gaussians)} Gaussians")
+    training_curve(out / "log.jsonl", out / "training_curve.png")
+    if config.size == "auto":
+        say_size(scene, out)
+    if scene.test:
+        evaluate_held_out(gaussians, scene, config, renderer, out)
+    return gaussians
+
+
+def train_with_progress(
+    scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path, resume: bool, viewer: "Viewer | None"
+) -> "Gaussians":
+    """Train with a progress bar and, if there is one, a viewer; Ctrl-C ends it after the iteration that runs."""
     from tqdm import tqdm
 
-    from clsplat.evaluate import evaluate, mean_metrics
-    from clsplat.formats import save_gaussians
-    from clsplat.pruning.prices import without_invisible
-    from clsplat.show.evaluation_page import training_curve
-    from clsplat.training.autosize.explanation import size_chart
-    from clsplat.training.autosize.rule import can_search, split
+    from clsplat.evaluate import mean_metrics
     from clsplat.training.loop import train
-    from clsplat.training.photo_poses import aligned
 
-    background = BACKGROUNDS[config.data.background]
     interrupted = threading.Event()
-    facts: dict[str, str] = {}  # what the viewer says beside its pictures
+    facts: dict[str, str] = {}  # lines of the viewer's panel
 
     def interrupt(*_: object) -> None:
         interrupted.set()
@@ -181,35 +202,40 @@ def train_and_report(
                 raise KeyboardInterrupt
 
         def held_out(gaussians: "Gaussians") -> dict[str, float]:
-            means = mean_metrics(gaussians, scene.test, config.render, device, background)
+            means = mean_metrics(gaussians, scene.test, renderer)
             facts["Held-out photos"] = ", ".join(f"{name.upper()} {value:.4g}" for name, value in means.items())
             return means
 
-        gaussians = train(
-            scene, config, device, out, resume=resume, evaluate=held_out if scene.test else None, progress=progress
-        )
+        evaluate = held_out if scene.test else None
+        gaussians = train(scene, config, out, renderer.device, resume=resume, evaluate=evaluate, progress=progress)
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    gaussians = without_invisible(gaussians)
-    save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
-    say(f"{out / 'scene.ply'}: {len(gaussians)} Gaussians")
-    training_curve(out / "log.jsonl", out / "training_curve.png")
-    if config.size == "auto" and not can_search(scene.train):
-        say(f"size: {len(scene.train)} photos are too few to choose it from; it is what the strategy made")
-    elif config.size == "auto":
-        size_chart(out / "size.json", out / "size.png")
-        say(f"size: chosen from {len(split(scene.train)[1])} validation photos; {out / 'size.png'} shows why")
-    if scene.test:
-        report = evaluate(gaussians, scene.test, out / "eval", config.render, device, background=background)
-        say_scores(report, out / "eval")
-    if scene.test and config.poses:
-        say("aligning the held-out photos' cameras with the scene")
-        posed = [
-            aligned(gaussians, view, scene.extent, config.optim, config.render, device, background)
-            for view in scene.test
-        ]
-        report = evaluate(gaussians, posed, out / "eval_aligned", config.render, device, background=background)
-        say_scores(report, out / "eval_aligned")
     return gaussians
+
+
+def say_size(scene: "Scene", out: Path) -> None:
+    """Report how the number of Gaussians was chosen, and draw it."""
+    from clsplat.training.autosize.explanation import size_chart
+    from clsplat.training.autosize.validation import can_validate, split
+
+    if not can_validate(scene.train):
+        say(f"size: {len(scene.train)} photos are too few to choose it from; it is what the strategy made")
+        return
+    size_chart(out / "size.json", out / "size.png")
+    say(f"size: chosen from {len(split(scene.train)[1])} validation photos; {out / 'size.png'} shows why")
+
+
+def evaluate_held_out(
+    gaussians: "Gaussians", scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path
+) -> None:
+    """Evaluate the held-out photos, twice where poses were refined: as posed, and with their cameras aligned."""
+    from clsplat.evaluate import evaluate
+    from clsplat.training.photo_poses import aligned
+
+    say_scores(evaluate(gaussians, scene.test, out / "eval", renderer), out / "eval")
+    if config.poses:
+        say("aligning the held-out photos' cameras with the scene")
+        posed = [aligned(gaussians, view, scene.extent, config.optim, renderer) for view in scene.test]
+        say_scores(evaluate(gaussians, posed, out / "eval_aligned", renderer), out / "eval_aligned")
 
 
 @dataclass(frozen=True)
@@ -225,23 +251,22 @@ class Demo:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.dataset import load_scene
         from clsplat.demo import make_photos
         from clsplat.render import render_views
         from clsplat.show.evaluation_page import side_by_side
+        from clsplat.training.preparation import prepare
 
         if self.out.exists() and any(self.out.iterdir()):
             raise InputError(f"{self.out}: expected an empty or new folder for the demo; choose another with -o")
         started = time.perf_counter()
-        device = open_device(self.device)
+        config = TrainConfig(iterations=self.iterations, eval_every=max(1, self.iterations // 7), device=self.device)
+        device = open_and_name(config)
         photos = self.out / "photos"
         new_folder(photos)
         say("photos: ray tracing a still life")
         make_photos(photos)
         say("cameras: structure from motion on the photos alone")
-        config = TrainConfig(iterations=self.iterations, eval_every=max(1, self.iterations // 7), device=self.device)
-        scene = load_scene(photos, config.data)
-        say(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
+        scene, config = prepare(photos, config, tell=say)
         write_json(self.out / "config.json", asdict(config))
         gaussians = train_and_report(scene, config, device, self.out, resume=False)
         renderings = render_views(gaussians, [view.camera for view in scene.test], config.render, device)

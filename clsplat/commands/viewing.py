@@ -32,6 +32,7 @@ class View:
         """Run the command."""
         from clsplat.dataset import load_scene
         from clsplat.formats import load_gaussians
+        from clsplat.renderer import Renderer
         from clsplat.show.camera_paths import first_photo, overview
         from clsplat.show.viewer import Viewer
 
@@ -44,8 +45,8 @@ class View:
             views = scene.train + scene.test
         start = first_photo([view.camera for view in views]) if views else overview(gaussians)
         background = BACKGROUNDS[self.data_config.background]
-        config = replace(self.render, mode=mode)
-        viewer = Viewer(device, config, start, views, background, host=self.host, port=self.port)
+        renderer = Renderer(device, replace(self.render, mode=mode), background)
+        viewer = Viewer(renderer, start, views, host=self.host, port=self.port)
         viewer.tell({"File": self.scene.name, "Gaussians": f"{len(gaussians):,}", "Device": device.label})
         say(f"viewer: open {viewer.address} in a browser; Ctrl-C ends it")
         with suppress(KeyboardInterrupt):

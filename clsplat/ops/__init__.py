@@ -1,5 +1,12 @@
-"""Launches of the stages: `clsplat.reference`'s functions with a `clsplat.device.Device` as first argument."""
+"""Launches of the stages: for each function of `clsplat.stages.Stages`, one that launches its kernels on a device.
 
+Belongs here: shapes, dtypes, buffers and the order of launches, one module per stage. Does not belong here: the
+mathematics, which is in cl/ and, as NumPy, in `clsplat.reference`.
+"""
+
+from functools import partial
+
+from clsplat.device import Device
 from clsplat.ops.adam import adam_step
 from clsplat.ops.bin import bin_splats
 from clsplat.ops.composite import composite_bwd, composite_fwd
@@ -15,28 +22,31 @@ from clsplat.ops.removal import removal
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
 
-__all__ = [
-    "adam_step",
-    "add_noise",
-    "argsort",
-    "argsort_segments",
-    "bin_splats",
-    "composite_bwd",
-    "composite_fwd",
-    "count_pairs",
-    "dropout_bwd",
-    "dropout_fwd",
-    "exclusive_scan",
-    "exposure_bwd",
-    "exposure_fwd",
-    "filter_bwd",
-    "filter_fwd",
-    "l1_ssim",
-    "observe",
-    "pixel_sizes",
-    "project_bwd",
-    "project_bwd_adam",
-    "project_disparities",
-    "project_fwd",
-    "removal",
-]
+
+class Launches:
+    """The functions of all stages with their first argument, the device, filled in."""
+
+    def __init__(self, device: Device) -> None:
+        self.project_fwd = partial(project_fwd, device)
+        self.project_disparities = partial(project_disparities, device)
+        self.project_bwd = partial(project_bwd, device)
+        self.project_bwd_adam = partial(project_bwd_adam, device)
+        self.dropout_fwd = partial(dropout_fwd, device)
+        self.dropout_bwd = partial(dropout_bwd, device)
+        self.bin_splats = partial(bin_splats, device)
+        self.composite_fwd = partial(composite_fwd, device)
+        self.composite_bwd = partial(composite_bwd, device)
+        self.count_pairs = partial(count_pairs, device)
+        self.removal = partial(removal, device)
+        self.exposure_fwd = partial(exposure_fwd, device)
+        self.exposure_bwd = partial(exposure_bwd, device)
+        self.l1_ssim = partial(l1_ssim, device)
+        self.observe = partial(observe, device)
+        self.adam_step = partial(adam_step, device)
+        self.add_noise = partial(add_noise, device)
+        self.pixel_sizes = partial(pixel_sizes, device)
+        self.filter_fwd = partial(filter_fwd, device)
+        self.filter_bwd = partial(filter_bwd, device)
+        self.exclusive_scan = partial(exclusive_scan, device)
+        self.argsort = partial(argsort, device)
+        self.argsort_segments = partial(argsort_segments, device)

@@ -1,46 +1,40 @@
-"""What each Gaussian, and each band of its spherical harmonics, is worth: its part in the error of rendered views.
+"""Prices of Gaussians and of the bands of their spherical harmonics: their part in the error of rendered views.
 
-By how much the error grows if one Gaussian alone is removed is known exactly (docs/stages/removal.md). Of many
-removed together some hide what others left; so they go in rounds, after each of which what is left is priced anew.
-And where the image is too bright, each of those that make it so promises a gain that only the first of them would
-bring: an order by the error alone removes them all, and loses more from round to round. So nothing is cheaper than
-the difference that its removal makes to the picture, but what would add to an error that is there already costs more.
+The growth of the error when a single Gaussian is removed is known exactly (docs/stages/removal.md). When many are
+removed together, some would have hidden the gaps that others leave. Gaussians are therefore removed in rounds, and
+the remaining ones are priced again after each. Where the image is too bright, each Gaussian that contributes promises
+a gain that only the first removal brings; an order by the error alone would remove them all. The price is therefore
+at least the difference that a removal makes to the image, and more where that difference adds to an existing error.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.config import RenderConfig
 from clsplat.constants import ALPHA_MIN
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.reference.sh import sh_basis
-from clsplat.render import Color, download, forward, stage_functions, upload
+from clsplat.renderer import Pass, Renderer, download
 from clsplat.scene import View
 from clsplat.stages import Removal
-
-if TYPE_CHECKING:
-    from clsplat.device import Device
 
 Array = NDArray[np.float64]
 
 ROUND = 0.85
-"""Fraction of the Gaussians that a round of `removal_order` leaves. With half of a scene removed in rounds of 0.7
-instead, the loss was 0.63 dB instead of 0.43 (fox_pinhole) and 0.24 instead of 0.21 (guitar, views of others), in
-0.6 of the time."""
+"""Fraction of the Gaussians that a round of `removal_order` leaves (measured: docs/howto/compact.md)."""
 
 
 class Prices(NamedTuple):
-    """What N Gaussians are worth to views: changes of the sum over the views of the mean squared error per pixel.
+    """Prices of N Gaussians: changes of the sum over the views of the mean squared error per pixel.
 
-    errors (N,): if the Gaussian alone is removed; negative for one that does harm. differences (N,): the same if the
-    render itself were the target. weights (N,): sums of its weight
-    alpha T per pixel, 0 for what no view shows. bands (N, D): column d, if the Gaussian alone keeps the bands 0 to d
-    of its spherical harmonics, whose degree is D.
+    errors (N,): change if the Gaussian alone is removed; negative if the error falls. differences (N,): the same with
+    the render itself as the target. weights (N,): sums of the weight alpha T per pixel, 0 for a Gaussian that no view
+    shows. bands (N, D): column d, change if the Gaussian alone keeps the bands 0 to d of its spherical harmonics,
+    whose degree is D.
     """
 
     errors: Array
@@ -50,19 +44,59 @@ class Prices(NamedTuple):
 
     @property
     def costs(self) -> Array:
-        """(N,) What pruning goes by: the error, but of what makes a place too bright, each promises the same gain."""
+        """Prices by which Gaussians are pruned, (N,): the larger of errors and differences."""
         return np.maximum(self.errors, self.differences)
 
 
-def price(
+class Measured(NamedTuple):
+    """Removal of each Gaussian measured in one view.
+
+    residuals (H, W, 3): render less photo, in [-1, 1] for a clamped render.
+    """
+
+    view: View
+    run: Pass
+    residuals: Array
+    removal: Removal
+
+
+def measure_removals(
+    renderer: Renderer,
     gaussians: Gaussians,
-    views: list[View],
-    config: RenderConfig = RenderConfig(),
-    device: "Device | None" = None,
-    background: Color = (0.0, 0.0, 0.0),
+    views: Iterable[View],
+    sh_degree: int | None = None,
     *,
-    bands: bool = True,
-) -> Prices:
+    clamped: bool = False,
+) -> Iterator[Measured]:
+    """Render views and measure the removal of each Gaussian in each of them (stage removal).
+
+    Parameters
+    ----------
+    renderer : Renderer
+    gaussians : Gaussians of N >= 1 rows
+        On the host or on the renderer's device.
+    views : iterable of View
+        Pixels that their masks leave out do not count.
+    sh_degree : int, optional
+        Highest degree of the spherical harmonics evaluated; default: all that are stored.
+    clamped : bool
+        Clamp the render to [0, 1] as a screen does: values above white are then no error.
+
+    Yields
+    ------
+    Measured
+        Per view.
+    """
+    placed = renderer.place(gaussians)
+    for view in views:
+        run = renderer.forward(placed, view.camera, sh_degree)
+        rgb = download(run.image.rgb)
+        residuals = (np.clip(rgb, 0, 1) if clamped else rgb) - view.image / 255
+        removal = renderer.stages.removal(run.splats, run.bins, np.array(renderer.background), residuals, view.mask)
+        yield Measured(view, run, residuals, removal)
+
+
+def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands: bool = True) -> Prices:
     """Price Gaussians by views.
 
     Parameters
@@ -70,14 +104,10 @@ def price(
     gaussians : Gaussians
         At least one, on the host.
     views : list of View
-        Photos, or renders of the scene as it was at first; their masks count.
-    config : RenderConfig
-    device : Device, optional
-        None prices with the float64 twins.
-    background : (3,) floats
-        RGB behind the Gaussians.
+        Photos, or renders of the scene before any was removed; pixels that their masks leave out do not count.
+    renderer : Renderer
     bands : bool
-        Whether the bands of the spherical harmonics are priced; their prices are 0 otherwise.
+        Whether the bands of the spherical harmonics are priced; otherwise their prices are 0.
 
     Returns
     -------
@@ -92,13 +122,7 @@ def price(
         raise InputError(f"views, gaussians: expected at least one each, found {len(views)} and {len(gaussians)}")
     n, degree = len(gaussians), gaussians.sh_degree
     total = Prices(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, degree)))
-    uploaded = upload(device, gaussians)
-    behind = np.array(background)
-    for view in views:
-        run = forward(device, uploaded, view.camera, config, behind, degree)
-        # What a screen shows: what exceeds white is no error.
-        residuals = np.clip(download(run.image.image), 0, 1) - view.image / 255
-        part: Removal = stage_functions(device).removal(run.splats, run.bins, behind, residuals, view.mask)
+    for view, _, residuals, part in measure_removals(renderer, gaussians, views, clamped=True):
         pixels = residuals[:, :, 0].size if view.mask is None else max(1, int(view.mask.sum()))
         total.errors[:] += part.errors / pixels
         total.differences[:] += part.differences / pixels
@@ -113,7 +137,7 @@ def price(
 
 
 def _color_changes(gaussians: Gaussians, position: Array) -> Array:
-    """(N, D, 3): what the colours seen from `position` change by if bands above d = 0 to D - 1 are dropped."""
+    """Changes (N, D, 3) of the colours seen from `position` if the bands above d = 0 to D - 1 are dropped."""
     directions = gaussians.means - position
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     terms = sh_basis(directions, gaussians.sh_degree)[:, :, None] * gaussians.sh
@@ -126,30 +150,28 @@ def removal_order(
     gaussians: Gaussians,
     views: list[View],
     until: Callable[[Gaussians], bool],
-    config: RenderConfig = RenderConfig(),
-    device: "Device | None" = None,
-    background: Color = (0.0, 0.0, 0.0),
+    renderer: Renderer,
 ) -> NDArray[np.intp]:
-    """The Gaussians from the one to keep longest to the first one to go.
+    """Order Gaussians from the one to keep longest to the first one to remove.
 
     Parameters
     ----------
-    gaussians, views, config, device, background
+    gaussians, views, renderer
         As given to `price`.
     until : callable
-        Told what is left after each round; true ends the rounds. Those left then are ordered by their prices of
-        the last round.
+        Called with the remaining Gaussians after each round; true ends the rounds. Those that remain then are ordered
+        by their prices of the last round.
 
     Returns
     -------
     (N,) int
-        Rows: ``gaussians.take(order[:n])`` is the scene pruned to n. Ties go by index; the same input gives the
-        same order.
+        Rows: ``gaussians.take(order[:n])`` is the scene pruned to n. Ties are ordered by index; the same input gives
+        the same order.
     """
     kept = np.arange(len(gaussians))
     gone: list[NDArray[np.intp]] = []
     while True:
-        prices = price(gaussians.take(kept), views, config, device, background, bands=False)
+        prices = price(gaussians.take(kept), views, renderer, bands=False)
         kept = kept[np.argsort(-prices.costs, kind="stable")]
         left = int(ROUND * len(kept))
         if left == 0 or until(gaussians.take(np.sort(kept[:left]))):
@@ -159,34 +181,34 @@ def removal_order(
 
 
 def without_invisible(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians without those of an opacity below ALPHA_MIN, which no pixel of any view shows; at least one."""
+    """Remove Gaussians whose opacity is below ALPHA_MIN, which no pixel of any view shows; at least one remains."""
     shown = gaussians.opacities >= ALPHA_MIN
     shown[np.argmax(gaussians.logit_opacities)] = True
     return gaussians.take(shown)
 
 
 def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The Gaussians with the bands 0 to `degree` of their spherical harmonics, at most those they have."""
+    """Keep the bands 0 to `degree` of the spherical harmonics, at most those that are stored."""
     return replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])
 
 
 def without_bands(gaussians: Gaussians, bands: Array, budget: float) -> Gaussians:
-    """Zero the bands above some degree of each Gaussian, the cheapest first, while a sum of prices lasts.
+    """Zero the bands above some degree of each Gaussian, the cheapest first, within a budget.
 
     Parameters
     ----------
     gaussians : Gaussians
     bands : (N, D)
-        Of `Prices` of the same Gaussians.
+        Prices of the bands, from `price` of the same Gaussians.
     budget : float
-        Largest sum of the prices of what is dropped.
+        Largest sum of the prices of the bands that are dropped.
 
     Returns
     -------
     Gaussians
-        Of the same degree: formats that compress profit from the zeros.
+        Gaussians of the same degree; formats that compress store the zeros in few bytes.
     """
-    # The lowest degree first: a Gaussian that loses all its bands gives most.
+    # The lowest degree first: dropping all bands of a Gaussian saves most.
     sh = gaussians.sh.copy()
     left, open_ = budget, np.ones(len(gaussians), dtype=bool)
     for degree in range(gaussians.sh_degree):

@@ -1,4 +1,8 @@
-"""The stages in float64 NumPy: readable mathematics, the oracle of the tests, and a renderer without OpenCL."""
+"""The stages in float64 NumPy: readable mathematics, the oracle of the tests, and a renderer without OpenCL.
+
+This module implements `clsplat.stages.Stages`. Belongs here: one module per stage with its equations, and what
+several stages share (lenses, spherical harmonics). Does not belong here: the algorithms that make a stage fast.
+"""
 
 from clsplat.reference.adam import adam_step
 from clsplat.reference.bin import bin_splats
@@ -14,29 +18,3 @@ from clsplat.reference.project import project_bwd, project_bwd_adam, project_dis
 from clsplat.reference.removal import removal
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
-
-__all__ = [
-    "adam_step",
-    "add_noise",
-    "argsort",
-    "argsort_segments",
-    "bin_splats",
-    "composite_bwd",
-    "composite_fwd",
-    "count_pairs",
-    "dropout_bwd",
-    "dropout_fwd",
-    "exclusive_scan",
-    "exposure_bwd",
-    "exposure_fwd",
-    "filter_bwd",
-    "filter_fwd",
-    "l1_ssim",
-    "observe",
-    "pixel_sizes",
-    "project_bwd",
-    "project_bwd_adam",
-    "project_disparities",
-    "project_fwd",
-    "removal",
-]

@@ -128,10 +128,10 @@ def composite_bwd(
     """Gradients of `composite_fwd`; arguments and result as `clsplat.ops.composite_bwd`."""
     v = SplatGrads(*(np.zeros_like(a) for a in (splats.means2d, splats.conics, splats.opacities, splats.colors)))
     transmittance = np.empty((bins.height, bins.width))
-    behind = (image.image * v_image.image).sum(axis=2) - (1 - image.alpha) * v_image.alpha
+    behind = (image.rgb * v_image.rgb).sum(axis=2) - (1 - image.alpha) * v_image.alpha
     if disparities is None:
         for hit in hits(splats, bins, transmittance):
-            g, dx, dy, v_pixels = hit.splat, hit.dx, hit.dy, v_image.image[hit.box]
+            g, dx, dy, v_pixels = hit.splat, hit.dx, hit.dy, v_image.rgb[hit.box]
             u = v_pixels @ splats.colors[g]
             v_sigma, weight, behind[hit.box] = _v_sigma(hit.alpha, hit.before, u, behind[hit.box])
             a, b, c = splats.conics[g]
@@ -141,7 +141,7 @@ def composite_bwd(
             v.colors[g] += np.einsum("hw,hwc->c", weight, v_pixels)
     else:
         for layer in layers(splats, bins, disparities, transmittance):
-            many, dx, dy, v_pixels = layer.splats, layer.dx, layer.dy, v_image.image[layer.pixels]
+            many, dx, dy, v_pixels = layer.splats, layer.dx, layer.dy, v_image.rgb[layer.pixels]
             u = (v_pixels * splats.colors[many]).sum(axis=1)
             v_sigma, weight, behind[layer.pixels] = _v_sigma(layer.alpha, layer.before, u, behind[layer.pixels])
             a, b, c = splats.conics[many].T

@@ -16,16 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config import RenderConfig
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.reference.project import rotations
-from clsplat.render import Color, download, forward, stage_functions, upload
+from clsplat.renderer import Renderer, download
 from clsplat.show.camera_paths import Viewpoint
 
 if TYPE_CHECKING:
-    from clsplat.device import Device
     from clsplat.scene import View
 
 MODES = ("render", "depth", "alpha", "count")
@@ -86,19 +84,15 @@ def whole_view(camera: Camera, aspect: float) -> float:
     return 2 * math.atan(max(camera.height / camera.fy, camera.width / camera.fx / aspect) / 2)
 
 
-def picture(
-    device: "Device", gaussians: Gaussians, camera: Camera, config: RenderConfig, background: Color, mode: str
-) -> tuple[NDArray[np.uint8], str]:
-    """One frame.
+def picture(renderer: Renderer, gaussians: Gaussians, camera: Camera, mode: str) -> tuple[NDArray[np.uint8], str]:
+    """Render one frame.
 
     Parameters
     ----------
-    device : Device
+    renderer : Renderer
     gaussians : Gaussians
-        On the device.
+        On the host or on the renderer's device.
     camera : Camera
-    config : RenderConfig
-    background : (3,) floats
     mode : str
         One of `MODES`.
 
@@ -106,15 +100,14 @@ def picture(
     -------
     frame : (H, W, 3) uint8
     legend : str
-        What its colours stand for; empty for the render.
+        Meaning of its colours; empty for the render.
     """
-    behind = np.array([*background, 0.0] if mode == "depth" else background)
-    run = forward(device, gaussians, camera, config, behind, gaussians.sh_degree, gradients=False)
+    run = renderer.forward(gaussians, camera, depth=mode == "depth", gradients=False)
     if mode == "count":
-        count = download(stage_functions(device).count_pairs(run.splats, run.bins)[1])
+        count = download(renderer.stages.count_pairs(run.splats, run.bins)[1])
         most = max(int(count.max()), 1)
         return _colored(count / most), f"dark 0, bright {most} Gaussians per pixel; mean {count.mean():.1f}"
-    image, alpha = download(run.image.image), download(run.image.alpha)
+    image, alpha = download(run.image.rgb), download(run.image.alpha)
     if mode == "alpha":
         return to_uint8(np.repeat(alpha[:, :, None], 3, axis=2)), "black transparent, white opaque"
     if mode == "depth":
@@ -161,13 +154,11 @@ class Viewer:
 
     Parameters
     ----------
-    device : Device
-    config : RenderConfig
+    renderer : Renderer
     start : Viewpoint
         Where browsers start. The mouse turns around the point on a camera's axis that is beside the focus.
     views : list of View
         Photos whose cameras are shown; a click on one goes there.
-    background : (3,) floats
     host : str
         Address to listen at.
     port : int
@@ -181,11 +172,9 @@ class Viewer:
 
     def __init__(
         self,
-        device: "Device",
-        config: RenderConfig,
+        renderer: Renderer,
         start: Viewpoint,
         views: "list[View]",
-        background: Color,
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
@@ -197,7 +186,7 @@ class Viewer:
                 "viewer: expected the package viser, found none: pip install 'clsplat[viewer]'"
             ) from error
 
-        self._device, self._config, self._background, self._focus = device, config, background, start.focus
+        self._renderer, self._focus = renderer, start.focus
         self._clients: dict[int, _Client] = {}
         self._asked = threading.Event()
         self._mode, self._version, self._paused = MODES[0], 0, False
@@ -303,8 +292,8 @@ class Viewer:
         """
         due = [(c, self._share_due(c, time.perf_counter())) for c in list(self._clients.values())]
         due = [(client, share) for client, share in due if share]
-        if due and isinstance(gaussians.means, np.ndarray):
-            gaussians = upload(self._device, gaussians)
+        if due:
+            gaussians = self._renderer.place(gaussians)
         for client, share in due:
             self._frame(client, share, gaussians)
         self._write()
@@ -329,7 +318,7 @@ class Viewer:
         assert camera is not None
         small = camera.resized(*(max(1, round(share * edge)) for edge in (camera.width, camera.height)))
         try:
-            frame, legend = picture(self._device, gaussians, small, self._config, self._background, mode)
+            frame, legend = picture(self._renderer, gaussians, small, mode)
         except DeviceError as error:  # a training goes on without a picture
             frame, legend = np.zeros((1, 1, 3), np.uint8), str(error)
         if not any(c is client for c in self._clients.values()):
@@ -357,8 +346,7 @@ class Viewer:
         until : callable
             Asked some ten times a second.
         """
-        if isinstance(gaussians.means, np.ndarray):
-            gaussians = upload(self._device, gaussians)
+        gaussians = self._renderer.place(gaussians)
         self._version += 1
         while not until():
             self._asked.clear()

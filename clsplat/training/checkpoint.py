@@ -1,15 +1,12 @@
-"""What a run leaves in its folder so that it can go on: the checkpoint and the log."""
+"""Checkpoints: the state of a training in a file, from which an interrupted run resumes."""
 
 import io
 import json
 import math
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,78 +15,25 @@ from clsplat.atomic import replacing
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.render import download, fetch, stage_functions, upload
-from clsplat.scene import Scene, View
-from clsplat.training import photo_exposures as exposure
-from clsplat.training import photo_poses as poses
-from clsplat.training.autosize.rule import Kept, Point, Rival, Search, Trial
-from clsplat.training.densify import STRATEGIES, Strategy
+from clsplat.renderer import download, fetch
+from clsplat.scene import Scene
+from clsplat.training.autosize.rule import Candidate, Search, SmallSide, Trial
+from clsplat.training.densify import STRATEGIES
 from clsplat.training.optimizer import Moments
 from clsplat.training.photo_parameters import PerPhoto
+from clsplat.training.photo_poses import refined
+from clsplat.training.rows import Rows
+from clsplat.training.smoothing_filter import SmoothingFilter
+from clsplat.training.state import State
 
-if TYPE_CHECKING:
-    from clsplat.device import Device
+CHECKPOINT = "checkpoint.npz"
+"""File name of the checkpoint in the folder of a run."""
 
+FREE = ("device", "checkpoint_every", "eval_every", "memory_limit")
+"""Settings that may differ when a run resumes: they do not change the result, unless a limit of memory is reached,
+and then the user lowers it."""
 
-@dataclass
-class State:
-    """All that training changes, which is what a checkpoint holds, and the scene's extent in world units.
-
-    intersections: the most tiles that a Gaussian has met in a view, on the mean over all Gaussians; it bounds their
-    growth where memory does. search: for the scene's size; None where that is fixed. exposures, poses: what is
-    learned about each photo, if it is. pixels: their sizes, of the 3D filter; None without it, or to be found anew.
-    """
-
-    iteration: int
-    seconds: float
-    extent: float
-    gaussians: Gaussians
-    moments: Moments
-    strategy: Strategy
-    intersections: float = 0.0
-    search: Search | None = None
-    exposures: PerPhoto | None = None
-    poses: PerPhoto | None = None
-    pixels: Any = None
-
-
-def move(state: State, device: "Device | None") -> None:
-    """Parameters, moments and statistics to the device, or to the host for None."""
-    place = partial(upload, device) if device else fetch
-    state.gaussians = place(state.gaussians)
-    state.moments = Moments(place(state.moments.first), place(state.moments.second))
-    statistics = state.strategy.statistics
-    for name, array in statistics.items():
-        statistics[name] = device.upload(name, array, array.dtype) if device else download(array)
-
-
-def as_seen(views: list[View], state: State) -> list[View]:
-    """Photos as the scene itself would show them: without what was learned about each."""
-    if state.exposures:
-        views = [replace(v, image=exposure.neutral(v.image, state.exposures.of(v.name))) for v in views]
-    if state.poses:
-        views = [replace(v, camera=poses.refined(v.camera, state.poses.of(v.name))) for v in views]
-    return views
-
-
-def on_device(gaussians: Gaussians, device: "Device") -> Gaussians:
-    """The Gaussians on the device, where they are with its optimiser."""
-    return upload(device, gaussians) if isinstance(gaussians.means, np.ndarray) else gaussians
-
-
-def measure_pixels(state: State, views: list[View], device: "Device") -> None:
-    """What the photos' cameras resolve at each Gaussian. Changes `state`."""
-    cameras = [view.camera for view in views]
-    state.pixels = stage_functions(device).pixel_sizes(on_device(state.gaussians, device), cameras)
-
-
-def filtered(state: State, device: "Device") -> Gaussians:
-    """The Gaussians on the device as they are shown and saved: under the 3D filter, if there is one."""
-    gaussians = on_device(state.gaussians, device)
-    if state.pixels is None:
-        return gaussians
-    shown: Gaussians = stage_functions(device).filter_fwd(gaussians, state.pixels)
-    return shown
+Arrays = dict[str, NDArray[Any]]
 
 
 def save_state(path: Path, state: State, config: TrainConfig) -> None:
@@ -97,31 +41,35 @@ def save_state(path: Path, state: State, config: TrainConfig) -> None:
     arrays: dict[str, Any] = {"iteration": state.iteration, "seconds": state.seconds}
     arrays["intersections"] = state.intersections
     arrays["config"] = json.dumps(asdict(config), sort_keys=True)
-    parts = {"gaussians": state.gaussians, "first": state.moments.first, "second": state.moments.second}
-    for part, gaussians in parts.items():
-        arrays |= {f"{part}.{name}": array for name, array in fetch(gaussians).arrays().items()}
-    arrays |= {f"statistics.{name}": download(array) for name, array in state.strategy.statistics.items()}
-    if state.pixels is not None:
-        arrays["pixels"] = download(state.pixels)
+    arrays |= _rows_arrays(state.rows, "")
+    if state.filter and state.filter.pixels is not None:
+        arrays["pixels"] = download(state.filter.pixels)
     for part, learned in (("exposures", state.exposures), ("poses", state.poses)):
         if learned:
             arrays |= {f"{part}.{name}": array for name, array in learned.arrays().items()}
     if search := state.search:
-        about = {name: getattr(search, name) for name in ("most", "trials", "degrees", "settled", "seen")}
-        if search.rival:
-            about["rival"] = search.rival.point
-            rival = search.rival.kept
-            parts = {"": rival.gaussians, "first.": rival.moments.first, "second.": rival.moments.second}
-            for part, kept in parts.items():
-                arrays |= {f"rival.{part}{name}": array for name, array in kept.arrays().items()}
-            arrays |= {f"rival.statistics.{name}": array for name, array in rival.statistics.items()}
+        about = {name: getattr(search, name) for name in ("most", "trials", "degrees", "settled", "validated")}
+        if search.small_side:
+            about["small_side"] = search.small_side.candidate
+            arrays |= _rows_arrays(search.small_side.rows, "small_side.")
         arrays["search"] = json.dumps(about)
     with replacing(path) as file:
         np.savez(file, **arrays)
 
 
+def _rows_arrays(rows: Rows, prefix: str) -> dict[str, Any]:
+    parts = {"gaussians": rows.gaussians, "first": rows.moments.first, "second": rows.moments.second}
+    arrays: dict[str, Any] = {
+        f"{prefix}{part}.{name}": array
+        for part, gaussians in parts.items()
+        for name, array in fetch(gaussians).arrays().items()
+    }
+    statistics = rows.strategy.statistics
+    return arrays | {f"{prefix}statistics.{name}": download(array) for name, array in statistics.items()}
+
+
 def write_photos(path: Path, state: State, scene: Scene) -> None:
-    """photos.json: what was learned about each training photo, by name.
+    """Write photos.json: the learned parameters of each training photo, by name.
 
     colours: the rows of the (3, 4) map from the scene's RGB, in [0, 1], to the photo's; viewmat: the refined one,
     world to camera, in the dataset's coordinates.
@@ -131,14 +79,14 @@ def write_photos(path: Path, state: State, scene: Scene) -> None:
         if state.exposures:
             content[view.name]["colours"] = state.exposures.of(view.name).tolist()
         if state.poses:
-            camera = poses.refined(view.camera, state.poses.of(view.name)).translated(-scene.offset)
+            camera = refined(view.camera, state.poses.of(view.name)).translated(-scene.offset)
             content[view.name]["viewmat"] = camera.viewmat.tolist()
     with replacing(path) as file:
         file.write((json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
 
 
 def load_state(path: Path, extent: float, config: TrainConfig) -> State:
-    """The state that `save_state` wrote, in a scene of the given extent in world units.
+    """Read the state that `save_state` wrote, of a scene of the given extent in world units.
 
     Raises
     ------
@@ -148,8 +96,7 @@ def load_state(path: Path, extent: float, config: TrainConfig) -> State:
     arrays = _load_arrays(path)
     try:
         saved, asked = json.loads(str(arrays["config"])), json.loads(json.dumps(asdict(config)))
-        # They do not change the result, but for a limit that is reached: whoever ran out of memory lowers it.
-        for free in ("device", "checkpoint_every", "eval_every", "memory_limit"):
+        for free in FREE:
             saved.pop(free, None), asked.pop(free, None)
         changed = sorted(k for k in asked if asked[k] != saved.get(k))
         state = None if saved != asked else _to_state(arrays, extent, config)
@@ -160,44 +107,54 @@ def load_state(path: Path, extent: float, config: TrainConfig) -> State:
     return state
 
 
-def _to_state(arrays: dict[str, NDArray[Any]], extent: float, config: TrainConfig) -> State:
-    def part(name: str, like: Gaussians | None = None) -> Gaussians:
-        gaussians = Gaussians(**{k: arrays[f"{name}.{k}"] for k in Gaussians.__dataclass_fields__}).validate()
-        for field, array in gaussians.arrays().items():
-            if array.dtype != np.float32 or array.shape != (like or gaussians).arrays()[field].shape:
-                raise ValueError(f"{name}.{field} of type {array.dtype} and shape {array.shape}")
-        return gaussians
-
-    def kept(gaussians: str, prefix: str) -> Kept:
-        rows = part(gaussians)
-        statistics = STRATEGIES[config.strategy](config, extent, len(rows)).statistics
-        for name, fresh in statistics.items():
-            array = statistics[name] = arrays[f"{prefix}statistics.{name}"]
-            if array.dtype != fresh.dtype or array.shape != fresh.shape:
-                raise ValueError(f"{prefix}statistics.{name} of type {array.dtype} and shape {array.shape}")
-        return Kept(rows, Moments(part(f"{prefix}first", rows), part(f"{prefix}second", rows)), statistics)
-
-    now, search = kept("gaussians", ""), None
-    strategy = STRATEGIES[config.strategy](config, extent, len(now.gaussians))
-    strategy.statistics = now.statistics
-    numbers = int(arrays["iteration"]), float(arrays["seconds"]), extent
+def _to_state(arrays: Arrays, extent: float, config: TrainConfig) -> State:
+    search = None
     if "search" in arrays:
         saved = json.loads(str(arrays["search"]))
-        trials = [Trial(grows, Point(*smaller), Point(*larger)) for grows, smaller, larger in saved["trials"]]
-        degrees = [Point(*p) for p in saved["degrees"]]
-        search = Search(saved["most"], trials, degrees, saved["settled"], saved["seen"])
-        if "rival" in saved:
-            search.rival = Rival(kept("rival", "rival."), Point(*saved["rival"]))
-    state = State(*numbers, now.gaussians, now.moments, strategy, float(arrays["intersections"]), search)
-    state.pixels = arrays.get("pixels")
-    for name in ("exposures", "poses"):
-        learned = {k.removeprefix(f"{name}."): a for k, a in arrays.items() if k.startswith(f"{name}.")}
-        if learned:
-            setattr(state, name, PerPhoto.restored(learned))
-    return state
+        trials = [Trial(grows, Candidate(*small), Candidate(*large)) for grows, small, large in saved["trials"]]
+        degrees, small_side = [Candidate(*c) for c in saved["degrees"]], None
+        if "small_side" in saved:
+            small_side = SmallSide(_to_rows(arrays, "small_side.", extent, config), Candidate(*saved["small_side"]))
+        search = Search(saved["most"], trials, degrees, saved["settled"], saved["validated"], small_side)
+    return State(
+        iteration=int(arrays["iteration"]),
+        seconds=float(arrays["seconds"]),
+        extent=extent,
+        rows=_to_rows(arrays, "", extent, config),
+        intersections=float(arrays["intersections"]),
+        search=search,
+        exposures=_to_photo_parameters(arrays, "exposures."),
+        poses=_to_photo_parameters(arrays, "poses."),
+        filter=SmoothingFilter(arrays.get("pixels")) if config.filter_3d else None,
+    )
 
 
-def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _with_prefix(arrays: Arrays, prefix: str) -> Arrays:
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
+def _to_photo_parameters(arrays: Arrays, prefix: str) -> PerPhoto | None:
+    learned = _with_prefix(arrays, prefix)
+    return PerPhoto.restored(learned) if learned else None
+
+
+def _to_rows(arrays: Arrays, prefix: str, extent: float, config: TrainConfig) -> Rows:
+    gaussians = _to_gaussians(arrays, f"{prefix}gaussians.")
+    moments = Moments(*(_to_gaussians(arrays, f"{prefix}{part}.", gaussians) for part in ("first", "second")))
+    strategy = STRATEGIES[config.strategy](config, extent, len(gaussians))
+    strategy.restore(_with_prefix(arrays, f"{prefix}statistics."))
+    return Rows(gaussians, moments, strategy)
+
+
+def _to_gaussians(arrays: Arrays, prefix: str, like: Gaussians | None = None) -> Gaussians:
+    gaussians = Gaussians(**{name: arrays[prefix + name] for name in Gaussians.__dataclass_fields__}).validate()
+    for name, array in gaussians.arrays().items():
+        if array.dtype != np.float32 or array.shape != (like or gaussians).arrays()[name].shape:
+            raise ValueError(f"{prefix}{name} of type {array.dtype} and shape {array.shape}")
+    return gaussians
+
+
+def _load_arrays(path: Path) -> Arrays:
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
@@ -213,7 +170,7 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _array(content: bytes) -> NDArray[Any]:
-    """The array of an .npy file. NumPy's own reader allocates whatever the header says, before it looks for it."""
+    """The array of an .npy file. NumPy's own reader allocates what the header declares before it reads the data."""
     file = io.BytesIO(content)
     try:
         if np.lib.format.read_magic(file) != (1, 0):
@@ -227,51 +184,3 @@ def _array(content: bytes) -> NDArray[Any]:
         raise ValueError(f"an array of shape {shape} and type {dtype} in {len(content)} bytes")
     flat = np.frombuffer(content, dtype, offset=file.tell())
     return flat.reshape(shape, order="F" if fortran_order else "C").copy()
-
-
-@contextmanager
-def log_file(path: Path, iteration: int) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Open a log of JSON lines after `iteration`; yields the function that appends a record.
-
-    Lines of later iterations, which a run wrote between its last checkpoint and its end, are dropped: the resumed run
-    writes them again.
-    """
-    kept = []
-    if iteration and path.exists():
-        for line in path.read_text().splitlines():
-            try:
-                if json.loads(line)["iteration"] <= iteration:
-                    kept.append(line)
-            except (json.JSONDecodeError, KeyError):  # the line that was being written when the run was killed
-                continue
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{path.parent}: expected a folder that can be written to, found: {error.strerror}"
-        ) from error
-    with replacing(path) as file:
-        file.writelines(f"{line}\n".encode() for line in kept)
-    events = event_writer(path.parent / "tensorboard", iteration)
-    with path.open("a") as log, closing(events) if events else nullcontext():
-
-        def append(record: dict[str, Any]) -> None:
-            log.write(json.dumps(record) + "\n")
-            log.flush()
-            if events:
-                for name in record.keys() - {"iteration"}:
-                    events.add_scalar(name, record[name], record["iteration"])
-
-        yield append
-
-
-def event_writer(folder: Path, iteration: int) -> Any:
-    """What writes the log for TensorBoard as well, after an iteration; None where tensorboardX is not installed."""
-    try:
-        from tensorboardX import SummaryWriter
-    except ImportError:
-        return None
-    # The names of its files tell seconds apart, no more.
-    return SummaryWriter(
-        str(folder), purge_step=iteration + 1 if iteration else None, filename_suffix=f".{iteration}"
-    )

@@ -1,8 +1,7 @@
-"""What changes in a training on few photos, which many arrangements of Gaussians explain alike.
+"""Adaptation of a configuration to few photos, which many arrangements of Gaussians fit equally well.
 
-Left to themselves, Gaussians fit each photo by itself: ever more of them, with colours that depend on
-direction. Fewer and simpler ones, of which no single one is needed, show more of the truth between the photos (Park
-et al. 2025, "DropGaussian").
+Without it, many Gaussians with view-dependent colours fit each photo separately. Fewer and simpler Gaussians, none of
+which is indispensable, generalise better to other viewpoints (Park et al. 2025, "DropGaussian").
 """
 
 from dataclasses import replace
@@ -12,8 +11,11 @@ from clsplat.scene import Scene
 
 
 def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
-    """The configuration for the scene's training photos: where they are fewer than `config.few.below`, of a lower
-    degree, with dropout, and with fewer Gaussians, whose number is not sought; otherwise as it is."""
+    """Adapt a configuration to the number of training photos.
+
+    With fewer than `config.few.below` the spherical harmonics have a lower degree, dropout is on, and there are fewer
+    Gaussians, whose number is not searched. Otherwise the configuration is returned as it is.
+    """
     few = config.few
     if len(scene.train) >= few.below:
         return config
@@ -22,6 +24,6 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
         most = round(few.growth * len(scene.points))
         cap = most if cap is None else min(cap, most)
     init = replace(config.init, sh_degree=min(config.init.sh_degree, few.sh_degree))
-    if config.size == "auto":  # too few photos to validate by; measured with the paper's strategy
+    if config.size == "auto":  # too few photos to validate
         config = replace(config, size="fixed", strategy="adc")
     return replace(config, init=init, max_gaussians=cap, dropout=max(config.dropout, few.dropout))

@@ -52,7 +52,7 @@ def initialize(scene: Scene, config: InitConfig, seed: int, cap: int | None = No
     """
     if cap is not None and cap < 1:
         raise InputError(f"--max-gaussians: expected at least 1, found {cap}")
-    n = start_size(scene, config, cap)
+    n = start_count(scene, config, cap)
     if not len(scene.points):
         return random([view.camera for view in scene.train], replace(config, random_points=n), seed)
     rows = np.arange(n)
@@ -61,7 +61,7 @@ def initialize(scene: Scene, config: InitConfig, seed: int, cap: int | None = No
     return from_points(scene.points[rows], scene.colors[rows], config)
 
 
-def start_size(scene: Scene, config: InitConfig, cap: int | None) -> int:
+def start_count(scene: Scene, config: InitConfig, cap: int | None) -> int:
     """How many Gaussians `initialize` makes."""
     wanted = len(scene.points) or _random_points(config)
     return wanted if cap is None else min(wanted, cap)

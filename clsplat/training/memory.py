@@ -1,4 +1,4 @@
-"""Device memory that training takes, predicted from what each stage allocates; photos are kept in what it leaves."""
+"""Device memory of a training, predicted from the buffers of each stage, and the photos kept in the rest."""
 
 import re
 from dataclasses import dataclass, replace
@@ -14,12 +14,11 @@ if TYPE_CHECKING:
     from clsplat.device import Device
 
 INTERSECTIONS = 8.0
-"""Tiles that a Gaussian is assumed to meet: the mean over all Gaussians, in the view where it is largest. Measured: 2
-to 5 in scenes of 25 000 to 110 000 Gaussians at 0.13 to 0.5 megapixels; up to 20 for sparse starts at 0.7, whose
-Gaussians are so few that it does not matter."""
+"""Assumed number of tiles per Gaussian: the mean over all Gaussians, in the view where it is largest (measured:
+docs/howto/memory.md)."""
 
 ROUNDING = 17 / 16
-"""The pool rounds a block up to the next of 16 sizes per octave."""
+"""Factor by which the pool rounds up a block: to the next of 16 sizes per octave."""
 
 REAL = 4  # bytes of a float32, a uint32 or an index
 
@@ -46,13 +45,13 @@ PER_PIXEL_EXPOSURE = 3  # the image with the colours of its photo
 PER_ROW = 3 * 416  # derivatives of SSIM: rows have margins, and end with a work-item
 
 COPIES = 4
-"""Of all parameters: themselves, Adam's two moments, and what an evaluation uploads."""
+"""Copies of all parameters: themselves, Adam's two moments, and one for renders outside of training."""
 
 UNITS = {"MB": 10**6, "GB": 10**9, "MiB": 2**20, "GiB": 2**30}
 
 
-def parse_size(text: str, name: str) -> int:
-    """Bytes of a size such as 4GB, 512MiB, 1.5 GB; `name` is the argument's in errors.
+def parse_bytes(text: str, name: str) -> int:
+    """Parse a number of bytes such as 4GB, 512MiB, 1.5 GB; `name` is the argument's name in errors.
 
     Raises
     ------
@@ -66,8 +65,8 @@ def parse_size(text: str, name: str) -> int:
     return size
 
 
-def size_text(size: int) -> str:
-    """A number of bytes as people read it, in GB or MB of powers of ten."""
+def bytes_text(size: int) -> str:
+    """Format a number of bytes in GB or MB, powers of ten."""
     return f"{size / 1e9:.2f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
 
 
@@ -78,15 +77,15 @@ class Footprint:
     Parameters
     ----------
     width, height : int
-        Of the largest photo, px.
+        Size of the largest photo, px.
     sh_degree : int
         Highest degree of the spherical harmonics.
     gpu : bool
-        The device is no CPU: intersections are sorted in another way.
+        Whether the device is not a CPU: intersections are then sorted differently.
     per_tile : bool
-        ``--sort per_tile``.
+        Whether ``--sort per_tile`` is used.
     exposure : bool
-        ``--exposure``.
+        Whether ``--exposure`` is used.
     """
 
     width: int
@@ -98,14 +97,14 @@ class Footprint:
 
     @classmethod
     def of(cls, scene: Scene, config: TrainConfig, device: "Device") -> "Footprint":
-        """That of training on the scene's photos."""
+        """Footprint of training on the scene's photos."""
         cameras = [view.camera for view in scene.train + scene.test]
         width, height = max(c.width for c in cameras), max(c.height for c in cameras)
         per_tile = config.render.sort == "per_tile"
         return cls(width, height, config.init.sh_degree, not device.is_cpu, per_tile, config.exposure)
 
     def per_gaussian(self, intersections: float = INTERSECTIONS) -> float:
-        """Bytes per Gaussian that meets so many tiles."""
+        """Bytes per Gaussian, if each meets `intersections` tiles."""
         parameters = 11 + 3 * (self.sh_degree + 1) ** 2
         per_intersection = sum(PER_INTERSECTION.values())
         per_intersection += self.gpu * PER_INTERSECTION_GPU + self.per_tile * PER_INTERSECTION_PER_TILE
@@ -114,43 +113,46 @@ class Footprint:
 
     @property
     def fixed(self) -> int:
-        """Bytes that do not depend on the Gaussians."""
+        """Bytes that do not depend on the number of Gaussians."""
         per_pixel = sum(PER_PIXEL.values()) + self.exposure * PER_PIXEL_EXPOSURE
         return round(REAL * ROUNDING * self.height * (self.width * per_pixel + PER_ROW))
 
     def total(self, n: int, intersections: float = INTERSECTIONS) -> int:
-        """Bytes for n Gaussians, each of which meets so many tiles; one photo is on the device."""
+        """Bytes for n Gaussians, if each meets `intersections` tiles; one photo is on the device."""
         return self.fixed + round(n * self.per_gaussian(intersections))
 
     def most_gaussians(self, limit: int, intersections: float = INTERSECTIONS) -> int:
         """The largest number of Gaussians for which `total` is within `limit` bytes; 0 where none is."""
         return max(0, int((limit - self.fixed) / self.per_gaussian(intersections)))
 
-    def describe(self, start: int, cap: int | None, limit: int) -> str:
-        """A sentence on what training takes, from `start` Gaussians to at most `cap`, within `limit` bytes.
+    def check(self, start: int, limit: int) -> None:
+        """Check that `start` Gaussians fit `limit` bytes.
 
         Raises
         ------
         InputError
-            If not even the start fits; the message says what does.
+            If they do not; the message names what does.
         """
         if self.total(start) > limit:
             smaller = {d: replace(self, width=self.width // d, height=self.height // d) for d in (2, 4, 8)}
             fitting = [f" with all of them: --downscale {d}" for d, f in smaller.items() if f.total(start) <= limit]
             raise InputError(
-                f"--memory-limit: expected at least {size_text(self.total(start))} for {start} Gaussians at "
-                f"{self.width}x{self.height}, found {size_text(limit)}; what fits at this size: "
+                f"--memory-limit: expected at least {bytes_text(self.total(start))} for {start} Gaussians at "
+                f"{self.width}x{self.height}, found {bytes_text(limit)}; what fits at this size: "
                 f"{self.most_gaussians(limit)} Gaussians{''.join(fitting[:1])}"
             )
-        capped = "" if cap is None else f" {size_text(self.total(cap))} for {cap} (--max-gaussians),"
+
+    def describe(self, start: int, cap: int | None, limit: int) -> str:
+        """A sentence on the memory of a training, from `start` Gaussians to at most `cap`, within `limit` bytes."""
+        capped = "" if cap is None else f" {bytes_text(self.total(cap))} for {cap} (--max-gaussians),"
         return (
-            f"memory: {size_text(self.total(start))} for {start} Gaussians,{capped} if each meets "
-            f"{INTERSECTIONS:.0f} tiles; limit {size_text(limit)}, enough for {self.most_gaussians(limit)}"
+            f"memory: {bytes_text(self.total(start))} for {start} Gaussians,{capped} if each meets "
+            f"{INTERSECTIONS:.0f} tiles; limit {bytes_text(limit)}, enough for {self.most_gaussians(limit)}"
         )
 
 
 class Photos:
-    """Photos and masks on the device, uploaded when first asked for and kept within a budget of bytes."""
+    """Photos and masks on the device, uploaded when they are first needed and kept within a budget of bytes."""
 
     def __init__(self, device: "Device"):
         self._device = device
@@ -159,7 +161,7 @@ class Photos:
         self._budget = 0
 
     def keep_within(self, budget: int) -> None:
-        """Drop what exceeds a budget, which counts from now on."""
+        """Set the budget, bytes, and drop photos that exceed it."""
         self._budget = budget
         while self._kept and self._bytes > budget:
             _, dropped = self._kept.popitem()

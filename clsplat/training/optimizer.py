@@ -1,33 +1,39 @@
-"""The optimiser's state and the schedules of the learning rates and of the spherical harmonics."""
+"""The optimiser: Adam on the device or in NumPy, its moments, and the schedules of the learning rates."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat import reference
 from clsplat.config import OptimConfig
 from clsplat.gaussians import Gaussians
-from clsplat.stages import AdamStep
+from clsplat.renderer import Pass, Renderer, download, fetch
+from clsplat.stages import AdamStep, CameraGrads, SplatGrads, Stages
+from clsplat.training.smoothing_filter import SmoothingFilter
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
 
 Array = NDArray[Any]
 
 
 @dataclass
 class Moments:
-    """Adam's running means of the gradients and of their squares, row by row those of the Gaussians."""
+    """Adam's running means of the gradients and of their squares, one row per Gaussian."""
 
     first: Gaussians
     second: Gaussians
 
     @classmethod
     def zeros(cls, gaussians: Gaussians) -> "Moments":
-        """Moments at the start of the optimisation of `gaussians`."""
+        """Moments before the first step on `gaussians`."""
         first, second = (Gaussians(**{k: np.zeros_like(a) for k, a in gaussians.arrays().items()}) for _ in range(2))
         return cls(first, second)
 
     def take(self, rows: Array, fresh: Array) -> "Moments":
-        """Moments after an edit of the rows: row i continues row rows[i], or starts at 0 where fresh[i]."""
+        """Moments after an edit: row i continues row rows[i], or starts at 0 where fresh[i]."""
         moved = Moments(self.first.take(rows), self.second.take(rows))
         for array in (*moved.first.arrays().values(), *moved.second.arrays().values()):
             array[fresh] = 0
@@ -35,12 +41,21 @@ class Moments:
 
 
 def sh_degree_at(iteration: int, every: int, stored: int) -> int:
-    """Degree of the spherical harmonics that is rendered and trained in an iteration, counted from 1: one more after
-    `every` iterations, up to the degree that is stored."""
+    """Degree of the spherical harmonics that is rendered and trained in an iteration, counted from 1.
+
+    It rises by one after every `every` iterations, up to the degree that is stored.
+    """
     return min(stored, (iteration - 1) // every)
 
 
-def adam_settings(iteration: int, progress: float, extent: float, config: OptimConfig, sh_degree: int) -> AdamStep:
+def adam_settings(
+    iteration: int,
+    progress: float,
+    extent: float,
+    config: OptimConfig,
+    sh_degree: int,
+    penalties: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> AdamStep:
     """Learning rates and constants of an iteration.
 
     Parameters
@@ -48,11 +63,13 @@ def adam_settings(iteration: int, progress: float, extent: float, config: OptimC
     iteration : int
         Counted from 1.
     progress : float
-        From 0 to 1, where means_lr_final is reached.
+        Fraction of the training, 0 to 1; means_lr_final is reached at 1.
     extent : float
-        Scale of the scene in world units: the means' rate is proportional to it.
+        Scale of the scene, world units; the learning rate of the means is proportional to it.
     sh_degree : int
         Highest degree of the spherical harmonics that is trained.
+    penalties : three floats
+        Weights in the loss of the sums of all opacities, of all scales, and of the penalties of needles.
     """
     rates = {
         "means": extent * config.means_lr * (config.means_lr_final / config.means_lr) ** progress,
@@ -62,4 +79,70 @@ def adam_settings(iteration: int, progress: float, extent: float, config: OptimC
         "sh0": config.sh0_lr,
         "sh_rest": config.sh_rest_lr,
     }
-    return AdamStep(iteration, rates, config.beta1, config.beta2, config.eps, sh_degree)
+    return AdamStep(iteration, rates, config.beta1, config.beta2, config.eps, sh_degree, penalties)
+
+
+class Optimizer:
+    """Adam on the device, or in NumPy on the host: the same to rounding.
+
+    Attributes
+    ----------
+    home : Device or None
+        Place of parameters, moments and statistics: the device, or None for the host.
+    stages : Stages
+        The functions of the stages that work there.
+    """
+
+    def __init__(self, renderer: Renderer, kind: Literal["device", "numpy"]):
+        self._renderer = renderer
+        self.home: Device | None = renderer.device if kind == "device" else None
+        self.stages: Stages = renderer.stages if kind == "device" else reference
+
+    def bring(self, array: Any) -> Any:
+        """A device array where the optimiser works."""
+        return download(array) if self.home is None else array
+
+    def step(
+        self,
+        gaussians: Gaussians,
+        moments: Moments,
+        smoothing: SmoothingFilter | None,
+        run: Pass,
+        v_splats: SplatGrads,
+        settings: AdamStep,
+        *,
+        camera_grad: bool = False,
+    ) -> CameraGrads | None:
+        """Differentiate by the parameters and take one step of Adam on them, in place.
+
+        On the device both are one kernel, unless the 3D filter comes between them.
+
+        Parameters
+        ----------
+        gaussians, moments
+            The parameters and their moments, at `home`.
+        smoothing : SmoothingFilter or None
+            The 3D filter that was applied before rendering.
+        run, v_splats
+            The forward pass, and the gradients with respect to its splats.
+        settings : AdamStep
+        camera_grad : bool
+            Whether the gradient with respect to the camera is computed.
+
+        Returns
+        -------
+        CameraGrads or None
+        """
+        stages, both = self._renderer.stages, (moments.first, moments.second)
+        options = {"antialiased": self._renderer.config.mode == "antialiased", "camera_grad": camera_grad}
+        if self.home is not None and smoothing is None:
+            return stages.project_bwd_adam(gaussians, both, run.camera, run.splats, v_splats, settings, **options)
+        v_gaussians, v_camera = stages.project_bwd(
+            run.gaussians, run.camera, settings.sh_degree, run.splats, v_splats, **options
+        )
+        if smoothing:
+            v_gaussians = smoothing.backward(stages, self._renderer.place(gaussians), v_gaussians)
+        if self.home is None:
+            v_gaussians = fetch(v_gaussians)
+        self.stages.adam_step(gaussians, v_gaussians, *both, settings)
+        return v_camera

@@ -1,4 +1,4 @@
-"""A few numbers per training photo beside the scene, with an Adam of their own on the host."""
+"""Parameters learned per training photo, with an optimiser (Adam) of their own on the host."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +15,8 @@ Array = NDArray[Any]
 class PerPhoto:
     """Parameters of V photos.
 
-    names: of the photos; values (V, ...): the parameters; first, second (V, ...): Adam's moments of the gradients;
-    steps (V,): how often each photo's were updated, by which its moments are corrected.
+    names: names of the photos; values (V, ...): the parameters; first, second (V, ...): Adam's moments of the
+    gradients; steps (V,): number of updates of each photo's parameters, by which its moments are corrected.
     """
 
     names: list[str]
@@ -27,7 +27,7 @@ class PerPhoto:
 
     @classmethod
     def start(cls, names: list[str], value: Array, shape: tuple[int, ...]) -> "PerPhoto":
-        """The same value for all photos; `shape` is that of a photo's gradient."""
+        """Parameters with the same value for all photos; `shape` is that of a photo's gradient."""
         v = len(names)
         values = np.repeat(np.asarray(value, np.float64)[None], v, axis=0)
         return cls(names, values, np.zeros((v, *shape)), np.zeros((v, *shape)), np.zeros(v, np.int64))
@@ -38,7 +38,7 @@ class PerPhoto:
         return values
 
     def step(self, name: str, gradient: Array, rate: Any, config: OptimConfig) -> Array:
-        """A photo's step of Adam (Kingma and Ba 2015, algorithm 1), which the caller adds; changes the moments."""
+        """Step of Adam (Kingma and Ba 2015, algorithm 1) for a photo, which the caller adds; changes the moments."""
         i = self.names.index(name)
         self.steps[i] += 1
         self.first[i] += (1 - config.beta1) * (gradient - self.first[i])
@@ -54,6 +54,6 @@ class PerPhoto:
 
     @classmethod
     def restored(cls, arrays: dict[str, Array]) -> "PerPhoto":
-        """What `arrays` gave."""
+        """Parameters from the arrays that `arrays` returned."""
         numbers = (arrays[name] for name in ("values", "first", "second", "steps"))
         return cls([str(name) for name in arrays["names"]], *numbers)

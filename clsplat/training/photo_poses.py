@@ -1,50 +1,48 @@
-"""Refinement of camera poses: a rigid motion for each training photo, found together with the scene.
+"""Refinement of camera poses: a rigid motion for each training photo, optimised together with the scene.
 
-Structure from motion places cameras to a fraction of a pixel at best, and poses from a phone's tracking or a rig are
-worse: Gaussians then blur what the photos do not agree on. The image's gradient with respect to the viewmat says how
-to move the camera (Lin et al. 2021, "BARF"). Scene and cameras may move together without any change of the photos: an
-evaluation of held-out photos, whose cameras were not refined, therefore aligns each with the scene first.
+Structure from motion is accurate to a fraction of a pixel at best, and poses from a phone's tracking or a rig are
+worse. Gaussians then become blurred. The gradient of the loss with respect to the viewmat shows how to move the
+camera (Lin et al. 2021, "BARF"). Scene and cameras can move together without changing the renders. An evaluation of
+held-out photos, whose cameras were not refined, therefore aligns each of them with the scene first.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config import OptimConfig, RenderConfig
+from clsplat.config import OptimConfig
 from clsplat.gaussians import Gaussians
-from clsplat.render import Color, backward, forward, stage_functions, upload
+from clsplat.renderer import Renderer
 from clsplat.scene import View
 from clsplat.stages import Image
 from clsplat.training.photo_parameters import PerPhoto
 
-if TYPE_CHECKING:
-    from clsplat.device import Device
-
 Array = NDArray[Any]
 
 ALIGNING_STEPS = 100
-"""Steps in which a held-out photo's camera is aligned with a scene: at the default rates they reach 1.2 degrees."""
+"""Steps in which a held-out photo's camera is aligned with a scene; at the default rates they can turn it by 1.2
+degrees."""
 
 
 def start(names: list[str]) -> PerPhoto:
-    """No motion: (V, 4, 4) for V photos, each applied in its camera's frame, after the world-to-camera transform."""
+    """Identity motions, (V, 4, 4) for V photos; each is applied in its camera's frame, after the viewmat."""
     return PerPhoto.start(names, np.eye(4), (6,))
 
 
 def refined(camera: Camera, motion: Array) -> Camera:
-    """The camera after a motion (4, 4) in its own frame."""
+    """Apply a motion (4, 4) to a camera, in its own frame."""
     return replace(camera, viewmat=motion @ camera.viewmat)
 
 
 def update(
     poses: PerPhoto, name: str, camera: Camera, v_viewmat: Array, rate: float, extent: float, config: OptimConfig
 ) -> None:
-    """One step on a photo's motion, by the gradient (4, 4) with respect to the viewmat of its refined camera.
+    """Take a step on a photo's motion by the gradient (4, 4) with respect to the viewmat of its refined camera.
 
-    rate: radians; positions move by as many extents of the scene.
+    rate: learning rate of rotations, radians, and of positions, extents of the scene.
     """
     rates = rate * np.array([1, 1, 1, extent, extent, extent])
     step = poses.step(name, twist_gradient(camera.viewmat, v_viewmat), rates, config)
@@ -84,31 +82,29 @@ def aligned(
     view: View,
     extent: float,
     config: OptimConfig,
-    render: RenderConfig,
-    device: "Device",
-    background: Color,
+    renderer: Renderer,
 ) -> View:
-    """A held-out view with its camera where the scene explains its photo best, near where it was.
+    """Move the camera of a held-out view, near its pose, to where the scene matches its photo best.
 
     Parameters
     ----------
     gaussians : Gaussians
         On the host.
     extent : float
-        Of the scene, in world units.
+        Scale of the scene, world units.
     config : OptimConfig
-        Its rates and the loss are those of the training.
+        Learning rates and loss of the training.
+    renderer : Renderer
     """
-    stage, uploaded = stage_functions(device), upload(device, gaussians)
-    photo = device.upload("photo", view.image, np.uint8)
-    mask = None if view.mask is None else device.upload("mask", view.mask, np.uint8)
+    placed, photo = renderer.place(gaussians), renderer.upload("photo", view.image, np.uint8)
+    mask = None if view.mask is None else renderer.upload("mask", view.mask, np.uint8)
     pose = start([view.name])
     for k in range(ALIGNING_STEPS):
         camera = refined(view.camera, pose.of(view.name))
-        run = forward(device, uploaded, camera, render, background, gaussians.sh_degree)
-        _, v_image = stage.l1_ssim(run.image.image, photo, config.ssim_weight, mask)
-        v_alpha = device.scratch("v_alpha", camera.height * camera.width)
-        v_viewmat = backward(device, run, Image(v_image, v_alpha), camera_grad=True).viewmat
+        run = renderer.forward(placed, camera)
+        _, v_rgb = renderer.stages.l1_ssim(run.image.rgb, photo, config.ssim_weight, mask)
+        v_image = Image(v_rgb, renderer.no_alpha_gradient(camera))
+        v_viewmat = renderer.backward(run, v_image, camera_grad=True).viewmat
         assert v_viewmat is not None
         update(pose, view.name, camera, v_viewmat, rate_at(k / ALIGNING_STEPS, config), extent, config)
     return replace(view, camera=refined(view.camera, pose.of(view.name)))

@@ -185,7 +185,7 @@ def test_growth_reaches_the_cap_in_time(settings: McmcConfig | ErrorConfig, iter
     n, sizes = min(1000, cap), []
     schedule = Schedule(replace(CONFIG, iterations=iterations, max_gaussians=cap), settings)
     for iteration in filter(schedule.due, range(1, iterations + 1)):
-        before, n = n, schedule.size_after(iteration, n, cap)
+        before, n = n, schedule.count_after(iteration, n, cap)
         assert n == cap or n >= round(before * (1 + settings.growth))
         sizes.append((iteration, n))
     assert max(size for _, size in sizes) == cap
@@ -196,15 +196,15 @@ def test_growth_reaches_the_cap_in_time(settings: McmcConfig | ErrorConfig, iter
 def test_growth_takes_nothing_away() -> None:
     """Where less than there is fits the device."""
     schedule = Schedule(replace(CONFIG, max_gaussians=5000), McmcConfig())
-    assert [schedule.size_after(200, 1000, cap) for cap in (900, 1010)] == [1000, 1010]
+    assert [schedule.count_after(200, 1000, cap) for cap in (900, 1010)] == [1000, 1010]
 
 
 @pytest.mark.parametrize(("iterations", "factor"), [(7000, 2 ** (1 / 7)), (2000, 1.25), (300, 1.25)])
 def test_the_search_grows_by_parts(iterations: int, factor: float) -> None:
     """In the 350 iterations of a trial three and a half rounds make sqrt(2); in 100 one would, all at once."""
     schedule = Schedule(replace(CONFIG, iterations=iterations, size="auto", max_gaussians=None), ErrorConfig())
-    assert schedule.size_after(200, 1000, 10_000) == int(np.ceil(1000 * factor))
-    assert schedule.size_after(200, 1000, 1050) == 1050
+    assert schedule.count_after(200, 1000, 10_000) == int(np.ceil(1000 * factor))
+    assert schedule.count_after(200, 1000, 1050) == 1050
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "error"])

@@ -67,7 +67,7 @@ def test_the_largest_errors_are_split() -> None:
     strategy = ErrorGuided(replace(CONFIG, max_gaussians=1000), 1.0, N)
     strategy.max_gaussians = 1000
     edit = strategy.edit(200, scene(), seeing(np.ones(N), errors))
-    target = strategy.schedule.size_after(200, N, 1000)
+    target = strategy.schedule.count_after(200, N, 1000)
     assert N < len(edit.rows) == target < 1000
     parents = np.unique(edit.rows[edit.fresh])
     assert sorted(parents) == sorted(np.argsort(-errors)[: target - N])

@@ -19,7 +19,7 @@ from clsplat.scene import Scene, View
 from clsplat.training.checkpoint import load_state
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.loop import train
-from clsplat.training.memory import INTERSECTIONS, Footprint, Photos, parse_size
+from clsplat.training.memory import INTERSECTIONS, Footprint, Photos, parse_bytes
 
 FIXED_N = AdcConfig(stop_fraction=0)
 """No densification."""
@@ -43,13 +43,13 @@ def make_scene(n: int, width: int, height: int, views: int = 4) -> Scene:
     [("4GB", 4 * 10**9), ("512MiB", 2**29), ("1.5 GB", 15 * 10**8), (".5GiB", 2**29), ("7MB", 7 * 10**6)],
 )
 def test_sizes(text: str, expected: int) -> None:
-    assert parse_size(text, "--memory-limit") == expected
+    assert parse_bytes(text, "--memory-limit") == expected
 
 
 @pytest.mark.parametrize("text", ["4", "GB", "4gb", "-1GB", "0GB", "4GB more", "1e9MB", "4.5.6GB", ""])
 def test_no_size(text: str) -> None:
     with pytest.raises(InputError, match=r"^--memory-limit: expected a size such as 4GB or 512MiB, found"):
-        parse_size(text, "--memory-limit")
+        parse_bytes(text, "--memory-limit")
 
 
 @pytest.mark.parametrize("sort", ["auto", "per_tile"])

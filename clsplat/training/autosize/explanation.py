@@ -1,4 +1,4 @@
-"""How the size of a scene was chosen: size.json and its chart."""
+"""Explanation of the chosen number of Gaussians: size.json and its chart."""
 
 import json
 from math import log
@@ -10,11 +10,11 @@ from clsplat.training.autosize.rule import SURE, Search, sh_bytes
 
 
 def write_report(path: Path, search: Search, config: TrainConfig) -> None:
-    """size.json: every point with what it was worth, the rule and the choice.
+    """Write size.json: the rule, all trials and candidates, and the choice.
 
-    least_share: the price as that of one Gaussian. A doubling that gains p dB lowers the squared error by the
-    fraction p ln(10)/10, and is ln(2) on the natural scale of N: the last Gaussian must lower it by this part of a
-    Gaussian's even share.
+    least_share is the price per doubling as one of a single Gaussian. A doubling that gains p dB lowers the squared
+    error by the fraction p ln(10)/10 and is ln(2) on the natural scale of N. The last Gaussian must therefore lower
+    the error by the fraction p ln(10)/(10 ln(2)) of a Gaussian's even share.
     """
     chosen = max(search.degrees, key=lambda p: p.worth)
     content = {
@@ -46,10 +46,10 @@ def write_report(path: Path, search: Search, config: TrainConfig) -> None:
 
 
 def size_chart(report: Path, path: Path) -> None:
-    """Draw how the size of a scene was chosen, as a PNG.
+    """Draw the choice of the number of Gaussians as a PNG.
 
-    Left, the validation PSNR against the number of Gaussians: the two sides of each trial joined; right, against the
-    bytes, of each degree of the spherical harmonics.
+    Left, the validation PSNR against the number of Gaussians, with the two sides of each trial joined. Right, the
+    same against the bytes, for each degree of the spherical harmonics.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def size_chart(report: Path, path: Path) -> None:
     for trial in content["trials"]:
         color, label = (grey, "growth") if trial["kind"] == "growth" else (blue, "pruning")
         larger = trial["psnr"][1]
-        sides = [larger - trial["gain"], larger]  # means of all photos would belie what the middle half decided
+        sides = [larger - trial["gain"], larger]  # by the gain that decided, not by the means over all photos
         by_n.plot(trial["n"], sides, "-", color=color, label=None if label in labelled else label)
         labelled.add(label)
         for n, quality in zip(trial["n"], sides, strict=True):
@@ -87,7 +87,7 @@ def size_chart(report: Path, path: Path) -> None:
     by_bytes.plot(best["bytes"] / 1e6, best["psnr"], "*", color=orange, markersize=15, zorder=4)
     for p in degrees:
         marker = ", chosen" if p is best else ""
-        right = p is degrees[0]  # the curve is to the right of the first, to the left of the others
+        right = p is degrees[0]  # the curve lies right of the first point and left of the others
         place = {"xytext": (8 if right else -10, -4), "ha": "left" if right else "right"}
         at = p["bytes"] / 1e6, p["psnr"]
         by_bytes.annotate(f"degree {p['sh_degree']}{marker}", at, textcoords="offset points", **place)

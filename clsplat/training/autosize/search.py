@@ -1,108 +1,130 @@
-"""The search for the size of a scene within a training: the trials of `clsplat.training.autosize.rule`."""
+"""The search for the number of Gaussians: it drives a training from trial to trial."""
 
 from collections.abc import Callable
-from copy import copy, deepcopy
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from clsplat.config import TrainConfig
-from clsplat.render import fetch
+from clsplat.renderer import fetch
 from clsplat.scene import View
-from clsplat.training.autosize import rule as size
-from clsplat.training.checkpoint import State, as_seen, filtered, measure_pixels, move
-from clsplat.training.optimizer import sh_degree_at
+from clsplat.training.autosize.reduction import costliest_rows
+from clsplat.training.autosize.rule import (
+    Candidate,
+    Decision,
+    Search,
+    SmallSide,
+    Trial,
+    candidate,
+    first_pruning,
+    halvings,
+    most_grown,
+    most_identifiable,
+    next_phase,
+    trial_bounds,
+    validation_times,
+)
+from clsplat.training.autosize.validation import split, validate
+from clsplat.training.smoothing_filter import SmoothingFilter
+from clsplat.training.state import State
 
 if TYPE_CHECKING:
-    from clsplat.device import Device
+    from clsplat.training.loop import Training
+
+After = Callable[["Training", float], None]
+"""Called after each iteration with the training and the loss."""
 
 
-def seek_size(
-    state: State,
-    iteration: int,
-    views: list[View],
-    config: TrainConfig,
-    device: "Device",
-    go: Callable[[State, int], float],
-    tell: Callable[[State, float], None],
-) -> State:
-    """What `clsplat.training.autosize.rule` does before an iteration: end a trial, begin the next, choose.
+def search_size(training: "Training", after: After, after_fork: After) -> None:
+    """Run a training until the number of its Gaussians is settled.
 
-    The state that is given stays whole until another is returned: whoever interrupts a trial loses that alone.
+    Parameters
+    ----------
+    training : Training
+        With a search in its state, which may be a resumed one.
+    after, after_fork : callable
+        Called after each iteration of the training, and of the smaller side of a trial. While the latter runs, the
+        training's state stays as it was before the trial: an interruption loses the trial alone.
     """
-    before = state.search
-    if before is None or before.settled:
-        return state
-    stops, looks = size.stops(config), size.looks(config)
-    if iteration not in (looks if before.rival else stops):
-        return state
-    training, validation = (as_seen(part, state) for part in size.split(views))
-
-    def degree(state: State) -> int:
-        every = config.shortened(config.optim.sh_degree_every)
-        return sh_degree_at(state.iteration, every, state.gaussians.sh_degree)
-
-    def look(state: State) -> list[float]:
-        return size.validate(fetch(filtered(state, device)), validation, config, device, degree(state))
-
-    def point(at: int, state: State, seen: list[list[float]]) -> size.Point:
-        return size.point(at, len(state.gaussians), degree(state), seen, config)
-
-    seen = [*before.seen, look(state)] if before.rival else []
-    if iteration not in stops:
-        return replace(state, search=replace(before, seen=seen))
-    move(state, None)
-    search = replace(before, trials=[*before.trials], rival=None, seen=[])
-    state = replace(state, search=search, strategy=copy(state.strategy))
-    if before.rival:
-        grown = iteration < size.first_shrink(config)
-        search.trials.append(size.Trial(grown, before.rival.point, point(iteration, state, seen)))
-        if search.trials[-1].takes_smaller:
-            state.gaussians, state.moments, state.strategy.statistics = before.rival.kept
-            state.pixels = None  # of other rows
-    if config.filter_3d and state.pixels is None:
-        measure_pixels(state, training, device)
-    search.most = len(state.gaussians)
-    most = size.most_identifiable(views, config)
-    todo = size.next_trial(search, iteration, config, most)
-    if todo == "settle":
-        here = size.Kept(state.gaussians, state.moments, state.strategy.statistics)
-        shown = fetch(filtered(state, device))
-        chosen = size.settle(search, iteration, shown, validation, config, device, degree(state))
-        state.gaussians, state.moments, state.strategy.statistics = size.lower_degree(here, chosen)
-    elif todo in ("try", "shrink"):
-        end = stops[stops.index(iteration) + 1]
-        trial = smaller_side(state, as_seen(views, state) if todo == "shrink" else None, config, device)
-        seen = []
-        for i in range(iteration, end):
-            tell(trial, go(trial, i))
-            if i + 1 in looks:
-                seen.append(look(trial))
-        move(trial, None)
-        kept = size.Kept(trial.gaussians, trial.moments, trial.strategy.statistics)
-        search.rival = size.Rival(kept, point(end, trial, seen))
-    search.most = size.most_grown(search, todo, config, most)
-    if config.optimizer == "device":
-        move(state, device)
-    return state
+    bounds, times = trial_bounds(training.config), validation_times(training.config)
+    for iteration in sorted(times.union(bounds)):
+        search = training.state.search
+        if search is None or search.settled:
+            return
+        if iteration <= training.state.iteration:  # before the checkpoint that a run was resumed from
+            continue
+        training.run_until(iteration - 1, after)
+        if search.small_side:
+            search = replace(search, validated=[*search.validated, _validate(training, _validation_views(training))])
+        if iteration in bounds:
+            training.state = _decide(training, search, iteration, after_fork)
+        else:
+            training.state = replace(training.state, search=search)
 
 
-def smaller_side(state: State, views: list[View] | None, config: TrainConfig, device: "Device") -> State:
-    """A state that shares nothing with this one and has its Gaussians or, given views, those that they would miss
-    most."""
+def _decide(training: "Training", search: Search, iteration: int, after_fork: After) -> State:
+    """End the current trial, decide the next phase, and train the smaller side of its trial; the state to go on
+    with."""
+    state, trials = replace(training.state), search.trials
+    if search.small_side:
+        larger = _candidate(training, iteration, search.validated)
+        trials = [*trials, Trial(iteration < first_pruning(training.config), search.small_side.candidate, larger)]
+        if trials[-1].takes_smaller:
+            state = replace(state, rows=search.small_side.rows, filter=state.filter and SmoothingFilter())
+    search = state.search = Search(len(state.gaussians), trials)
+    here = training.fork(state)  # an interruption of what follows leaves the training as it is
+    here.refresh_filter()
+    most = most_identifiable(training.scene.train, training.config)
+    phase = next_phase(search, iteration, training.config, most)
+    if phase == "settle":
+        search = replace(search, settled=iteration, degrees=_degrees(here, iteration))
+        best = max(search.degrees, key=lambda c: c.worth).sh_degree
+        here.state.rows = here.state.rows.on(None).with_degree(best).on(here.optimizer.home)
+    elif phase in ("try", "prune"):
+        search = replace(search, small_side=_train_small_side(here, phase, iteration, after_fork))
+    here.state.search = replace(search, most=most_grown(search, phase, training.config, most))
+    return here.state
+
+
+def _train_small_side(training: "Training", phase: Decision, iteration: int, after: After) -> SmallSide:
+    """Fork a training and train the fork to the end of the trial: with the same Gaussians, or with the costliest."""
+    state, config = training.state, training.config
     rows = np.arange(len(state.gaussians))
-    if views and state.search:
-        left = 2 ** -size.halvings(state.search.trials)
-        rows = size.costliest_rows(fetch(filtered(state, device)), left, views, config, device)
-    here = size.Kept(state.gaussians, state.moments, state.strategy.statistics)
-    gaussians, moments, statistics = here.take(rows)
-    strategy, search = copy(state.strategy), state.search and replace(state.search, most=len(rows))
-    strategy.statistics = statistics
-    learned = {name: deepcopy(getattr(state, name)) for name in ("exposures", "poses")}
-    trial = replace(
-        state, gaussians=gaussians, moments=moments, strategy=strategy, search=search, pixels=None, **learned
-    )
-    if config.optimizer == "device":
-        move(trial, device)
-    return trial
+    if phase == "prune":
+        left = 2 ** -halvings(state.search.trials if state.search else [])
+        gaussians, views = fetch(state.shown(training.renderer)), state.corrected(training.scene.train)
+        rows = costliest_rows(gaussians, left, views, training.renderer)
+    side = training.fork(state.fork(state.rows.on(None).take(rows)))
+    validation, validated = _validation_views(training), []
+    end = next(bound for bound in trial_bounds(config) if bound > iteration)
+    for time in sorted(time for time in validation_times(config) if iteration < time <= end):
+        side.run_until(time - 1, after)
+        validated.append(_validate(side, validation))
+    return SmallSide(side.state.rows.on(None), _candidate(side, end, validated))
+
+
+def _degrees(training: "Training", iteration: int) -> list[Candidate]:
+    """Candidates for the degree of the spherical harmonics, of those that are trained."""
+    state, config, renderer = training.state, training.config, training.renderer
+    gaussians, views = state.shown(renderer), _validation_views(training)
+    return [
+        candidate(iteration, len(gaussians), degree, [validate(gaussians, views, renderer, degree)], config)
+        for degree in range(state.sh_degree(state.iteration, config) + 1)
+    ]
+
+
+def _validation_views(training: "Training") -> list[View]:
+    return training.state.corrected(split(training.scene.train)[1])
+
+
+def _validate(training: "Training", views: list[View]) -> list[float]:
+    """PSNR of each validation view, dB."""
+    state = training.state
+    degree = state.sh_degree(state.iteration, training.config)
+    return validate(state.shown(training.renderer), views, training.renderer, degree)
+
+
+def _candidate(training: "Training", iteration: int, validated: list[list[float]]) -> Candidate:
+    state = training.state
+    degree = state.sh_degree(state.iteration, training.config)
+    return candidate(iteration, len(state.gaussians), degree, validated, training.config)

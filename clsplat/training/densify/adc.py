@@ -9,13 +9,16 @@ from clsplat.config import TrainConfig
 from clsplat.gaussians import Gaussians, logit
 from clsplat.randomness import stream
 from clsplat.reference.project import rotations
+from clsplat.stages import Stages
 from clsplat.training.densify.strategy import Edit, Strategy, Survey
 
 Array = NDArray[Any]
 
-# Children of a split: their number, and the divisor of their scales (original: 0.8 * 2).
 CHILDREN = 2
+"""Children of a Gaussian that is split."""
+
 CHILD_SHRINK = 1.6
+"""Divisor of the scales of the children of a split (original: 0.8 * 2)."""
 
 
 class Adc(Strategy):
@@ -29,8 +32,8 @@ class Adc(Strategy):
         super().__init__(config, extent, n)
         self.config, self.seed, self.extent = config.adc, config.seed, extent
         self.start = config.shortened(config.adc.start)
-        # On white, Gaussians in empty space turn white instead of transparent: a reset at the first round of
-        # densification leaves those without use to be pruned (original).
+        # On white, Gaussians in empty space turn white instead of transparent. A reset at the first round of
+        # densification makes those that are not needed transparent, and they are pruned (original).
         self.white = config.data.background == "white"
         self.first_edit = -(-self.start // config.adc.every) * config.adc.every
         self.stop = round(config.adc.stop_fraction * config.iterations)
@@ -43,9 +46,9 @@ class Adc(Strategy):
         """See `clsplat.training.densify.Strategy`."""
         return iteration < self.stop
 
-    def observe(self, stage: Any, extents: Any, v_means2d: Any, width: int, height: int) -> None:
+    def observe(self, stages: Stages, extents: Any, v_means2d: Any, width: int, height: int) -> None:
         """See `clsplat.training.densify.Strategy`."""
-        stage.observe(extents, v_means2d, width, height, **self.statistics)
+        stages.observe(extents, v_means2d, width, height, **self.statistics)
 
     def _densifies(self, iteration: int) -> bool:
         return self.start <= iteration < self.stop and iteration % self.config.every == 0
@@ -59,11 +62,11 @@ class Adc(Strategy):
         """See `clsplat.training.densify.Strategy`."""
         return self._densifies(iteration) or self._resets(iteration)
 
-    def edit(self, iteration: int, gaussians: Gaussians, survey: Survey) -> Edit:
+    def edit(self, iteration: int, gaussians: Gaussians, cap: int, survey: Survey) -> Edit:
         """See `clsplat.training.densify.Strategy`."""
         edit = Edit(gaussians, np.arange(len(gaussians)), np.zeros(len(gaussians), bool))
         if self._densifies(iteration):
-            edit = self._prune(iteration, self._densify(iteration, gaussians))
+            edit = self._prune(iteration, self._densify(iteration, gaussians, cap))
             self._clear(len(edit.rows))
             if self.config.opacity_decay:
                 edit.gaussians.logit_opacities = logit(
@@ -77,12 +80,12 @@ class Adc(Strategy):
             edit = edit._replace(gaussians=lowered, reset_opacities=True)
         return edit
 
-    def _densify(self, iteration: int, gaussians: Gaussians) -> Edit:
+    def _densify(self, iteration: int, gaussians: Gaussians, cap: int) -> Edit:
         c, n = self.config, len(gaussians)
         grads = self.statistics["grad_sum"] / np.maximum(self.statistics["seen"], 1)
         chosen = np.flatnonzero(grads >= c.grad_threshold)
-        # Each adds one Gaussian; where the cap leaves no room for all, the largest gradients come first.
-        room = max(0, self.max_gaussians - n)
+        # Each adds one Gaussian. Where the cap leaves no room for all, the largest gradients come first.
+        room = max(0, cap - n)
         if len(chosen) > room:
             chosen = np.sort(chosen[np.argsort(-grads[chosen], kind="stable")[:room]])
         large = gaussians.scales[chosen].max(axis=1) > c.scale_threshold * self.extent

@@ -8,22 +8,24 @@ from numpy.typing import NDArray
 from clsplat.config import TrainConfig
 from clsplat.gaussians import Gaussians, logit
 from clsplat.randomness import stream
+from clsplat.stages import Stages
 from clsplat.training.densify.schedule import Schedule
 from clsplat.training.densify.strategy import Edit, Strategy, Survey
 
 Array = NDArray[Any]
 
-# A Gaussian becomes at most so many at once; the binomial coefficients stay exact in double precision (original).
 COPIES_MAX = 51
+"""Largest number of copies of a Gaussian made in one round; binomial coefficients up to it are exact in float64
+(original)."""
 
 
 class Mcmc(Strategy):
-    """Gaussians as samples: dead ones move to live ones, noise explores, penalties free what is not needed.
+    """Gaussians as samples: dead ones move to live ones, noise explores, penalties make unneeded ones transparent.
 
-    It remembers nothing between iterations.
+    It keeps no statistics.
     """
 
-    start_opacity = 0.5  # the original's; measured 0.6 dB better than 0.1 on fox_pinhole
+    start_opacity = 0.5  # original
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         super().__init__(config, extent, n)
@@ -31,19 +33,20 @@ class Mcmc(Strategy):
         self.schedule = Schedule(config, config.mcmc)
 
     def penalties(self, n: int) -> tuple[float, float]:
-        """See `clsplat.training.densify.Strategy`: of the means over all Gaussians, and all axes."""
+        """See `clsplat.training.densify.Strategy`; the configured weights are those of means over Gaussians and
+        axes."""
         return self.config.opacity_penalty / n, self.config.scale_penalty / (3 * n * self.extent)
 
-    def perturb(self, stage: Any, gaussians: Gaussians, iteration: int, rate: float) -> None:
+    def perturb(self, stages: Stages, gaussians: Gaussians, iteration: int, rate: float) -> None:
         """See `clsplat.training.densify.Strategy`."""
         if self.config.noise_lr > 0:
-            stage.add_noise(gaussians, self.config.noise_lr * rate / self.extent**2, self.seed, iteration)
+            stages.add_noise(gaussians, self.config.noise_lr * rate / self.extent**2, self.seed, iteration)
 
     def due(self, iteration: int) -> bool:
         """See `clsplat.training.densify.Strategy`."""
         return self.schedule.due(iteration)
 
-    def edit(self, iteration: int, gaussians: Gaussians, survey: Survey) -> Edit:
+    def edit(self, iteration: int, gaussians: Gaussians, cap: int, survey: Survey) -> Edit:
         """See `clsplat.training.densify.Strategy`."""
         n = len(gaussians)
         rows, fresh = np.arange(n), np.zeros(n, bool)
@@ -60,7 +63,7 @@ class Mcmc(Strategy):
         share(moved, np.bincount(rows, minlength=n)[rows], self.config.opacity_min)
 
         draw = stream(self.seed, "sources of new Gaussians", iteration)
-        added = sample(moved.opacities, self.schedule.size_after(iteration, n, self.max_gaussians) - n, draw)
+        added = sample(moved.opacities, self.schedule.count_after(iteration, n, cap) - n, draw)
         fresh[added] = True
         all_rows = np.concatenate([np.arange(n), added])
         grown = moved.take(all_rows)
@@ -69,17 +72,17 @@ class Mcmc(Strategy):
 
 
 def sample(weights: Array, count: int, generator: np.random.Generator) -> Array:
-    """Rows (count,) drawn with replacement, in proportion to their weights."""
+    """Draw rows (count,) with replacement, with probabilities in proportion to their weights."""
     sums = np.cumsum(weights, dtype=np.float64)
     rows = np.searchsorted(sums, generator.random(count) * sums[-1], side="right")
     return np.minimum(rows, len(weights) - 1)
 
 
 def share(gaussians: Gaussians, copies: Array, opacity_min: float) -> None:
-    """Opacities and scales of Gaussians that lie `copies` (N,) times in the same place, in place (equation 9).
+    """Change opacities and scales of Gaussians of which there are `copies` (N,) in one place (equation 9), in place.
 
-    Together the copies are as opaque at the centre as the one was, and along every line through it their opacity has
-    the same integral.
+    Together the copies have the opacity of the original at the centre, and the same integral of opacity along every
+    line through it.
     """
     shared = np.flatnonzero(copies > 1)
     count = np.minimum(copies[shared], COPIES_MAX)
@@ -91,7 +94,7 @@ def share(gaussians: Gaussians, copies: Array, opacity_min: float) -> None:
 
 
 def integral(opacities: Array, copies: Array) -> Array:
-    """Integral of the opacity of so many coincident Gaussians along a line, in units of sqrt(2 pi) scales.
+    """Integral along a line of the opacity of coincident Gaussians, in units of sqrt(2 pi) scales.
 
     1 - (1 - o g)^N with g = exp(-x^2/2) is the sum over k of C(N, k + 1) (-1)^k (o g)^(k + 1), term by term an
     integral of a Gaussian.

@@ -1,4 +1,4 @@
-"""When a strategy that grows to a cap has its rounds, and how many Gaussians there are after each."""
+"""Schedule of strategies that grow to a cap: iterations of the rounds, and the number of Gaussians after each."""
 
 from math import ceil, sqrt
 
@@ -10,24 +10,24 @@ TRIAL_LENGTH = 0.05
 (measured: docs/size.md)."""
 
 GROWTH_SHORTEST = 100
-"""Iterations of a window of growth at least: the strategies' rounds are so far apart."""
+"""Fewest iterations of a window of growth: the interval between two rounds of the strategies."""
 
 TRIAL_GROWTH = sqrt(2)
-"""Factor by which the Gaussians grow in a window of growth, if that has rounds enough for `MOST_GROWTH`."""
+"""Factor by which the number of Gaussians grows in a window, unless `MOST_GROWTH` limits its rounds to less."""
 
 MOST_GROWTH = 1.25
-"""Factor by which they grow in a round at most. Twice as many in one round are a split of each, wherever it is: 1.41
-ended 0.4 dB, 2 ended 0.8 dB below a growth to the same number by parts (fox_pinhole, 135x240, 2000 iterations)."""
+"""Largest factor by which the number of Gaussians grows in a round (measured: docs/size.md). A factor of 2 would
+split every Gaussian, wherever it is."""
 
 
 def growth_window(config: TrainConfig) -> int:
-    """Iterations in which the Gaussians grow by `TRIAL_GROWTH`."""
+    """Iterations in which the number of Gaussians grows by `TRIAL_GROWTH`."""
     return max(round(TRIAL_LENGTH * config.iterations), GROWTH_SHORTEST)
 
 
 class Schedule:
-    """Rounds every so many iterations, and growth by equal factors: to the cap, or, with ``--size auto``, by
-    `TRIAL_GROWTH` in a window.
+    """Rounds at equal intervals, and growth by equal factors: to the cap, or by `TRIAL_GROWTH` in a window with
+    ``--size auto``.
 
     Raises
     ------
@@ -52,9 +52,12 @@ class Schedule:
         """Whether a round is due after an iteration, counted from 1."""
         return self.start <= iteration < self.stop and iteration % self.every == 0
 
-    def size_after(self, iteration: int, n: int, cap: int) -> int:
-        """Gaussians after a round that began with n: a fixed fraction more, and no less than takes them to the cap by
-        equal factors in the rounds until it is to be full; none are taken away."""
+    def count_after(self, iteration: int, n: int, cap: int) -> int:
+        """Number of Gaussians after a round that began with n.
+
+        It grows by a fixed fraction, and by at least the equal factor that reaches the cap in the remaining rounds of
+        the growth phase. It never falls.
+        """
         if n >= cap:
             return n
         if self.factor:

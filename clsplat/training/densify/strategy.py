@@ -1,25 +1,31 @@
-"""What a densification strategy is."""
+"""The interface of a densification strategy."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from copy import copy
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from numpy.typing import NDArray
 
 from clsplat.config import TrainConfig
 from clsplat.gaussians import Gaussians
+from clsplat.renderer import download
+from clsplat.stages import Stages
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
 
 Array = NDArray[Any]
 
-# Indices on the device are of 32 bits.
 MOST_GAUSSIANS = 2**32 - 1
+"""Largest number of Gaussians: indices on the device have 32 bits."""
 
 
 class Contributions(NamedTuple):
-    """What N Gaussians have to do with some photos, added up over them.
+    """Contributions of N Gaussians to some photos, summed over them.
 
-    weights (N,): with which they are composited; errors (N,): the same, times the pixels' squared errors; prices
-    (N,): by how much the squared error would rise without the Gaussian alone, negative where it does harm. Squared
-    errors are summed over RGB. share: of the training photos, how many these are.
+    weights (N,): sums of the compositing weights; errors (N,): sums of weight times the pixel's squared error; prices
+    (N,): change of the squared error if the Gaussian alone is removed, negative if the error falls. Squared errors
+    are summed over RGB. share: fraction of the training photos that these are.
     """
 
     weights: Array
@@ -28,15 +34,15 @@ class Contributions(NamedTuple):
     share: float = 1.0
 
 
-# Contributions to so many training photos.
 Survey = Callable[[int], Contributions]
+"""Return the contributions to a number of training photos, or to all if there are fewer."""
 
 
 class Edit(NamedTuple):
-    """New rows for old ones.
+    """New rows in exchange for old ones.
 
-    gaussians: after the edit; rows (M,): the old row that each new one continues; fresh (M,) bool: whether the
-    optimiser's moments of a new row start at 0; reset_opacities: whether those of all logits of opacities do.
+    gaussians: the M rows after the edit; rows (M,): the old row that each new one continues; fresh (M,) bool: whether
+    the optimiser's moments of a new row start at 0; reset_opacities: whether the moments of all opacities do.
     """
 
     gaussians: Gaussians
@@ -46,67 +52,113 @@ class Edit(NamedTuple):
 
 
 class Strategy:
-    """Decides when Gaussians are added and removed, from statistics of the gradients; this one leaves them alone.
+    """Decide when and where Gaussians are added and removed; this base class never changes them.
 
-    A strategy keeps all it remembers between iterations in `statistics`, arrays of one row per Gaussian: checkpoints
-    save and restore them, so that a resumed run continues to the same bits. No edit leaves more than `max_gaussians`:
-    training sets it before each, to the user's cap or what fits the device.
+    A strategy keeps what it remembers between iterations in `statistics`, arrays with one row per Gaussian. It alone
+    changes them. Checkpoints save and restore them, so that a resumed run ends with the same bits.
+
+    Parameters
+    ----------
+    config : TrainConfig
+    extent : float
+        Scale of the scene, world units.
+    n : int
+        Number of Gaussians.
     """
 
-    statistics: dict[str, Any]
-    max_gaussians: int
     start_opacity = 0.1
-    """Opacity of the Gaussians at the start, where the user gives none (original)."""
+    """Opacity of the first Gaussians, where the user gives none (original code of Kerbl et al. 2023)."""
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
-        """Statistics of `n` Gaussians in a scene of the given extent, in world units."""
-        self.statistics = {}
-        self.max_gaussians = config.max_gaussians or MOST_GAUSSIANS
+        self.statistics: dict[str, Any] = {}
+
+    def on(self, device: "Device | None") -> "Strategy":
+        """The strategy with its statistics on the device, or on the host for None."""
+        result = copy(self)
+        result.statistics = {
+            name: device.upload(name, array, array.dtype) if device else download(array)
+            for name, array in self.statistics.items()
+        }
+        return result
+
+    def take(self, rows: Array) -> "Strategy":
+        """A strategy that shares no statistics with this one and has copies of some rows, on the host."""
+        result = copy(self)
+        result.statistics = {name: array[rows] for name, array in self.statistics.items()}
+        return result
+
+    def restore(self, statistics: dict[str, Array]) -> None:
+        """Continue with the statistics of a checkpoint.
+
+        Raises
+        ------
+        ValueError
+            If names, types or shapes are not those of this strategy's statistics.
+        """
+        found = {name: (array.dtype, array.shape) for name, array in statistics.items()}
+        expected = {name: (array.dtype, array.shape) for name, array in self.statistics.items()}
+        if found != expected:
+            raise ValueError(f"statistics: expected {expected}, found {found}")
+        self.statistics = statistics
 
     def watches(self, iteration: int) -> bool:
-        """Whether `observe` is to be told of an iteration, counted from 1."""
+        """Whether `observe` is called in an iteration, counted from 1."""
         return False
 
-    def observe(self, stage: Any, extents: Any, v_means2d: Any, width: int, height: int) -> None:
-        """Take in one iteration.
+    def observe(self, stages: Stages, extents: Any, v_means2d: Any, width: int, height: int) -> None:
+        """Add one iteration to the statistics.
 
         Parameters
         ----------
-        stage : namespace
-            The stage functions that work where the arrays and the statistics lie: `clsplat.render.stage_functions`.
+        stages : Stages
+            The functions of the stages, working where the arrays and the statistics are.
         extents, v_means2d : (N, 2)
-            Of the splats, and the gradients with respect to their centres, per pixel.
+            Extents of the splats, px, and the gradients with respect to their centres, per pixel.
         width, height : int
-            The image's size in pixels.
+            Size of the image, px.
         """
 
     def penalties(self, n: int) -> tuple[float, float]:
-        """Weights in the loss of the sum of all opacities and of that of all scales, where there are n Gaussians."""
+        """Weights in the loss of the sum of all opacities and of the sum of all scales of n Gaussians."""
         return 0.0, 0.0
 
-    def perturb(self, stage: Any, gaussians: Gaussians, iteration: int, rate: float) -> None:
+    def perturb(self, stages: Stages, gaussians: Gaussians, iteration: int, rate: float) -> None:
         """Change the Gaussians in place after the step of the optimiser.
 
         Parameters
         ----------
-        stage : namespace
+        stages : Stages
             As given to `observe`.
         gaussians : Gaussians
             Arrays where the stages work.
         iteration : int
-            Counted from 1.
+            Number of the iteration, counted from 1.
         rate : float
-            Learning rate of the means in this iteration, in world units.
+            Learning rate of the means in this iteration, world units.
         """
 
     def due(self, iteration: int) -> bool:
         """Whether an edit is due after an iteration, counted from 1."""
         return False
 
-    def edit(self, iteration: int, gaussians: Gaussians, survey: Survey) -> Edit:
-        """The edit that is due.
+    def edit(self, iteration: int, gaussians: Gaussians, cap: int, survey: Survey) -> Edit:
+        """Make the edit that is due after an iteration.
 
-        Leaves `gaussians` as they are, and the statistics in step with the result. `survey` renders as many photos
-        as it is asked for.
+        Parameters
+        ----------
+        iteration : int
+            Number of the iteration, counted from 1.
+        gaussians : Gaussians
+            On the host; they stay as they are.
+        cap : int
+            Largest number of Gaussians after the edit: the user's limit or what fits the device. There may be more
+            before it; then none are added.
+        survey : callable
+            Renders training photos and returns contributions to them.
+
+        Returns
+        -------
+        Edit
+            The statistics have its rows.
         """
         raise NotImplementedError

@@ -1,0 +1,246 @@
+"""The renderer: the stages in their order, forward and backward, on a device or in NumPy."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat import reference
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig
+from clsplat.errors import DeviceError, InputError
+from clsplat.gaussians import Gaussians
+from clsplat.scene import Color
+from clsplat.stages import Bins, Dropout, Image, SplatGrads, Splats, Stages
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+Array = NDArray[Any]
+
+BLACK: Color = (0.0, 0.0, 0.0)
+
+
+class Gradients(NamedTuple):
+    """Gradients of a scalar with respect to what was rendered.
+
+    gaussians: one per field of `Gaussians`, pre-activation; means2d (N, 2): per pixel, the statistic of
+    densification; viewmat (4, 4): each entry as an independent variable; intrinsics (4,): fx, fy, cx, cy. The last
+    two are None if they were not asked for.
+    """
+
+    gaussians: Gaussians
+    means2d: Any
+    viewmat: NDArray[np.float64] | None
+    intrinsics: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True)
+class Pass:
+    """Results of a forward pass that its gradients need. Arrays are where the stages ran.
+
+    disparities: those of the splats, where each pixel sorts them; otherwise None.
+    """
+
+    gaussians: Gaussians
+    camera: Camera
+    sh_degree: int
+    splats: Splats
+    bins: Bins
+    image: Image
+    disparities: Any = None
+    dropout: Dropout | None = None
+
+
+class Renderer:
+    """Where and how Gaussians become images.
+
+    Parameters
+    ----------
+    device : Device, "reference" or None
+        None takes `default_device`. "reference" renders in float64 NumPy: exact, slow, and without OpenCL.
+    config : RenderConfig
+    background : (3,) floats
+        RGB behind the Gaussians.
+
+    Attributes
+    ----------
+    device : Device or None
+        None for the reference.
+    config, background
+        As given.
+    stages : Stages
+        The functions of the stages that it runs.
+
+    Raises
+    ------
+    InputError
+        If `device` is another text.
+    DeviceError
+        If there is no OpenCL device where one is needed.
+    """
+
+    def __init__(
+        self,
+        device: "Device | Literal['reference'] | None" = None,
+        config: RenderConfig = RenderConfig(),
+        background: Color = BLACK,
+    ):
+        self.config, self.background = config, background
+        self.device: Device | None = None
+        self.stages: Stages = reference
+        if isinstance(device, str):
+            if device != "reference":
+                raise InputError(f'device: expected a Device, None or "reference", found {device!r}')
+        else:
+            from clsplat.ops import Launches
+
+            self.device = device or default_device()
+            self.stages = Launches(self.device)
+
+    @property
+    def label(self) -> str:
+        """Name of the device for people."""
+        return "float64 reference, no OpenCL" if self.device is None else self.device.label
+
+    @property
+    def real(self) -> Any:
+        """Type of the reals of an image."""
+        return np.dtype(np.float64) if self.device is None else self.device.real
+
+    def upload(self, name: str, array: Any, dtype: Any = None) -> Any:
+        """An array where the stages run: on the device in its precision, or float64; `dtype` names another type."""
+        if self.device is None:
+            return np.asarray(array, dtype=dtype or np.float64)
+        return self.device.upload(name, array, dtype)
+
+    def no_alpha_gradient(self, camera: Camera) -> Any:
+        """Zero gradients with respect to the alpha of a camera's image, for losses that do not depend on it."""
+        size = camera.height * camera.width
+        # No kernel writes this buffer: it is uploaded once per size.
+        return (
+            np.zeros((camera.height, camera.width)) if self.device is None else self.device.scratch("v_alpha", size)
+        )
+
+    def place(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians where the stages run: uploaded from the host; those of the device as they are."""
+        if self.device is None:
+            return fetch(gaussians).astype(np.float64)
+        if not isinstance(gaussians.means, np.ndarray):
+            return gaussians
+        return Gaussians(**{name: self.upload(name, array) for name, array in gaussians.arrays().items()})
+
+    def forward(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        sh_degree: int | None = None,
+        *,
+        background: Any = None,
+        depth: bool = False,
+        gradients: bool = True,
+        dropout: Dropout | None = None,
+    ) -> Pass:
+        """Run the stages from Gaussians to an image.
+
+        Parameters
+        ----------
+        gaussians : Gaussians of N >= 1 rows
+            On the host or where the stages run.
+        camera : Camera
+            Of a model that kernels project to: not equirectangular.
+        sh_degree : int, optional
+            Highest degree of the spherical harmonics evaluated; default: all that are stored.
+        background : (3,) floats, optional
+            Another than the renderer's.
+        depth : bool
+            Composite the depth as a fourth channel.
+        gradients : bool
+            Whether `backward` follows; otherwise its lists of intersections are left out.
+        dropout : Dropout, optional
+            The splats left out while training.
+
+        Returns
+        -------
+        Pass
+        """
+        gaussians, config = self.place(gaussians), self.config
+        degree = gaussians.sh_degree if sh_degree is None else sh_degree
+        if config.near is not None:
+            camera = replace(camera, near=config.near)
+        behind = np.array([*(self.background if background is None else background), *[0.0] * depth])
+        antialiased = config.mode == "antialiased"
+        splats = self.stages.project_fwd(gaussians, camera, degree, antialiased=antialiased, channels=len(behind))
+        if dropout:
+            self.stages.dropout_fwd(splats, dropout)
+        # The reference works splat by splat and gains nothing from tiles.
+        tile_size = max(camera.width, camera.height) if self.device is None else config.tile_size
+        by_pixel = config.sort == "pixel"
+        scheme = "auto" if by_pixel else config.sort
+        bins = self.stages.bin_splats(
+            splats, camera.width, camera.height, tile_size, gradients=gradients, scheme=scheme
+        )
+        disparities = self.stages.project_disparities(gaussians, camera, splats) if by_pixel else None
+        image = self.stages.composite_fwd(splats, bins, behind, compositor=config.compositor, disparities=disparities)
+        return Pass(gaussians, camera, degree, splats, bins, image, disparities, dropout)
+
+    def backward_to_splats(self, run: Pass, v_image: Image) -> SplatGrads:
+        """Gradients with respect to the splats: the first half of `backward`."""
+        v_splats = self.stages.composite_bwd(
+            run.splats, run.bins, run.image, v_image, compositor=self.config.compositor, disparities=run.disparities
+        )
+        if run.dropout:
+            self.stages.dropout_bwd(v_splats, run.dropout)
+        return v_splats
+
+    def backward(self, run: Pass, v_image: Image, *, camera_grad: bool = False) -> Gradients:
+        """Gradients of a forward pass.
+
+        Parameters
+        ----------
+        run : Pass
+        v_image : Image
+            Gradients with respect to its image and alpha, where the stages run.
+        camera_grad : bool
+            Whether the camera's gradients are computed.
+        """
+        v_splats = self.backward_to_splats(run, v_image)
+        v_gaussians, v_camera = self.stages.project_bwd(
+            run.gaussians,
+            run.camera,
+            run.sh_degree,
+            run.splats,
+            v_splats,
+            antialiased=self.config.mode == "antialiased",
+            camera_grad=camera_grad,
+        )
+        return Gradients(v_gaussians, v_splats.means2d, *(v_camera or (None, None)))
+
+
+@cache
+def default_device() -> "Device":
+    """The OpenCL device that `clsplat.device.select_device` chooses, opened once and kept.
+
+    Raises
+    ------
+    DeviceError
+        If there is none.
+    """
+    from clsplat.device import Device
+
+    try:
+        return Device()
+    except DeviceError as error:
+        raise DeviceError(f'{error}; device="reference" renders in NumPy, slowly') from error
+
+
+def download(array: Any) -> Array:
+    """A device array on the host; a NumPy array as it is."""
+    return array if isinstance(array, np.ndarray) else array.get()
+
+
+def fetch(gaussians: Gaussians) -> Gaussians:
+    """Gaussians of the device on the host; those of the host as they are."""
+    return Gaussians(**{name: download(array) for name, array in gaussians.arrays().items()})

@@ -1,0 +1,100 @@
+"""Preparation of a training: the scene and the configuration as ``clsplat train`` uses them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from clsplat.config import TrainConfig
+from clsplat.dataset import load_scene, with_points
+from clsplat.dataset.finding import mask_folder
+from clsplat.renderer import default_device
+from clsplat.scene import Scene
+from clsplat.training.few_views import adapted
+from clsplat.training.memory import parse_bytes
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+
+def prepare(
+    path: str | Path,
+    config: TrainConfig,
+    *,
+    scene: Scene | None = None,
+    resume: bool = False,
+    verbose: bool = False,
+    tell: Callable[[str], None] = lambda text: None,
+) -> tuple[Scene, TrainConfig]:
+    """Load a dataset and adapt the configuration to it.
+
+    Where the dataset has poses but no points, points are triangulated from its photos (`config.init.triangulate`).
+    With few photos the configuration is adapted to them (`config.few`). `clsplat.training.loop.train` on the result
+    does what ``clsplat train`` does.
+
+    Parameters
+    ----------
+    path : str or Path
+        The dataset's folder, as `clsplat.dataset.load_scene` reads it.
+    config : TrainConfig
+    scene : Scene, optional
+        The dataset, if `load_scene` has read it already with `config.data`.
+    resume : bool
+        The result continues a run: points, which only its start needed, are not triangulated again.
+    verbose : bool
+        Show COLMAP's own messages.
+    tell : callable
+        Called with a sentence about each step.
+
+    Returns
+    -------
+    scene : Scene
+    config : TrainConfig
+
+    Raises
+    ------
+    InputError
+        If the dataset cannot be read; the message names the file.
+    """
+    if config.data.masks is not None:
+        masks = str(mask_folder(Path(path), config.data.masks).resolve())
+        config = replace(config, data=replace(config.data, masks=masks))
+    if scene is None:
+        scene = load_scene(path, config.data, verbose)
+    tell(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
+    few_photos = len(scene.train) < config.few.below  # their points limit the number of Gaussians
+    if config.init.triangulate and not len(scene.points) and (few_photos or not resume):
+        scene = with_points(scene, path, config.data, verbose)
+        found = f"{len(scene.points)} points, from photos and poses" if len(scene.points) else "random"
+        tell(f"start: {found} (--init.no-triangulate: random)")
+    few = adapted(config, scene)
+    if few != config:
+        tell(
+            f"few photos: with fewer than {config.few.below} the Gaussians are fewer and simpler, and some are left "
+            "out of each image (--few.below 0 trains as with many)"
+        )
+    return scene, few
+
+
+def open_device(config: TrainConfig) -> "Device":
+    """The device that `config.device` and `config.memory_limit` describe, opened once and kept.
+
+    Raises
+    ------
+    InputError
+        If the limit is no number of bytes.
+    DeviceError
+        If there is no such device.
+    """
+    if config.device is None and config.memory_limit is None:
+        return default_device()
+    return _open(config.device, config.memory_limit)
+
+
+@cache
+def _open(name: str | None, memory_limit: str | None) -> "Device":
+    from clsplat.device import Device, select_device
+
+    limit = None if memory_limit is None else parse_bytes(memory_limit, "--memory-limit")
+    return Device(select_device(name), memory_limit=limit)

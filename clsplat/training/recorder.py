@@ -1,0 +1,150 @@
+"""Records of a training: its log, its checkpoints, its evaluations, and its training time."""
+
+import json
+import time
+from collections.abc import Callable, Container, Iterator
+from contextlib import closing, contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from clsplat.atomic import replacing
+from clsplat.errors import ClsplatError, InputError
+from clsplat.gaussians import Gaussians
+from clsplat.training.checkpoint import CHECKPOINT, save_state
+
+if TYPE_CHECKING:
+    from clsplat.training.loop import Training
+
+LOG = "log.jsonl"
+"""File name of the log in the folder of a run."""
+
+LOG_EVERY = 10
+"""Iterations per line of the log; the loss of a line is their mean, since losses of single photos differ much."""
+
+Append = Callable[[dict[str, Any]], None]
+
+
+class Recorder:
+    """What happens after each iteration of a training.
+
+    Parameters
+    ----------
+    training : Training
+    out : Path
+        Folder of the checkpoint.
+    log : callable
+        Append a record to the log.
+    progress, evaluate, evaluate_after
+        As given to `clsplat.training.loop.train`.
+    """
+
+    def __init__(
+        self,
+        training: "Training",
+        out: Path,
+        log: Append,
+        progress: Append,
+        evaluate: Callable[[Gaussians], dict[str, float]] | None,
+        evaluate_after: Container[int] | None,
+    ):
+        self._training, self._out, self._log, self._progress = training, out, log, progress
+        config = training.config
+        if evaluate_after is None:
+            every = config.eval_every
+            evaluate_after = range(every, config.iterations + 1, every) if every else ()
+        self._evaluate, self._evaluate_after = evaluate, evaluate_after
+        self._losses: list[float] = []
+        self._started = time.perf_counter() - training.state.seconds
+
+    def after(self, training: "Training", loss: float) -> None:
+        """Record an iteration of the training itself."""
+        state, config = training.state, training.config
+        if not np.isfinite(loss):
+            raise ClsplatError(
+                f"training diverged: the loss of iteration {state.iteration} is {loss}; lower the learning rates "
+                f"(--optim.*); the last checkpoint in {self._out} is intact"
+            )
+        self._losses.append(loss)
+        state.seconds = time.perf_counter() - self._started
+        record: dict[str, Any] = {}
+        if state.iteration % LOG_EVERY == 0 or state.iteration == config.iterations:
+            record = {"loss": float(np.mean(self._losses))}
+            self._losses.clear()
+        if self._evaluate and state.iteration in self._evaluate_after:
+            record |= self._evaluate(state.shown(training.renderer))
+            self._started = time.perf_counter() - state.seconds
+        if record:
+            at = {"iteration": state.iteration, "num_gaussians": len(state.gaussians), "seconds": state.seconds}
+            self._log(at | record)
+        if state.iteration % config.checkpoint_every == 0 or state.iteration == config.iterations:
+            save_state(self._out / CHECKPOINT, state, config)
+        left = time.perf_counter()
+        self._tell(training, loss)
+        self._started += time.perf_counter() - left
+
+    def after_fork(self, fork: "Training", loss: float) -> None:
+        """Report an iteration of a fork, which is neither logged nor saved."""
+        self._tell(fork, loss)
+
+    def _tell(self, shown: "Training", loss: float) -> None:
+        state = self._training.state
+        about = {"iteration": state.iteration, "loss": loss, "num_gaussians": len(shown.state.gaussians)}
+        gaussians = shown.state.shown(shown.renderer) if shown.state.filter else shown.state.gaussians
+        try:
+            self._progress(about | {"gaussians": gaussians})
+        except KeyboardInterrupt:
+            save_state(self._out / CHECKPOINT, state, self._training.config)
+            raise
+
+
+@contextmanager
+def log_file(path: Path, iteration: int) -> Iterator[Append]:
+    """Open a log of JSON lines after an iteration; yields the function that appends a record.
+
+    Lines of later iterations, written after the last checkpoint of an interrupted run, are dropped: the resumed run
+    writes them again.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be created or the file cannot be written.
+    """
+    kept = []
+    if iteration and path.exists():
+        for line in path.read_text().splitlines():
+            try:
+                if json.loads(line)["iteration"] <= iteration:
+                    kept.append(line)
+            except (json.JSONDecodeError, KeyError):  # a line cut off when the run was killed
+                continue
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot create {path.parent}: {error.strerror}") from error
+    with replacing(path) as file:
+        file.writelines(f"{line}\n".encode() for line in kept)
+    events = event_writer(path.parent / "tensorboard", iteration)
+    with path.open("a") as log, closing(events) if events else nullcontext():
+
+        def append(record: dict[str, Any]) -> None:
+            log.write(json.dumps(record) + "\n")
+            log.flush()
+            if events:
+                for name in record.keys() - {"iteration"}:
+                    events.add_scalar(name, record[name], record["iteration"])
+
+        yield append
+
+
+def event_writer(folder: Path, iteration: int) -> Any:
+    """Writer of the log for TensorBoard, after an iteration; None where tensorboardX is not installed."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        return None
+    # The names of its files differ by whole seconds alone.
+    return SummaryWriter(
+        str(folder), purge_step=iteration + 1 if iteration else None, filename_suffix=f".{iteration}"
+    )
