@@ -28,7 +28,7 @@ Metric = Callable[..., float | None]
 def mean_metrics(
     gaussians: Gaussians,
     views: Iterable[View],
-    renderer: Renderer,
+    renderer: Renderer | None = None,
     metrics: Iterable[Metric] = (psnr, ssim),
 ) -> dict[str, Any]:
     """Mean metrics over views, for the log of a training run.
@@ -49,7 +49,7 @@ def mean_metrics(
     def compare(_: int, view: View, image: NDArray[np.uint8]) -> list[float | None]:
         return [metric(image, view.image, view.mask) for metric in metrics]
 
-    figures = zip(*_compared(compare, gaussians, list(views), renderer), strict=True)
+    figures = zip(*_compared(compare, gaussians, list(views), renderer or Renderer()), strict=True)
     return {m.__name__: _mean(values) for m, values in zip(metrics, figures, strict=True)}
 
 
@@ -57,7 +57,7 @@ def evaluate(
     gaussians: Gaussians,
     views: Iterable[View],
     out: Path,
-    renderer: Renderer,
+    renderer: Renderer | None = None,
 ) -> dict[str, Any]:
     """Render views and compare them with their photos.
 
@@ -69,8 +69,8 @@ def evaluate(
         At least one; usually a scene's held-out views.
     out : Path
         Folder for metrics.json, index.html, and the pictures in truth/, render/ and difference/; created if missing.
-    renderer : Renderer
-        Its background is that of the photos where they were transparent.
+    renderer : Renderer, optional
+        Its background is that of the photos where they were transparent. Default: ``Renderer()``.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def evaluate(
             (out / kind).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot create {out}: {error.strerror}") from error
-    views = list(views)
+    views, renderer = list(views), renderer or Renderer()
     names = _file_names(views)
 
     def compare(index: int, view: View, image: NDArray[np.uint8]) -> dict[str, Any]:

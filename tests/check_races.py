@@ -20,7 +20,8 @@ from clsplat.camera import Camera
 from clsplat.config import OptimConfig, RenderConfig
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.render import render, upload
+from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.stages import SplatGrads
 from clsplat.training.optimizer import adam_settings
 
@@ -143,7 +144,7 @@ def adam(device):
         device.is_cpu = is_cpu
         found = [scene(22, seed, 1).astype(np.float64) for seed in range(3)]
         found.append(Gaussians(**{name: array**2 for name, array in found[2].arrays().items()}))
-        on_device = [upload(device, part) for part in found]
+        on_device = [Renderer(device).place(part) for part in found]
         step = adam_settings(3, 0.3, 1.0, OptimConfig(), 0)
         ops.adam_step(device, *on_device, step)
         reference.adam_step(*found, step)
@@ -162,7 +163,7 @@ def fused(device):
         rng = np.random.default_rng(0)
         v = SplatGrads(*(rng.normal(size=getattr(splats, name).shape) for name in SplatGrads._fields))
         statistics = [np.zeros(70), np.zeros(70, np.int32)]
-        on_device = [upload(device, part) for part in found]
+        on_device = [Renderer(device).place(part) for part in found]
         arrays, v_arrays = (type(part)(*(device.upload("splats", a) for a in part)) for part in (splats, v))
         sums = [device.upload("sums", a, a.dtype) for a in statistics]
         ops.observe(device, arrays.extents, v_arrays.means2d, 37, 21, *sums)
@@ -198,7 +199,7 @@ def removal(device):
 
 def noise(device):
     found = scene(70, -3, 1).astype(np.float64)
-    on_device = upload(device, found)
+    on_device = Renderer(device).place(found)
     ops.add_noise(device, on_device, 2.0, 5, 9)
     reference.add_noise(found, 2.0, 5, 9)
     np.testing.assert_allclose(on_device.means.get(), found.means, rtol=1e-12, atol=1e-14)

@@ -9,7 +9,7 @@ from clsplat import ops, reference
 from clsplat.config import OptimConfig
 from clsplat.gaussians import SHAPES, Gaussians, sigmoid
 from clsplat.reference.adam import BLOCK
-from clsplat.render import fetch, upload
+from clsplat.renderer import Renderer, fetch
 from clsplat.stages import ERANK_SLACK
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene
 from clsplat.training.optimizer import Moments, adam_settings
@@ -48,9 +48,9 @@ def by_twin(state, gradients, sh_degree):
 
 def by_kernel(device, state, gradients, sh_degree):
     """As `by_twin`."""
-    state = [upload(device, part) for part in state]
+    state = [Renderer(device).place(part) for part in state]
     for t, gradient in enumerate(gradients, start=1):
-        ops.adam_step(device, state[0], upload(device, gradient), *state[1:], settings(t, sh_degree))
+        ops.adam_step(device, state[0], Renderer(device).place(gradient), *state[1:], settings(t, sh_degree))
     return [fetch(part) for part in state]
 
 
@@ -170,7 +170,7 @@ def test_penalties_are_gradients_of_sums(any_device):
         return state[2]
 
     def kernel(step):
-        state = [upload(any_device, part) for part in (gaussians, zeros, zeros, second)]
+        state = [Renderer(any_device).place(part) for part in (gaussians, zeros, zeros, second)]
         ops.adam_step(any_device, *state, step)
         return fetch(state[2])
 

@@ -67,7 +67,7 @@ def backward(device, compositor, splats, bins, image, v_image):
 
 def random_grads(image, seed=0):
     rng = np.random.default_rng(seed)
-    return Image(rng.normal(size=image.image.shape), rng.normal(size=image.alpha.shape))
+    return Image(rng.normal(size=image.rgb.shape), rng.normal(size=image.alpha.shape))
 
 
 def brute_force(splats, width, height, background, disparities=None):
@@ -106,7 +106,7 @@ def test_twin_matches_brute_force():
     assert expected.alpha.max() > 0.9
     for tile_size in (8, 16, 19):
         image = reference.composite_fwd(splats, reference.bin_splats(splats, width, height, tile_size), BACKGROUND)
-        assert_matches("image", image.image, expected.image, DOUBLE)
+        assert_matches("image", image.rgb, expected.rgb, DOUBLE)
         assert_matches("alpha", image.alpha, expected.alpha, DOUBLE)
 
 
@@ -120,7 +120,7 @@ def test_double_matches_twin(device64, compositor, tile_size, channels):
     assert np.diff(bins.tile_ranges).max() > 64
     expected = reference.composite_fwd(splats, bins, BACKGROUND[:channels])
     image = forward(device64, compositor, splats, bins, BACKGROUND[:channels])
-    assert_matches("image", image.image, expected.image, DOUBLE)
+    assert_matches("image", image.rgb, expected.rgb, DOUBLE)
     assert_matches("alpha", image.alpha, expected.alpha, DOUBLE)
 
     v_image = random_grads(expected)
@@ -140,7 +140,7 @@ def test_blocks_of_both_widths_match_twin(lanes, tile_size):
     bins = reference.bin_splats(splats, width, height, tile_size)
     expected = reference.composite_fwd(splats, bins, BACKGROUND[:3])
     image = forward(device, "cpu", splats, bins, BACKGROUND[:3])
-    assert_matches("image", image.image, expected.image, DOUBLE)
+    assert_matches("image", image.rgb, expected.rgb, DOUBLE)
     v_image = random_grads(expected)
     v_expected = reference.composite_bwd(splats, bins, expected, v_image)
     v = backward(device, "cpu", splats, bins, expected, v_image)
@@ -157,7 +157,7 @@ def test_float_matches_twin(device, compositor, tile_size, channels):
     image = forward(device, compositor, splats, bins, background)
     band = ambiguous_pixels(splats, width, height, margin=1e-3)
     assert 0 < band.mean() < 0.25, "a band this wide proves nothing"
-    assert_matches("image", image.image, expected.image, FLOAT, where=~band)
+    assert_matches("image", image.rgb, expected.rgb, FLOAT, where=~band)
     assert_matches("alpha", image.alpha, expected.alpha, FLOAT, where=~band)
 
     # In the band one pair may flip: it moves a pixel by ALPHA_MIN or so of the splat's colour, either way.
@@ -168,7 +168,7 @@ def test_float_matches_twin(device, compositor, tile_size, channels):
 
     # Pixels of the band pass no gradient, so that every other pair decides as the twin does.
     v_image = random_grads(expected)
-    v_image.image[band], v_image.alpha[band] = 0, 0
+    v_image.rgb[band], v_image.alpha[band] = 0, 0
     v_expected = reference.composite_bwd(splats, bins, expected, v_image)
     v = backward(device, compositor, splats, bins, image, v_image)
     for name, array in v_expected._asdict().items():
@@ -258,7 +258,7 @@ def test_stop_and_skip_in_numbers(any_device, compositor):
     bins = Bins(order, np.array([[0, 6]]), order, np.arange(7), order, 16, 1, 1)
     image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
     weights = 0.95 * np.array([1, 0.05, 0.0025])
-    np.testing.assert_allclose(image.image[0, 0], weights, rtol=1e-5)
+    np.testing.assert_allclose(image.rgb[0, 0], weights, rtol=1e-5)
     np.testing.assert_allclose(image.alpha, 1 - 1.25e-4, rtol=1e-6)
     ones = Image(np.ones((1, 1, 3)), np.zeros((1, 1)))
     v = backward(any_device, compositor, splats, bins, image, ones)
@@ -287,7 +287,7 @@ def test_image_sizes(device64, compositor, width, height):
     bins = reference.bin_splats(splats, width, height, 16)
     expected = reference.composite_fwd(splats, bins, BACKGROUND)
     image = forward(device64, compositor, splats, bins, BACKGROUND)
-    assert_matches("image", image.image, expected.image, DOUBLE)
+    assert_matches("image", image.rgb, expected.rgb, DOUBLE)
     v_image = random_grads(expected)
     v_expected = reference.composite_bwd(splats, bins, expected, v_image)
     v = backward(device64, compositor, splats, bins, expected, v_image)
@@ -300,7 +300,7 @@ def test_nothing_visible(any_device, compositor):
     uploaded = Splats(*(any_device.upload("splats", a) for a in splats))
     bins = ops.bin_splats(any_device, uploaded, 20, 10, 16)
     image = ops.composite_fwd(any_device, uploaded, bins, BACKGROUND, compositor=compositor)
-    np.testing.assert_array_equal(image.image.get(), np.tile(np.array(BACKGROUND, any_device.real), (10, 20, 1)))
+    np.testing.assert_array_equal(image.rgb.get(), np.tile(np.array(BACKGROUND, any_device.real), (10, 20, 1)))
     np.testing.assert_array_equal(image.alpha.get(), np.zeros((10, 20)))
     v = ops.composite_bwd(any_device, uploaded, bins, image, image, compositor=compositor)
     for name, array in v._asdict().items():
@@ -327,7 +327,7 @@ def test_same_bits_twice_and_for_every_tiling(device, compositor):
     bins = {t: reference.bin_splats(splats, width, height, t) for t in (8, 16)}
     images = [forward(device, compositor, splats, bins[t], BACKGROUND) for t in (16, 16, 8)]
     for image in images[1:]:
-        np.testing.assert_array_equal(image.image, images[0].image)
+        np.testing.assert_array_equal(image.rgb, images[0].rgb)
         np.testing.assert_array_equal(image.alpha, images[0].alpha)
     v_image = random_grads(images[0])
     v = [backward(device, compositor, splats, bins[16], images[0], v_image) for _ in range(2)]
@@ -347,7 +347,7 @@ def test_what_overflows_has_no_gradient(any_device, compositor):
     bins = reference.bin_splats(splats, width, height, 16)
     v_image = Image(np.full((height, width, 3), 100.0), np.zeros((height, width)))
     image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
-    assert np.isfinite(image.image).all()
+    assert np.isfinite(image.rgb).all()
     with np.errstate(all="ignore"):
         twin = reference.composite_bwd(splats, bins, image, v_image)
     for first, second in backward(any_device, compositor, splats, bins, image, v_image):

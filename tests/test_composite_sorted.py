@@ -51,10 +51,10 @@ def test_twin_matches_brute_force():
     for tile_size in (8, 19):
         bins = reference.bin_splats(splats, width, height, tile_size)
         image = reference.composite_fwd(splats, bins, BACKGROUND, disparities=disparities)
-        assert_matches("image", image.image, expected.image, DOUBLE)
+        assert_matches("image", image.rgb, expected.rgb, DOUBLE)
         assert_matches("alpha", image.alpha, expected.alpha, DOUBLE)
     by_centre = reference.composite_fwd(splats, bins, BACKGROUND)
-    assert np.abs(by_centre.image - image.image).max() > 0.1, "the order must matter"
+    assert np.abs(by_centre.rgb - image.rgb).max() > 0.1, "the order must matter"
 
 
 @pytest.mark.parametrize(("tile_size", "channels", "window"), [(16, 3, 1), (8, 4, 5), (16, 4, 32), (8, 3, 32)])
@@ -65,7 +65,7 @@ def test_double_matches_twin(device64, monkeypatch, tile_size, channels, window)
     bins, disparities = reference.bin_splats(splats, width, height, tile_size), planes(splats)
     expected = reference.composite_fwd(splats, bins, BACKGROUND[:channels], disparities=disparities)
     image = forward(device64, splats, bins, BACKGROUND[:channels], disparities)
-    assert_matches("image", image.image, expected.image, DOUBLE)
+    assert_matches("image", image.rgb, expected.rgb, DOUBLE)
     assert_matches("alpha", image.alpha, expected.alpha, DOUBLE)
 
     v_image = random_grads(expected)
@@ -81,12 +81,12 @@ def test_float_matches_twin(device):
     bins, disparities = reference.bin_splats(splats, width, height, 16), planes(splats)
     expected = reference.composite_fwd(splats, bins, BACKGROUND[:3], disparities=disparities)
     image = forward(device, splats, bins, BACKGROUND[:3], disparities)
-    error = np.abs(image.image - expected.image).max(axis=2)
+    error = np.abs(image.rgb - expected.rgb).max(axis=2)
     assert (error < 1e-5).mean() > 0.995, "float32: up to a hundred pairs per pixel"
     assert error.max() < 0.05, "one pair, or two neighbours whose order flips"
     band = error >= 1e-5
     v_image = random_grads(expected)
-    v_image.image[band], v_image.alpha[band] = 0, 0
+    v_image.rgb[band], v_image.alpha[band] = 0, 0
     v_expected = reference.composite_bwd(splats, bins, expected, v_image, disparities=disparities)
     v = backward(device, splats, bins, image, v_image, disparities)
     for name, array in v_expected._asdict().items():
@@ -129,7 +129,7 @@ def test_two_discs_that_cross(any_device):
     splats = handmade([(8, 8), (8, 8)], np.eye(2) * 400, [0.9, 0.9], [[1, 0, 0], [0, 1, 0]])
     disparities = np.array([[1.0, 0.01, 0], [0.999, -0.01, 0]])
     bins = reference.bin_splats(splats, 16, 16, 16)
-    image = forward(any_device, splats, bins, (0.0, 0.0, 0.0), disparities).image
+    image = forward(any_device, splats, bins, (0.0, 0.0, 0.0), disparities).rgb
     red = image[:, :, 0] > image[:, :, 1]
     np.testing.assert_array_equal(red, np.tile(np.arange(16) >= 8, (16, 1)))
 
@@ -140,7 +140,7 @@ def test_ties_go_by_the_list(any_device, monkeypatch):
     colors = np.eye(3)
     splats = handmade([(8, 8)] * 3, np.eye(2) * 400, [0.5] * 3, colors)._replace(depths=np.ones(3))
     bins = reference.bin_splats(splats, 16, 16, 16)
-    image = forward(any_device, splats, bins, (0.0, 0.0, 0.0), np.tile([1.0, 0, 0], (3, 1))).image
+    image = forward(any_device, splats, bins, (0.0, 0.0, 0.0), np.tile([1.0, 0, 0], (3, 1))).rgb
     assert (image[..., 0] > image[..., 1]).all() and (image[..., 1] > image[..., 2]).all()
 
 
@@ -152,7 +152,7 @@ def test_image_sizes(device64, width, height):
     bins, disparities = reference.bin_splats(splats, width, height, 16), planes(splats)
     expected = reference.composite_fwd(splats, bins, BACKGROUND, disparities=disparities)
     image = forward(device64, splats, bins, BACKGROUND, disparities)
-    assert_matches("image", image.image, expected.image, DOUBLE)
+    assert_matches("image", image.rgb, expected.rgb, DOUBLE)
     v_image = random_grads(expected)
     v_expected = reference.composite_bwd(splats, bins, expected, v_image, disparities=disparities)
     v = backward(device64, splats, bins, expected, v_image, disparities)
@@ -166,7 +166,7 @@ def test_nothing_visible(any_device):
     bins = ops.bin_splats(any_device, uploaded, 20, 10, 16)
     none = any_device.upload("disparities", np.zeros((5, 3)))
     image = ops.composite_fwd(any_device, uploaded, bins, BACKGROUND, disparities=none)
-    np.testing.assert_array_equal(image.image.get(), np.tile(np.array(BACKGROUND, any_device.real), (10, 20, 1)))
+    np.testing.assert_array_equal(image.rgb.get(), np.tile(np.array(BACKGROUND, any_device.real), (10, 20, 1)))
     v = ops.composite_bwd(any_device, uploaded, bins, image, image, disparities=none)
     assert all((array.get() == 0).all() for array in v)
 
@@ -179,7 +179,7 @@ def test_same_bits_twice_and_for_every_tiling(device):
     bins = {t: reference.bin_splats(splats, width, height, t) for t in (8, 16)}
     images = [forward(device, splats, bins[t], BACKGROUND, disparities) for t in (16, 16, 8)]
     for image in images[1:]:
-        np.testing.assert_array_equal(image.image, images[0].image)
+        np.testing.assert_array_equal(image.rgb, images[0].rgb)
         np.testing.assert_array_equal(image.alpha, images[0].alpha)
     v_image = random_grads(images[0])
     v = [backward(device, splats, bins[16], images[0], v_image, disparities) for _ in range(2)]
@@ -192,8 +192,8 @@ def test_render_sorts_pixels(device64, mode):
     """From the Gaussians to their gradients, the twin's and the device's."""
     gaussians, camera = synthetic_scene(150, 7)
     config = RenderConfig(mode=mode, sort="pixel", tile_size=8)
-    expected, found = (render(gaussians, camera, config, d, depth=True) for d in (None, device64))
-    by_centre = render(gaussians, camera, RenderConfig(mode=mode), None)
+    expected, found = (render(gaussians, camera, config, d, depth=True) for d in ("reference", device64))
+    by_centre = render(gaussians, camera, RenderConfig(mode=mode), "reference")
     assert np.abs(expected.rgb - by_centre.rgb).max() > 0.05
     assert_matches("rgb", found.rgb, expected.rgb, DOUBLE)
     v_rgb, v_depth = np.random.default_rng(0).normal(size=(2, *expected.rgb.shape))

@@ -6,7 +6,7 @@ import pytest
 from clsplat import ops, reference
 from clsplat.config import RenderConfig
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from clsplat.render import forward, upload
+from clsplat.renderer import Renderer
 from clsplat.stages import Splats
 from clsplat.testing import synthetic_scene
 
@@ -44,7 +44,7 @@ def test_pairs_are_those_of_brute_force(device64, tile_size):
     gaussians.logit_opacities[:] += 1
     gaussians.logit_opacities[::4] = 9  # clamped at ALPHA_MAX near their centres
     config = RenderConfig(tile_size=tile_size)
-    run = forward(device64, upload(device64, gaussians), camera, config, np.zeros(3), 0)
+    run = Renderer(device64, config).forward(gaussians, camera, 0)
     splats = Splats(*(array.get() for array in run.splats))
     bins = reference.bin_splats(splats, camera.width, camera.height, tile_size)
     evaluated, accepted, live = brute_force_pairs(splats, bins)
@@ -59,7 +59,7 @@ def test_pairs_are_those_of_brute_force(device64, tile_size):
 def test_nothing_visible_counts_nothing(any_device):
     gaussians, camera = synthetic_scene(5, seed=1)
     gaussians.logit_opacities[:] = -20  # below ALPHA_MIN
-    run = forward(any_device, upload(any_device, gaussians), camera, RenderConfig(), np.zeros(3), 0)
+    run = Renderer(any_device).forward(gaussians, camera, 0)
     for count in ops.count_pairs(any_device, run.splats, run.bins):
         assert count.shape == (camera.height, camera.width)
         assert not count.get().any()

@@ -127,7 +127,7 @@ def test_scene_without_photos_or_points_shows_itself():
 @pytest.mark.filterwarnings("error")
 def test_rendering_is_its_image():
     gaussians, camera = synthetic_scene(20)
-    rendering = render(gaussians, camera)
+    rendering = render(gaussians, camera, device="reference")
     rendering.rgb = rendering.rgb * 2  # beyond 1
     rendering.rgb[0, 0] = np.nan
     shown = np.asarray(Image.open(io.BytesIO(rendering._repr_png_())))

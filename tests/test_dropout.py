@@ -5,8 +5,7 @@ import pytest
 from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
-from clsplat.config import RenderConfig
-from clsplat.render import backward, fetch, forward, upload
+from clsplat.renderer import Renderer, fetch
 from clsplat.stages import Dropout, Image, SplatGrads, Splats
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene
 
@@ -79,22 +78,21 @@ def test_each_iteration_and_seed_draws_anew(device):
 def test_gradients_through_the_image(device64):
     gaussians, camera = synthetic_scene(12, seed=2, margin=3e-2)
     gaussians.logit_opacities -= 1  # the others' opacities stay below ALPHA_MAX
-    dropout, background = Dropout(0.3, 0, 5), (0.1, 0.5, 0.9)
+    dropout, renderer = Dropout(0.3, 0, 5), Renderer(device64, background=(0.1, 0.5, 0.9))
     weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))
 
     def run(logit_opacities, means):
         arrays = {**gaussians.arrays(), "logit_opacities": logit_opacities, "means": means}
-        changed = upload(device64, type(gaussians)(**arrays))
-        return forward(device64, changed, camera, RenderConfig(), background, 3, dropout=dropout)
+        return renderer.forward(type(gaussians)(**arrays), camera, dropout=dropout)
 
     first = run(gaussians.logit_opacities, gaussians.means)
     dropped = first.splats.opacities.get() == 0
     assert 0 < dropped.sum() < 12
     v = Image(device64.upload("v", weights), device64.upload("v", np.zeros(weights.shape[:2])))
-    gradients = fetch(backward(device64, first, v).gaussians)
+    gradients = fetch(renderer.backward(first, v).gaussians)
     assert (gradients.logit_opacities[dropped] == 0).all() and (gradients.logit_opacities[~dropped] != 0).any()
     gradcheck(
-        lambda **inputs: float((run(**inputs).image.image.get() * weights).sum()),
+        lambda **inputs: float((run(**inputs).image.rgb.get() * weights).sum()),
         {"logit_opacities": gaussians.logit_opacities, "means": gaussians.means},
         {"logit_opacities": gradients.logit_opacities, "means": gradients.means},
     )

@@ -16,8 +16,10 @@ from clsplat.errors import InputError
 from clsplat.evaluate import evaluate, mean_metrics
 from clsplat.gaussians import Gaussians
 from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.scene import View
 
+REFERENCE = Renderer("reference")
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -52,7 +54,7 @@ def read(path):
 
 def test_figures_are_those_of_the_files(gaussians, tmp_path):
     views = make_views(gaussians, [5, 20, 10])
-    result = evaluate(gaussians, views, tmp_path / "new" / "out")
+    result = evaluate(gaussians, views, tmp_path / "new" / "out", REFERENCE)
     out = tmp_path / "new" / "out"
     assert json.loads((out / "metrics.json").read_text()) == result
     assert list(result) == ["mean", "num_gaussians", "sh_degree", "mode", "resolution", "device", "views"]
@@ -69,26 +71,26 @@ def test_figures_are_those_of_the_files(gaussians, tmp_path):
     psnrs = [record["psnr"] for record in result["views"]]
     assert psnrs[0] > psnrs[2] > psnrs[1]
     assert result["mean"]["psnr"] == pytest.approx(np.mean(psnrs), rel=1e-12)
-    assert mean_metrics(gaussians, views) == {key: result["mean"][key] for key in ("psnr", "ssim")}
-    chosen = mean_metrics(gaussians, views, metrics=(metrics.flip, metrics.ssim))
+    assert mean_metrics(gaussians, views, REFERENCE) == {key: result["mean"][key] for key in ("psnr", "ssim")}
+    chosen = mean_metrics(gaussians, views, REFERENCE, metrics=(metrics.flip, metrics.ssim))
     assert chosen == {key: result["mean"][key] for key in ("flip", "ssim")}
 
 
 def test_mode_background_and_mask_are_passed_on(gaussians, tmp_path):
     config = RenderConfig(mode="antialiased")
     (view,) = make_views(gaussians, [0], config=config, background=WHITE)
-    assert evaluate(gaussians, [view], tmp_path, config, None, WHITE)["mean"]["psnr"] is None
-    assert evaluate(gaussians, [view], tmp_path, config, None)["mean"]["psnr"] < 40
-    assert evaluate(gaussians, [view], tmp_path, RenderConfig(), None, WHITE)["mean"]["psnr"] < 60
+    assert evaluate(gaussians, [view], tmp_path, Renderer("reference", config, WHITE))["mean"]["psnr"] is None
+    assert evaluate(gaussians, [view], tmp_path, Renderer("reference", config))["mean"]["psnr"] < 40
+    assert evaluate(gaussians, [view], tmp_path, Renderer("reference", background=WHITE))["mean"]["psnr"] < 60
     photo, mask = view.image.copy(), np.ones((24, 32), dtype=bool)
     photo[:, :10], mask[:, :10] = 255 - photo[:, :10], False
     masked = View(view.name, view.camera, photo, mask)
-    assert evaluate(gaussians, [masked], tmp_path, config, None, WHITE)["mean"]["psnr"] is None
-    assert mean_metrics(gaussians, [masked], config, None, WHITE)["psnr"] == np.inf
+    assert evaluate(gaussians, [masked], tmp_path, Renderer("reference", config, WHITE))["mean"]["psnr"] is None
+    assert mean_metrics(gaussians, [masked], Renderer("reference", config, WHITE))["psnr"] == np.inf
 
 
 def test_equal_images_are_written_as_valid_json(gaussians, tmp_path):
-    result = evaluate(gaussians, make_views(gaussians, [0, 9]), tmp_path)
+    result = evaluate(gaussians, make_views(gaussians, [0, 9]), tmp_path, REFERENCE)
     assert result["views"][0]["psnr"] is None and result["views"][1]["psnr"] > 20
     assert result["mean"]["psnr"] is None
     assert "Infinity" not in (tmp_path / "metrics.json").read_text()
@@ -122,7 +124,7 @@ def test_the_page_links_to_its_pictures_worst_first(gaussians, tmp_path):
     views = make_views(gaussians, [5, 20, 10])
     names = ["a/<b>&\"x'.jpg", "../.b c#1?.jpg", "b_c_1.png"]
     views = [View(name, view.camera, view.image) for name, view in zip(names, views, strict=True)]
-    result = evaluate(gaussians, views, tmp_path)
+    result = evaluate(gaussians, views, tmp_path, REFERENCE)
     page = Page((tmp_path / "index.html").read_text(encoding="utf-8"))
     assert page.cards == ["view-1", "view-2", "view-0"]
     assert page.headings == [names[1], names[2], names[0]]
@@ -141,7 +143,7 @@ def test_views_of_one_name_do_not_overwrite_each_other(gaussians, tmp_path):
     views = make_views(gaussians, [5, 20, 10, 7])
     names = ["a/1.jpg", "A_1.png", "a_1.JPG", "照片.jpg"]
     views = [View(name, view.camera, view.image) for name, view in zip(names, views, strict=True)]
-    records = evaluate(gaussians, views, tmp_path)["views"]
+    records = evaluate(gaussians, views, tmp_path, REFERENCE)["views"]
     assert len({record["truth"].casefold() for record in records}) == 4
     assert records[3]["truth"] == "truth/照片.png"
     for view, record in zip(views, records, strict=True):
@@ -151,7 +153,7 @@ def test_views_of_one_name_do_not_overwrite_each_other(gaussians, tmp_path):
 def test_the_same_again_is_the_same_bytes(gaussians, tmp_path):
     views = make_views(gaussians, [5, 20])
     for out in ("one", "two"):
-        evaluate(gaussians, iter(views), tmp_path / out)
+        evaluate(gaussians, iter(views), tmp_path / out, REFERENCE)
     files = sorted(p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*") if p.is_file())
     assert len(files) == 2 + 2 * 3
     for file in files:
@@ -160,7 +162,7 @@ def test_the_same_again_is_the_same_bytes(gaussians, tmp_path):
 
 def test_without_flip(gaussians, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    result = evaluate(gaussians, make_views(gaussians, [5]), tmp_path)
+    result = evaluate(gaussians, make_views(gaussians, [5]), tmp_path, REFERENCE)
     assert result["mean"]["flip"] is None and result["views"][0]["flip"] is None
     assert "FLIP" not in (tmp_path / "index.html").read_text(encoding="utf-8")
 
@@ -168,11 +170,11 @@ def test_without_flip(gaussians, tmp_path, monkeypatch):
 def test_what_is_refused(gaussians, tmp_path):
     (view,) = make_views(gaussians, [5])
     with pytest.raises(InputError, match="at least one view"):
-        evaluate(gaussians, [], tmp_path)
+        evaluate(gaussians, [], tmp_path, REFERENCE)
     wrong = View("x.jpg", view.camera, view.image[:-1])
     with pytest.raises(InputError, match=r"x\.jpg: expected a photo of its camera's size, \(24, 32, 3\)"):
-        evaluate(gaussians, [wrong], tmp_path)
+        evaluate(gaussians, [wrong], tmp_path, REFERENCE)
     assert not (tmp_path / "metrics.json").exists()
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="expected a folder"):
-        evaluate(gaussians, [view], tmp_path / "file")
+    with pytest.raises(InputError, match=r"cannot create .*file: Not a directory"):
+        evaluate(gaussians, [view], tmp_path / "file", REFERENCE)

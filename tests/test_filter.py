@@ -11,19 +11,19 @@ from clsplat import ops, reference
 from clsplat.camera import Camera
 from clsplat.constants import FILTER_VARIANCE
 from clsplat.gaussians import Gaussians
-from clsplat.render import upload
+from clsplat.renderer import Renderer
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene
 
 NAMES = ("log_scales", "logit_opacities")
 
 
 def forward(device, gaussians, pixels):
-    return host(ops.filter_fwd(device, upload(device, gaussians), device.upload("pixels", pixels)))
+    return host(ops.filter_fwd(device, Renderer(device).place(gaussians), device.upload("pixels", pixels)))
 
 
 def backward(device, gaussians, pixels, v):
     v = Gaussians(**{name: device.upload("v", array) for name, array in v.arrays().items()})
-    return host(ops.filter_bwd(device, upload(device, gaussians), device.upload("pixels", pixels), v))
+    return host(ops.filter_bwd(device, Renderer(device).place(gaussians), device.upload("pixels", pixels), v))
 
 
 def scene(n=400):
@@ -51,7 +51,7 @@ def test_sizes_match_twin(any_device):
     gaussians, _ = scene()
     gaussians.means *= 3  # some are seen by no camera, and some by all
     cameras = ring(5, 4)
-    found = ops.pixel_sizes(any_device, upload(any_device, gaussians), cameras).get()
+    found = ops.pixel_sizes(any_device, Renderer(any_device).place(gaussians), cameras).get()
     expected = reference.pixel_sizes(gaussians, cameras)
     # The edge of an image may be on either side of a centre: one row in 1e4.
     assert (np.abs(found / expected - 1) > 1e-5).sum() <= (1 if any_device.real == np.float32 else 0)
@@ -68,7 +68,10 @@ def test_sizes_in_numbers(any_device):
     gaussians = synthetic_scene(3)[0]
     gaussians.means[:] = [(0, 0, 5), (0, 0, 1.5), (0, 0, -5)]
     cameras = [camera, nearer, away]
-    found = [ops.pixel_sizes(any_device, upload(any_device, gaussians), c).get() for c in (cameras[:2], cameras, [])]
+    found = [
+        ops.pixel_sizes(any_device, Renderer(any_device).place(gaussians), c).get()
+        for c in (cameras[:2], cameras, [])
+    ]
     np.testing.assert_allclose(found[0], [0.03, 0.015, 0.03], rtol=1e-6)
     np.testing.assert_allclose(found[1], [0.03, 0.015, 0.0005], rtol=1e-6)
     np.testing.assert_array_equal(found[2], 0)

@@ -89,4 +89,4 @@ def test_double(gold, device64, name, mode, compositor):
 
 @CASES
 def test_twin(gold, name, mode):
-    compare(gold, name, mode, None, "auto", image_atol=1e-9, gradient_rtol=1e-9)
+    compare(gold, name, mode, "reference", "auto", image_atol=1e-9, gradient_rtol=1e-9)

@@ -22,7 +22,8 @@ from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.evaluate import mean_metrics
 from clsplat.metrics import to_uint8
-from clsplat.render import render, upload
+from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.stages import Splats
 from clsplat.testing import assert_matches, synthetic_scene, threshold_distances
 from clsplat.training.initialize import initialize
@@ -78,11 +79,11 @@ def test_kernels_match_twin(any_device, model, degree):
     assert_cameras_match(v_camera, v_camera_expected, table)
 
     uploaded = Splats(*(any_device.upload("splats", a) for a in expected))
-    found = ops.project_disparities(any_device, upload(any_device, gaussians), camera, uploaded).get()
+    found = ops.project_disparities(any_device, Renderer(any_device).place(gaussians), camera, uploaded).get()
     disparities = reference.project_disparities(gaussians, camera, expected)
     for column in range(3):
         assert_matches("disparities", found[:, column], disparities[:, column], table)
-    pixels = ops.pixel_sizes(any_device, upload(any_device, gaussians), [camera]).get()
+    pixels = ops.pixel_sizes(any_device, Renderer(any_device).place(gaussians), [camera]).get()
     np.testing.assert_allclose(pixels, reference.pixel_sizes(gaussians, [camera]), rtol=1e-5)
 
 
@@ -215,20 +216,22 @@ def test_gradients_of_intrinsics_by_rendering(model):
     gaussians, camera = synthetic_scene(8, seed=4, margin=0)
     camera = as_model(camera, model)
     weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))
-    v = render(gaussians, camera).backward(weights, intrinsics_grad=True)
+    v = render(gaussians, camera, device="reference").backward(weights, intrinsics_grad=True)
     assert v.viewmat is None
     for k, name in enumerate(("fx", "fy", "cx", "cy")):
         value, step = getattr(camera, name), 1e-6
-        ends = [render(gaussians, replace(camera, **{name: value + s})).rgb for s in (-step, step)]
+        ends = [
+            render(gaussians, replace(camera, **{name: value + s}), device="reference").rgb for s in (-step, step)
+        ]
         assert v.intrinsics[k] == pytest.approx(((ends[1] - ends[0]) * weights).sum() / (2 * step), rel=1e-5)
-    assert render(gaussians, camera).backward(weights).intrinsics is None
+    assert render(gaussians, camera, device="reference").backward(weights).intrinsics is None
 
 
 @EACH
 def test_one_image_for_each_tiling(device, model):
     gaussians, camera = scene_around(model, 300)
     images = [render(gaussians, camera, RenderConfig(tile_size=t), device).rgb for t in (8, 16)]
-    twin = render(gaussians, camera).rgb
+    twin = render(gaussians, camera, device="reference").rgb
     np.testing.assert_allclose(*images, atol=1e-4)  # float32 sums in blocks of other places
     assert (np.abs(images[0] - twin) > 2e-4).mean() < 1e-3  # thresholds may flip
     assert twin.std() > 0.05
@@ -242,7 +245,7 @@ def test_invalid_cameras_are_refused(device):
         replace(camera, distortion=WIDE)
     for where in (device, None):
         function = ops.project_fwd if where else reference.project_fwd
-        arguments = (device, upload(device, gaussians)) if where else (gaussians,)
+        arguments = (device, Renderer(device).place(gaussians)) if where else (gaussians,)
         with pytest.raises(InputError, match="found an equirectangular one"):
             function(*arguments, Camera.panorama(np.eye(4), 32), 0)
 
@@ -259,6 +262,6 @@ def test_scenes_train_on_every_model(device, tmp_path, model):
         return [replace(v, camera=c, image=p) for v, c, p in zip(views, cameras, photos, strict=True)]
 
     scene = replace(scene, train=through(scene.train), test=through(scene.test))
-    start = mean_metrics(initialize(scene, CONFIG.init, 0), scene.test, device=device)["psnr"]
-    found = mean_metrics(train(scene, CONFIG, device, tmp_path), scene.test, device=device)["psnr"]
+    start = mean_metrics(initialize(scene, CONFIG.init, 0), scene.test, Renderer(device))["psnr"]
+    found = mean_metrics(train(scene, CONFIG, tmp_path, device), scene.test, Renderer(device))["psnr"]
     assert found > max(30, start + 5), (start, found)

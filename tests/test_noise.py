@@ -8,7 +8,7 @@ from clsplat import ops, reference
 from clsplat.gaussians import Gaussians, logit, sigmoid
 from clsplat.reference.noise import normals, philox
 from clsplat.reference.project import rotations
-from clsplat.render import fetch, upload
+from clsplat.renderer import Renderer, fetch
 from clsplat.stages import GATE_OPACITY, GATE_SLOPE
 from clsplat.testing import assert_matches, synthetic_scene
 
@@ -21,7 +21,7 @@ def scene(n):
 
 
 def by_kernel(device, gaussians, *arguments):
-    uploaded = upload(device, gaussians)
+    uploaded = Renderer(device).place(gaussians)
     ops.add_noise(device, uploaded, *arguments)
     return fetch(uploaded)
 

@@ -12,7 +12,7 @@ from clsplat.config import OptimConfig
 from clsplat.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN
 from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations as reference_rotations
-from clsplat.render import download, upload
+from clsplat.renderer import Renderer, download
 from clsplat.stages import SplatGrads, Splats
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene, threshold_distances
 from clsplat.training.optimizer import adam_settings
@@ -30,12 +30,12 @@ def host(arrays):
 
 
 def forward(device, gaussians, camera, degree=3, **options):
-    return host(ops.project_fwd(device, upload(device, gaussians), camera, degree, **options))
+    return host(ops.project_fwd(device, Renderer(device).place(gaussians), camera, degree, **options))
 
 
 def backward(device, gaussians, camera, splats, v_splats, degree=3, **options):
     uploaded = [type(a)(*(device.upload("splats", x) for x in a)) for a in (splats, v_splats)]
-    v, v_camera = ops.project_bwd(device, upload(device, gaussians), camera, degree, *uploaded, **options)
+    v, v_camera = ops.project_bwd(device, Renderer(device).place(gaussians), camera, degree, *uploaded, **options)
     return host(v), v_camera
 
 
@@ -120,7 +120,7 @@ def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degr
     v_splats = random_grads(splats)
     step = adam_settings(20, 0.2, 2.0, OptimConfig(), degree)._replace(penalties=penalties)
     uploaded = [type(a)(*(any_device.upload("splats", x) for x in a)) for a in (splats, v_splats)]
-    fused, separate = ([upload(any_device, part) for part in parts] for _ in range(2))
+    fused, separate = ([Renderer(any_device).place(part) for part in parts] for _ in range(2))
 
     # The gradient of the viewmat comes along on request; without it, the kernel is another.
     options = {"antialiased": antialiased, "camera_grad": degree == stored}
@@ -246,7 +246,7 @@ def test_disparities_match_twin(any_device):
         gaussians = gaussians.take((z < 0) | (z > 0.2))
     splats = reference.project_fwd(gaussians, camera, 0)
     uploaded = Splats(*(any_device.upload("splats", a) for a in splats))
-    found = ops.project_disparities(any_device, upload(any_device, gaussians), camera, uploaded).get()
+    found = ops.project_disparities(any_device, Renderer(any_device).place(gaussians), camera, uploaded).get()
     expected = reference.project_disparities(gaussians, camera, splats)
     table = DOUBLE if any_device.real == np.float64 else FLOAT
     for column in range(3):

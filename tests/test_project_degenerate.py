@@ -9,7 +9,8 @@ from tolerances import DOUBLE, FLOAT
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MIN, NEAR
 from clsplat.gaussians import Gaussians, logit
-from clsplat.render import render, upload
+from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.stages import SplatGrads, Splats
 from clsplat.testing import synthetic_scene
 
@@ -111,7 +112,7 @@ def test_extreme_gaussians_stay_finite(any_device, antialiased):
     for name in Splats._fields:
         np.testing.assert_array_equal(getattr(splats, name)[healthy], getattr(clean, name), err_msg=name)
     uploaded = Splats(*(any_device.upload("splats", a) for a in splats))
-    disparities = ops.project_disparities(any_device, upload(any_device, mixed), camera, uploaded).get()
+    disparities = ops.project_disparities(any_device, Renderer(any_device).place(mixed), camera, uploaded).get()
     assert np.isfinite(disparities).all() and (disparities[:, 0] >= 0).all()
 
 

@@ -52,11 +52,11 @@ def test_is_what_rendering_without_the_splat_shows(any_device):
     width, height = 23, 17
     splats = faint(40, 1, width, height)
     bins = reference.bin_splats(splats, width, height, 8)
-    image = image_of(splats, width, height, BACKGROUND).image
+    image = image_of(splats, width, height, BACKGROUND).rgb
     target, mask = target_and_mask(image.shape)
     args = splats, bins, BACKGROUND, image - target, mask
     before = squared_error(image, target, mask)
-    images = [image_of(without(splats, g), width, height, BACKGROUND).image for g in range(len(splats.depths))]
+    images = [image_of(without(splats, g), width, height, BACKGROUND).rgb for g in range(len(splats.depths))]
     removed = [squared_error(other, target, mask) - before for other in images]
     changed = [squared_error(other, image, mask) for other in images]
     assert min(removed) < 0 < max(removed), "removal makes it worse and better"
@@ -70,7 +70,7 @@ def test_is_what_rendering_without_the_splat_shows(any_device):
         for g in (0, 7, 31):
             colors = splats.colors.copy()
             colors[g] += d
-            recoloured = image_of(splats._replace(colors=colors), width, height, BACKGROUND).image
+            recoloured = image_of(splats._replace(colors=colors), width, height, BACKGROUND).rgb
             expected = squared_error(recoloured, target, mask) - before
             assert found.squares[g] * d @ d + 2 * found.pulls[g] @ d == pytest.approx(expected, rel=tolerance)
 
@@ -88,8 +88,8 @@ def test_double_matches_twin(device64, tile_size, channels):
     bins = reference.bin_splats(splats, width, height, tile_size)
     image = reference.composite_fwd(splats, bins, BACKGROUND[:channels])
     assert (image.alpha > 1 - 2 * TRANSMITTANCE_MIN).any() and np.diff(bins.tile_ranges).max() > 64
-    target, mask = target_and_mask(image.image.shape)
-    args = splats, bins, BACKGROUND[:channels], image.image - target, mask
+    target, mask = target_and_mask(image.rgb.shape)
+    args = splats, bins, BACKGROUND[:channels], image.rgb - target, mask
     expected, found = reference.removal(*args), by_kernel(device64, *args)
     for name in Removal._fields:
         assert_matches(name, getattr(found, name), getattr(expected, name), DOUBLE)
@@ -102,8 +102,8 @@ def test_float_matches_twin(device):
     # Pixels in which rounding decides whether a pair is drawn do not count.
     band = ambiguous_pixels(splats, width, height, margin=1e-3)
     assert 0 < band.mean() < 0.25
-    target, _ = target_and_mask(image.image.shape)
-    args = splats, bins, BACKGROUND[:3], image.image - target, ~band
+    target, _ = target_and_mask(image.rgb.shape)
+    args = splats, bins, BACKGROUND[:3], image.rgb - target, ~band
     expected, found = reference.removal(*args), by_kernel(device, *args)
     for name in Removal._fields:
         assert_matches(name, getattr(found, name), getattr(expected, name), FLOAT)
@@ -138,13 +138,13 @@ def test_pixels_that_stop_are_wrong_by_no_more_than_the_stop_hides():
     hidden = TRANSMITTANCE_MIN / (1 - ALPHA_MAX)
     errors = []
     for g in range(n):
-        target = image_of(without(splats, g), width, height, background).image
-        expected = ((image.image - target) ** 2).sum()
+        target = image_of(without(splats, g), width, height, background).rgb
+        expected = ((image.rgb - target) ** 2).sum()
         bins = reference.bin_splats(splats, width, height, max(width, height))
         price = reference.removal(splats, bins, background).errors[g]
         # |D'|^2 - |D|^2 <= |D' - D| (2 |D| + |D' - D|), pixel by pixel; both stops may err, and the formula's own.
         slack = 3 * hidden
-        bound = (slack * (2 * np.abs(image.image - target) + slack)).sum()
+        bound = (slack * (2 * np.abs(image.rgb - target) + slack)).sum()
         assert abs(price - expected) <= bound
         errors.append([price, expected])
     price, expected = np.array(errors).T

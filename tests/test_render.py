@@ -54,7 +54,7 @@ def turned(gaussians, camera, rotation_quat, shift, scale=1.0):
 @COMPOSITORS
 def test_double_matches_twin(device64, mode, compositor):
     gaussians, camera = synthetic_scene(200, 1, width=53, height=38)
-    twin = render(gaussians, camera, RenderConfig(mode), background=BACKGROUND, depth=True)
+    twin = render(gaussians, camera, RenderConfig(mode), background=BACKGROUND, depth=True, device="reference")
     actual = render(
         gaussians, camera, RenderConfig(mode, compositor=compositor), device64, background=BACKGROUND, depth=True
     )
@@ -73,7 +73,7 @@ def test_float_matches_twin(device, mode):
     gaussians, camera = synthetic_scene(400, 2, width=97, height=71)
     gaussians = gaussians.astype(np.float32)
     config = RenderConfig(mode)
-    twin = render(gaussians, camera, config, background=BACKGROUND, depth=True)
+    twin = render(gaussians, camera, config, background=BACKGROUND, depth=True, device="reference")
     actual = render(gaussians, camera, config, device, background=BACKGROUND, depth=True)
     splats = reference.project_fwd(gaussians, camera, 3, antialiased=mode == "antialiased")
     band = ambiguous_pixels(splats, camera.width, camera.height, margin=1e-3)
@@ -120,7 +120,7 @@ def test_central_differences(device64, mode, compositor):
 @MODES
 def test_central_differences_of_the_twin(mode):
     gaussians, camera = synthetic_scene(15, 4, margin=1e-3)
-    check_gradients(None, gaussians, camera, RenderConfig(mode))
+    check_gradients("reference", gaussians, camera, RenderConfig(mode))
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2])
@@ -269,7 +269,7 @@ def test_image_sizes(device64, compositor, width, height):
     camera = Camera.look_at((1.5, -1.0, 3.57), (0, 0, 0), (0, 1, 0), focal, width, height)
     gaussians.means[:, 1] *= 0.01
     config = RenderConfig(compositor=compositor)
-    expected, actual = (render(gaussians, camera, config, d, background=BACKGROUND) for d in (None, device64))
+    expected, actual = (render(gaussians, camera, config, d, background=BACKGROUND) for d in ("reference", device64))
     assert expected.alpha.max() > 0.1
     assert_matches("rgb", actual.rgb, expected.rgb, DOUBLE)
     v_images = random_grads(expected)
@@ -281,7 +281,9 @@ def test_image_sizes(device64, compositor, width, height):
 @pytest.mark.parametrize("twin", [True, False], ids=["twin", "device"])
 def test_no_gaussians(device, twin):
     gaussians, camera = synthetic_scene(0)
-    rendering = render(gaussians, camera, RenderConfig(), None if twin else device, background=BACKGROUND, depth=True)
+    rendering = render(
+        gaussians, camera, RenderConfig(), "reference" if twin else device, background=BACKGROUND, depth=True
+    )
     np.testing.assert_allclose(rendering.rgb, np.broadcast_to(BACKGROUND, rendering.rgb.shape), rtol=1e-6)
     assert (rendering.alpha == 0).all() and (rendering.depth == 0).all()
     v = rendering.backward(*random_grads(rendering), viewmat_grad=True)
@@ -321,11 +323,11 @@ def test_gradients_left_out_are_zero(device):
 def test_input_errors(device):
     gaussians, camera = synthetic_scene(3, sh_degree=1)
     with pytest.raises(InputError, match="sh_degree: expected 0 to 1"):
-        render(gaussians, camera, sh_degree=2)
+        render(gaussians, camera, sh_degree=2, device="reference")
     with pytest.raises(InputError, match="sh_degree"):
-        render(gaussians, camera, sh_degree=-1)
+        render(gaussians, camera, sh_degree=-1, device="reference")
     with pytest.raises(InputError, match="quats: expected shape"):
-        render(replace(gaussians, quats=gaussians.quats[:2]), camera)
+        render(replace(gaussians, quats=gaussians.quats[:2]), camera, device="reference")
     rendering = render(gaussians, camera, RenderConfig(), device)
     with pytest.raises(InputError, match=r"v_rgb: expected shape \(29, 37, 3\), found \(37, 29, 3\)"):
         rendering.backward(np.zeros((37, 29, 3)))

@@ -30,7 +30,7 @@ class TestForwardOnly:
 
     @pytest.mark.parametrize("twin", [True, False], ids=["twin", "device"])
     def test_views_are_what_render_gives(self, device, scene, cameras, twin):
-        gaussians, target = scene[0], None if twin else device
+        gaussians, target = scene[0], "reference" if twin else device
         options = {"background": BACKGROUND, "depth": True, "sh_degree": 1}
         views = list(render_views(gaussians, cameras, RenderConfig("antialiased"), target, **options))
         assert len(views) == len(cameras)
@@ -52,9 +52,9 @@ class TestForwardOnly:
         monkeypatch.setattr(
             reference, "bin_splats", lambda *a, gradients=True, **k: asked.append(gradients) or bin_splats(*a, **k)
         )
-        list(render_views(scene[0], cameras))
-        render(*scene, gradients=False)
-        render(*scene)
+        list(render_views(scene[0], cameras, device="reference"))
+        render(*scene, gradients=False, device="reference")
+        render(*scene, device="reference")
         assert asked == [False] * (len(cameras) + 1) + [True]
 
     def test_cameras_are_asked_for_one_by_one(self, device, scene, cameras):
@@ -78,7 +78,7 @@ class TestForwardOnly:
 
     def test_bad_input_is_refused_at_once(self, scene, cameras):
         with pytest.raises(InputError, match="sh_degree"):
-            render_views(scene[0], cameras, sh_degree=4)
+            render_views(scene[0], cameras, sh_degree=4, device="reference")
 
     def test_no_gaussians(self, device, cameras):
         for view, camera in zip(render_views(synthetic_scene(0)[0], cameras, device=device), cameras, strict=True):

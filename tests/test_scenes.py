@@ -27,7 +27,7 @@ def test_held_out_quality(
 ) -> None:
     scene = load_scene(shared / "data" / name, data)
     config = TrainConfig(strategy="adc", size="fixed", iterations=iterations, data=data)
-    gaussians = train(scene, config, device, tmp_path)
+    gaussians = train(scene, config, tmp_path, device)
     figures = mean_metrics(gaussians, scene.test, config.render, device, BACKGROUNDS[data.background])
     print(name, figures, len(gaussians))
     assert figures["psnr"] > psnr

@@ -256,7 +256,7 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
                 scene = _load(source)
             if not isinstance(scene, Scene):
                 raise scene or ClsplatError(f"{cell.source.path}: could not be read, see above")
-            start, config = prepare(source.path, cell.config, scene=scene)
+            start, config = prepare(source.path, cell.config, device, scene=scene)
             last = run_cell(config, start, device, record)
             flips = "" if last["flip"] is None else f", FLIP {last['flip']:.3f}"
             say(

@@ -97,10 +97,7 @@ class Train:
         """Prepare scene and configuration, check that they fit the device, and write the configuration to `out`."""
         from clsplat.dataset.video import extract_frames, is_video
         from clsplat.training.checkpoint import CHECKPOINT
-        from clsplat.training.initialize import start_count
-        from clsplat.training.memory import Footprint
         from clsplat.training.preparation import prepare
-        from clsplat.training.state import start_config
 
         data = self.data
         if is_video(data):
@@ -109,16 +106,11 @@ class Train:
         scene, config = prepare(
             data,
             self.settings,
+            device,
             resume=(out / CHECKPOINT).exists(),
             verbose=console.loudness == "verbose",
             tell=say,
         )
-        need, start = (
-            Footprint.of(scene, config, device),
-            start_count(scene, start_config(config), config.max_gaussians),
-        )
-        need.check(start, device.memory_limit)
-        say(need.describe(start, config.max_gaussians, device.memory_limit))
         new_folder(out)
         write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
         say_cameras(data, out / "cameras.png")
@@ -266,7 +258,7 @@ class Demo:
         say("photos: ray tracing a still life")
         make_photos(photos)
         say("cameras: structure from motion on the photos alone")
-        scene, config = prepare(photos, config, tell=say)
+        scene, config = prepare(photos, config, device, tell=say)
         write_json(self.out / "config.json", asdict(config))
         gaussians = train_and_report(scene, config, device, self.out, resume=False)
         renderings = render_views(gaussians, [view.camera for view in scene.test], config.render, device)

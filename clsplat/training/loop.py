@@ -57,7 +57,8 @@ class Training:
         self.photos = Photos(device)
         self._views: list[View] = scene.train
         self._views_of = 1, False  # the divisor of their edges, and whether blocks of them validate
-        state.move(self.optimizer.home)
+        if state.filter and state.filter.pixels is not None:  # of a checkpoint
+            state.filter.pixels = self.renderer.upload("pixel sizes", state.filter.pixels)
 
     @cached_property
     def need(self) -> Footprint:
@@ -68,11 +69,12 @@ class Training:
         """A training of the same scene that goes on from another state."""
         result = copy(self)
         result.state = state
-        state.move(self.optimizer.home)
         return result
 
     def run_until(self, last: int, after: Callable[["Training", float], None]) -> None:
         """Run the iterations up to `last`, and call `after` with the training and the loss after each."""
+        if self.state.iteration < last:
+            self.state.move(self.optimizer.home)
         while self.state.iteration < last:
             after(self, self.advance())
 
@@ -210,10 +212,10 @@ def train(
     Raises
     ------
     InputError
-        If the scene has no photos to train on, the strategy is unknown, the price is negative, the first Gaussians do
-        not fit the device's memory, or the checkpoint is of another configuration.
+        If the scene has no photos to train on, the strategy is unknown, the price is negative, or the checkpoint is
+        of another configuration.
     DeviceError
-        If the device's memory, or its limit, is exceeded later.
+        If the device's memory, or its limit, is exceeded.
     ClsplatError
         If the loss stops being finite.
 
@@ -226,8 +228,6 @@ def train(
     out, device = Path(out), device or open_device(config)
     state = load_state(out / CHECKPOINT, scene.extent, config) if resume else initial_state(scene, config)
     training = Training(scene, config, device, state)
-    if not resume:
-        training.need.check(len(state.gaussians), device.memory_limit)
     with log_file(out / LOG, state.iteration) as log:
         recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
         try:
@@ -259,6 +259,7 @@ def finish(training: Training, out: Path) -> Gaussians:
     if state.exposures or state.poses:
         write_photos(out / "photos.json", state, scene)
     gaussians = fetch(state.shown(training.renderer))
+    state.move(None)  # what follows needs the device's memory
     if state.search:
         write_report(out / "size.json", state.search, training.config)
         gaussians = without_useless_bands(gaussians, state.corrected(scene.train), training.renderer)

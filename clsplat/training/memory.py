@@ -44,8 +44,8 @@ PER_PIXEL = {
 PER_PIXEL_EXPOSURE = 3  # the image with the colours of its photo
 PER_ROW = 3 * 416  # derivatives of SSIM: rows have margins, and end with a work-item
 
-COPIES = 4
-"""Copies of all parameters: themselves, Adam's two moments, and one for renders outside of training."""
+COPIES = 3
+"""Copies of all parameters: themselves and Adam's two moments."""
 
 UNITS = {"MB": 10**6, "GB": 10**9, "MiB": 2**20, "GiB": 2**30}
 

@@ -12,7 +12,9 @@ from clsplat.dataset.finding import mask_folder
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
 from clsplat.training.few_views import adapted
-from clsplat.training.memory import parse_bytes
+from clsplat.training.initialize import start_count
+from clsplat.training.memory import Footprint, parse_bytes
+from clsplat.training.state import start_config
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 def prepare(
     path: str | Path,
     config: TrainConfig,
+    device: "Device | None" = None,
     *,
     scene: Scene | None = None,
     resume: bool = False,
@@ -38,6 +41,8 @@ def prepare(
     path : str or Path
         The dataset's folder, as `clsplat.dataset.load_scene` reads it.
     config : TrainConfig
+    device : Device, optional
+        Device that will train; default: the one that `config` describes.
     scene : Scene, optional
         The dataset, if `load_scene` has read it already with `config.data`.
     resume : bool
@@ -55,7 +60,7 @@ def prepare(
     Raises
     ------
     InputError
-        If the dataset cannot be read; the message names the file.
+        If the dataset cannot be read, with the file's name; or if the first Gaussians do not fit the device's memory.
     """
     if config.data.masks is not None:
         masks = str(mask_folder(Path(path), config.data.masks).resolve())
@@ -74,7 +79,18 @@ def prepare(
             f"few photos: with fewer than {config.few.below} the Gaussians are fewer and simpler, and some are left "
             "out of each image (--few.below 0 trains as with many)"
         )
+    check_memory(scene, few, device or open_device(config), tell)
     return scene, few
+
+
+def check_memory(scene: Scene, config: TrainConfig, device: "Device", tell: Callable[[str], None]) -> None:
+    """Check that the first Gaussians fit the device, and tell what the training takes."""
+    limit = device.memory_limit
+    if config.memory_limit is not None:
+        limit = min(limit, parse_bytes(config.memory_limit, "--memory-limit"))
+    need, start = Footprint.of(scene, config, device), start_count(scene, start_config(config), config.max_gaussians)
+    need.check(start, limit)
+    tell(need.describe(start, config.max_gaussians, limit))
 
 
 def open_device(config: TrainConfig) -> "Device":

@@ -7,7 +7,7 @@ import numpy as np
 from clsplat import ops
 from clsplat.bench.workloads import synthetic
 from clsplat.device import Device
-from clsplat.render import upload
+from clsplat.renderer import Renderer
 
 NAMES = ["10k-640x480", "10k-1280x720", "100k-640x480", "100k-1280x720", "1M-640x480", "1M-1280x720"]
 TILE_SIZE = 16
@@ -36,7 +36,7 @@ def main():
     print("|---|---|---|---|---|---|")
     for name in NAMES:
         workload = synthetic(name)
-        camera, gaussians = workload.view.camera, upload(device, workload.gaussians)
+        camera, gaussians = workload.view.camera, Renderer(device).place(workload.gaussians)
         splats = ops.project_fwd(device, gaussians, camera, 0)
         m = ops.bin_splats(device, splats, camera.width, camera.height, TILE_SIZE).gauss_ids.shape[0]
         cells = [

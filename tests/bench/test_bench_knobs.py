@@ -135,7 +135,7 @@ class TestResults:
     def test_errors_are_of_the_images(self, results, device):
         workload = synthetic(WORKLOAD)
         camera, base = workload.view.camera, RenderConfig()
-        truth = render(workload.gaussians, camera, base).rgb
+        truth = render(workload.gaussians, camera, base, device="reference").rgb
         image = render(workload.gaussians, camera, replace(base, mode="antialiased"), device).rgb
         measured = found(results, "mode")["antialiased"]["error"]
         assert measured["max_abs"] == pytest.approx(np.abs(image - truth).max())

@@ -49,7 +49,7 @@ def write_dataset(folder: Path, count: int = 9) -> Gaussians:
         angle = 2 * np.pi * i / count
         eye = [3 * np.sin(angle), -1.0, 3 * np.cos(angle)]
         camera = Camera.look_at(eye, [0, 0, 0], [0, -1, 0], 45, *SIZE)
-        Image.fromarray(to_uint8(render(truth, camera).rgb)).save(folder / f"{i}.png")
+        Image.fromarray(to_uint8(render(truth, camera, device="reference").rgb)).save(folder / f"{i}.png")
         # transforms.json holds camera to world, in OpenGL axes.
         matrix = np.linalg.inv(camera.viewmat) @ np.diag([1, -1, -1, 1])
         frames.append({"file_path": f"{i}.png", "transform_matrix": matrix.tolist()})

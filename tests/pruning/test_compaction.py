@@ -8,18 +8,17 @@ import pytest
 from test_cli import fails, run, write_dataset
 
 from clsplat.camera import Camera
-from clsplat.config import DataConfig, RenderConfig
+from clsplat.config import DataConfig
 from clsplat.dataset import load_scene
 from clsplat.formats import FORMATS, load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, to_uint8
-from clsplat.pruning import compaction as compact
-from clsplat.pruning.compaction import ASSUMED_PSNR, Judge
+from clsplat.pruning import viewpoints
+from clsplat.pruning.compaction import ASSUMED_PSNR, LossMeter
 from clsplat.pruning.viewpoints import automatic_cameras, own_views
 from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.testing import synthetic_scene
-
-BLACK = (0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +36,12 @@ def bloated(tmp_path_factory):
 def test_loss_against_own_renders_in_numbers(device):
     """A difference as large as the assumed error doubles it: 3 dB."""
     gaussians, camera = synthetic_scene(20, 1)
-    view = own_views(gaussians, {"a": camera}, device=device)[0]
-    judge = Judge(gaussians, [view], False, RenderConfig(), device, BLACK)
-    assert judge(gaussians) == 0
+    view = own_views(gaussians, {"a": camera}, Renderer(device))[0]
+    loss = LossMeter(gaussians, [view], False, Renderer(device))
+    assert loss(gaussians) == 0
     less = gaussians.take(np.arange(17))
     mse = 10 ** (-psnr(to_uint8(render(less, camera, device=device).rgb), view.image) / 10)
-    assert judge(less) == pytest.approx(10 * np.log10(1 + mse / 10 ** (-ASSUMED_PSNR / 10)))
+    assert loss(less) == pytest.approx(10 * np.log10(1 + mse / 10 ** (-ASSUMED_PSNR / 10)))
 
 
 def test_loss_against_photos_is_the_difference_of_psnr(device, bloated):
@@ -53,11 +52,9 @@ def test_loss_against_photos_is_the_difference_of_psnr(device, bloated):
     def mean_psnr(gaussians):
         return np.mean([psnr(to_uint8(render(gaussians, v.camera, device=device).rgb), v.image) for v in views])
 
-    judge = Judge(good, views, True, RenderConfig(), device, BLACK)
-    assert judge(bad) == pytest.approx(
-        mean_psnr(good) - mean_psnr(bad), abs=0.1
-    )  # but for the rounding of the photos
-    assert judge(bad) > 1
+    loss = LossMeter(good, views, True, Renderer(device))
+    assert loss(bad) == pytest.approx(mean_psnr(good) - mean_psnr(bad), abs=0.1)  # but for the rounding of the photos
+    assert loss(bad) > 1
 
 
 def compacted(bloated, out, *arguments, flag="--photos"):
@@ -131,8 +128,8 @@ def test_degree_that_nobody_sees_is_dropped(bloated, tmp_path):
 
 
 def test_without_cameras(bloated, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(compact, "VIEW_SIZE", (64, 48))
-    monkeypatch.setattr(compact, "CANDIDATES", 5)
+    monkeypatch.setattr(viewpoints, "VIEW_SIZE", (64, 48))
+    monkeypatch.setattr(viewpoints, "CANDIDATES", 5)
     run("compact", bloated / "bloated.ply", "-o", tmp_path / "a.ply", "--max-gaussians", 50)
     assert len(load_gaussians(tmp_path / "a.ply")[0]) == 50
     assert "if the scene has 30 dB against photos unknown" in capsys.readouterr().err
@@ -141,10 +138,10 @@ def test_without_cameras(bloated, tmp_path, capsys, monkeypatch):
 def test_views_of_nothing_are_left_out(device):
     gaussians, camera = synthetic_scene(20, 1)
     away = Camera.look_at(camera.position, 2 * camera.position, (0, 1, 0), 40.0, 37, 29)
-    views = own_views(gaussians, {"away": away, "here": camera}, device=device)
+    views = own_views(gaussians, {"away": away, "here": camera}, Renderer(device))
     assert [view.name for view in views] == ["here"]
     gaussians.logit_opacities[:] = -20
-    assert automatic_cameras(gaussians, device=device) == {}
+    assert automatic_cameras(gaussians, Renderer(device)) == {}
 
 
 def test_bad_input_is_a_sentence(bloated, tmp_path, capsys):
@@ -161,7 +158,7 @@ def test_bad_input_is_a_sentence(bloated, tmp_path, capsys):
     assert "expected one of them, found both" in error(*one, "--photos", photos, "--cameras", photos)
     assert "expected a file of Gaussians in a folder that exists" in error(*one, out=tmp_path / "no" / "a.ply")
     assert "expected a file of Gaussians in a folder that exists" in error(*one, out=tmp_path / "a.xyz")
-    assert "--max-bytes: expected enough for a Gaussian" in error("--max-bytes", "0.0001MB", "--photos", photos)
+    assert "--max-bytes: expected at least" in error("--max-bytes", "0.0001MB", "--photos", photos)
     both = ("--max-psnr-loss", 0.5, "--max-gaussians", 3)
     assert "--max-gaussians: expected at least" in error(*both, "--photos", photos)
     lossy = error("--max-psnr-loss", 0.001, "--photos", photos, out=tmp_path / "a.splat")

@@ -12,6 +12,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.pruning.prices import price, removal_order, with_degree, without_bands
 from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.scene import View
 from clsplat.testing import synthetic_scene
 
@@ -35,7 +36,7 @@ def scene(n=30, seed=0):
     return gaussians, views
 
 
-def error(gaussians, views, device=None, config=RenderConfig()):
+def error(gaussians, views, device="reference", config=RenderConfig()):
     total = 0.0
     for view in views:
         rgb = render(gaussians, view.camera, config, device, background=BACKGROUND).rgb
@@ -49,8 +50,8 @@ def error(gaussians, views, device=None, config=RenderConfig()):
 def test_prices_are_what_rendering_anew_shows(device64, mode):
     gaussians, views = scene()
     config, before = RenderConfig(mode=mode), error(*scene(), config=RenderConfig(mode=mode))
-    for device in (None, device64):
-        prices = price(gaussians, views, config, device, BACKGROUND)
+    for device in ("reference", device64):
+        prices = price(gaussians, views, Renderer(device, config, BACKGROUND))
         for g in (0, 3, 11, 29):
             others = gaussians.take(np.arange(30) != g)
             assert prices.errors[g] == pytest.approx(error(others, views, config=config) - before, rel=1e-8)
@@ -66,9 +67,9 @@ def test_what_exceeds_white_is_no_error(device):
     gaussians, views = scene()
     gaussians.sh[:, 0] = 30.0
     white = [replace(v, image=np.full_like(v.image, 255)) for v in views]
-    covered = [replace(v, mask=render(gaussians, v.camera).rgb.min(axis=2) > 1) for v in white]
+    covered = [replace(v, mask=render(gaussians, v.camera, device="reference").rgb.min(axis=2) > 1) for v in white]
     assert all(v.mask.sum() > 100 for v in covered)
-    prices = price(gaussians, covered, device=device)
+    prices = price(gaussians, covered, Renderer(device))
     # With r = 0 only |D|^2 is left; the excess over white would make removal a gain.
     assert (prices.errors >= 0).all()
 
@@ -80,21 +81,24 @@ def test_useless_gaussians_go_first(device, brightness):
     truth = synthetic_scene(25, 3)[0].astype(np.float32)
     truth.log_scales[:] = np.log(0.2)
     truth.logit_opacities[:] = 2.0
-    views = [View(str(i), c, to_uint8(render(truth, c).rgb * brightness)) for i, c in enumerate(cameras())]
+    views = [
+        View(str(i), c, to_uint8(render(truth, c, device="reference").rgb * brightness))
+        for i, c in enumerate(cameras())
+    ]
     useless = synthetic_scene(60, 4)[0].astype(np.float32)
     useless.means[:20] += 1000  # beside the picture
     useless.logit_opacities[20:] = -5.0  # alpha at most 1.7/255
     useless.sh[:, 1:] = 0
     mixed = Gaussians.concatenate([useless.take(np.arange(30)), truth, useless.take(np.arange(30, 60))])
     rounds = []
-    order = removal_order(mixed, views, lambda left: rounds.append(left) or len(left) < 25, device=device)
+    order = removal_order(mixed, views, lambda left: rounds.append(left) or len(left) < 25, Renderer(device))
     assert sorted(order) == list(range(85))
     # Of the picture's own, a few are hidden behind others.
     assert np.isin(order[:20], np.arange(30, 55)).all()
     assert len(rounds[0]) == int(0.85 * 85) and len(rounds[-1]) < 25 and len(rounds) > 5
     for left in rounds[:-1]:
         np.testing.assert_array_equal(mixed.take(np.sort(order[: len(left)])).means, left.means)
-    np.testing.assert_array_equal(order, removal_order(mixed, views, lambda left: len(left) < 25, device=device))
+    np.testing.assert_array_equal(order, removal_order(mixed, views, lambda left: len(left) < 25, Renderer(device)))
 
 
 def test_rounds_see_what_earlier_rounds_spoilt(device):
@@ -105,10 +109,10 @@ def test_rounds_see_what_earlier_rounds_spoilt(device):
     small = one.take(np.zeros(4, int))
     small.means[:, 0], small.log_scales[:], small.logit_opacities[:] = (-1.2, -0.8, 0.8, 1.2), np.log(0.18), 3.0
     both = Gaussians.concatenate([one, one, small])
-    views = [View(str(i), c, to_uint8(render(both, c).rgb)) for i, c in enumerate(cameras())]
-    prices = price(both, views, device=device)
+    views = [View(str(i), c, to_uint8(render(both, c, device="reference").rgb)) for i, c in enumerate(cameras())]
+    prices = price(both, views, Renderer(device))
     assert prices.errors[:2].max() < prices.errors[2:].min(), "each of the two alone seems to be worth little"
-    order = removal_order(both, views, lambda left: False, device=device)
+    order = removal_order(both, views, lambda left: False, Renderer(device))
     assert min(order.tolist().index(0), order.tolist().index(1)) == 0, "together they are worth most"
 
 
@@ -121,11 +125,11 @@ def test_what_would_add_to_an_error_goes_last(device):
     for first in (0, 1):
         photo = pair.take(np.arange(2))
         photo.sh[first, 0] = 1.0
-        view = View("photo", camera, to_uint8(render(photo, camera).rgb))
-        prices = price(pair, [view], device=device)
+        view = View("photo", camera, to_uint8(render(photo, camera, device="reference").rgb))
+        prices = price(pair, [view], Renderer(device))
         assert prices.differences[0] == pytest.approx(prices.differences[1], rel=1e-3)
         assert prices.errors[first] > 1.5 * prices.errors[1 - first]
-        assert removal_order(pair, [view], lambda left: True, device=device)[0] == first
+        assert removal_order(pair, [view], lambda left: True, Renderer(device))[0] == first
 
 
 def test_degrees():
@@ -150,4 +154,4 @@ def test_nothing_to_price_is_an_error():
     gaussians, views = scene()
     for arguments in ((gaussians, []), (gaussians.take(np.arange(0)), views)):
         with pytest.raises(InputError, match="expected at least one each"):
-            price(*arguments)
+            price(*arguments, Renderer("reference"))

@@ -13,11 +13,12 @@ import pytest
 from browser import browser, wait_for
 
 from clsplat.camera import Camera
-from clsplat.config import RenderConfig, TrainConfig
+from clsplat.config import TrainConfig
 from clsplat.errors import DeviceError, InputError
 from clsplat.metrics import psnr, to_uint8
 from clsplat.ops import count_pairs
-from clsplat.render import forward, render, upload
+from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
 from clsplat.show.camera_paths import first_photo
 from clsplat.show.viewer import FRAME_TIME, MODES, STILL_AFTER, Viewer, client_camera, picture, whole_view, wxyz_of
@@ -64,7 +65,7 @@ def test_a_window_shows_the_whole_photo(window):
 class TestPicture:
     def test_render_is_ours(self, device):
         gaussians, (camera, *_) = cameras()
-        frame, legend = picture(device, upload(device, gaussians), camera, RenderConfig(), (1.0, 0.0, 0.5), "render")
+        frame, legend = picture(Renderer(device, background=(1.0, 0.0, 0.5)), gaussians, camera, "render")
         ours = render(gaussians, camera, device=device, background=(1.0, 0.0, 0.5))
         np.testing.assert_array_equal(frame, to_uint8(ours.rgb))
         assert legend == ""
@@ -74,8 +75,7 @@ class TestPicture:
         gaussians.logit_opacities[:] = 4
         ours = render(gaussians, camera, device=device, depth=True)
         shown = {
-            mode: picture(device, upload(device, gaussians), camera, RenderConfig(), (0.0, 0.0, 0.0), mode)
-            for mode in MODES
+            mode: picture(Renderer(device, background=(0.0, 0.0, 0.0)), gaussians, camera, mode) for mode in MODES
         }
         alpha = np.repeat(ours.alpha[:, :, None], 3, axis=2)
         np.testing.assert_array_equal(shown["alpha"][0], to_uint8(alpha))
@@ -86,7 +86,7 @@ class TestPicture:
         assert np.corrcoef(brightness, ours.depth[solid])[0, 1] < -0.8, "near must be bright"
         near, far = np.percentile(ours.depth[solid], [2, 98])
         assert f"bright {near:.3g}, dark {far:.3g}" in shown["depth"][1]
-        run = forward(device, upload(device, gaussians), camera, RenderConfig(), np.zeros(3), 0, gradients=False)
+        run = Renderer(device).forward(gaussians, camera, 0, gradients=False)
         count = count_pairs(device, run.splats, run.bins)[1].get()
         assert f"bright {count.max()} Gaussians per pixel; mean {count.mean():.1f}" in shown["count"][1]
         order = np.argsort(count, axis=None)[[0, -1]]
@@ -96,7 +96,7 @@ class TestPicture:
     def test_an_empty_view_has_no_depth(self, device):
         gaussians, (camera, *_) = cameras()
         gaussians.logit_opacities[:] = -20
-        frame, legend = picture(device, upload(device, gaussians), camera, RenderConfig(), (1.0, 1.0, 1.0), "depth")
+        frame, legend = picture(Renderer(device, background=(1.0, 1.0, 1.0)), gaussians, camera, "depth")
         assert not frame.any()
         assert legend == "nothing opaque in view"
 
@@ -105,7 +105,7 @@ def test_without_viser_it_says_how_to_get_it(device, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     cams = cameras()[1]
     with pytest.raises(InputError, match=r"pip install 'clsplat\[viewer\]'"):
-        Viewer(device, RenderConfig(), first_photo(cams), [], (0.0, 0.0, 0.0))
+        Viewer(Renderer(device), first_photo(cams), [])
 
 
 @pytest.fixture
@@ -113,7 +113,7 @@ def viewer(device):
     """Of five cameras; its clients are what a test makes of it."""
     pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
     cams = cameras()[1]
-    result = Viewer(device, RenderConfig(), first_photo(cams), views_of(cams), (0.0, 0.0, 0.0), port=18080)
+    result = Viewer(Renderer(device), first_photo(cams), views_of(cams), port=18080)
     yield result
     result.close()
 
@@ -210,7 +210,7 @@ def small_training(device, out, progress=lambda record: None, **options):
     points = gaussians.means[:100].astype(np.float64)
     scene = Scene(photos, [], points, np.full((100, 3), 128, np.uint8))
     config = TrainConfig(strategy="adc", size="fixed", iterations=12, max_gaussians=150, eval_every=0, **options)
-    return train(scene, config, device, out, progress=progress)
+    return train(scene, config, out, device, progress=progress)
 
 
 @pytest.mark.parametrize("optimizer", ["device", "numpy"])
@@ -304,7 +304,7 @@ def test_a_browser_shows_our_render_and_jumps_to_a_clicked_camera(viewer, device
             page.click(*page.evaluate(MODE_BOX))
             wait_for(lambda: page.evaluate(CHOOSE_ALPHA), "the list of modes")
             wait_for(lambda: client.shown.mode == "alpha" and client.shown.share == 1, "a frame of another mode")
-            alpha = picture(device, upload(device, gaussians), whole[1], RenderConfig(), (0.0, 0.0, 0.0), "alpha")[0]
+            alpha = picture(Renderer(device, background=(0.0, 0.0, 0.0)), gaussians, whole[1], "alpha")[0]
             # 25 dB: a JPEG; without the frusta, that hide nothing any more.
             wait_for(lambda: psnr(page.screenshot()[200:], alpha[200:]) > 25, "alpha")
     finally:

@@ -41,5 +41,5 @@ def test_training_is_the_same_a_million_units_away(device, tmp_path):
     there = _near_origin(Scene(far(scene.train), far(scene.test), scene.points + offset, scene.colors))
     assert np.abs(there.offset - offset).max() < 10
     config = replace(CONFIG, iterations=100)
-    psnrs = [mean_metrics(train(s, config, device, tmp_path), s.test, device=device)["psnr"] for s in (scene, there)]
+    psnrs = [mean_metrics(train(s, config, tmp_path, device), s.test, device=device)["psnr"] for s in (scene, there)]
     assert abs(psnrs[0] - psnrs[1]) < 0.01

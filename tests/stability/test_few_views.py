@@ -1,6 +1,5 @@
 """Few photos, which many arrangements of Gaussians explain alike (Park et al. 2025, "DropGaussian")."""
 
-import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 
 from clsplat.bench.stability.small import CONFIG, small_scene, with_train
 from clsplat.evaluate import mean_metrics
+from clsplat.renderer import Renderer
 from clsplat.training import few_views
 from clsplat.training.loop import train
 
@@ -31,7 +31,7 @@ def test_three_photos_are_not_learned_by_heart(scene, device, tmp_path):
     psnr = {}
     plain = replace(CONFIG, iterations=400, max_gaussians=1000)
     for config in (plain, few_views.adapted(plain, scene)):
-        psnr[config != plain] = mean_metrics(train(scene, config, device, tmp_path), scene.test, device=device)[
+        psnr[config != plain] = mean_metrics(train(scene, config, tmp_path, device), scene.test, device=device)[
             "psnr"
         ]
     # Measured: 20.5 dB and 26.2 dB.
@@ -52,17 +52,16 @@ def test_what_changes_where_photos_are_few(scene):
 
 
 def test_dropout_is_part_of_the_training_and_rises(scene, device, tmp_path, monkeypatch):
-    module = importlib.import_module("clsplat.train")  # the package has a function of this name
-    rates, forward = [], module.forward
+    rates, forward = [], Renderer.forward
 
     def watched(*args, **options):
         rates.append(options["dropout"].rate)
         return forward(*args, **options)
 
     config = replace(CONFIG, iterations=21, dropout=0.2)
-    monkeypatch.setattr(module, "forward", watched)
-    found = train(scene, config, device, tmp_path)
+    monkeypatch.setattr(Renderer, "forward", watched)
+    found = train(scene, config, tmp_path, device)
     np.testing.assert_allclose(rates, np.linspace(0, 0.2, 21))
     monkeypatch.undo()
-    without = train(scene, replace(config, dropout=0.0), device, tmp_path)
+    without = train(scene, replace(config, dropout=0.0), tmp_path, device)
     assert (found.means != without.means).any()

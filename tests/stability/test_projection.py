@@ -11,7 +11,8 @@ from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.constants import FRUSTUM_MARGIN
 from clsplat.gaussians import Gaussians
-from clsplat.render import render, upload
+from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.testing import synthetic_scene
 
 
@@ -31,7 +32,7 @@ def test_needles_keep_their_determinant(device):
     gaussians.means[:] = rng.uniform(-0.3, 0.3, (200, 3))
     gaussians.log_scales[:] = np.log([40.0, 1e-3, 1e-3])
     needles = gaussians.astype(np.float32)
-    found = ops.project_fwd(device, upload(device, needles), camera, 0)
+    found = ops.project_fwd(device, Renderer(device).place(needles), camera, 0)
     expected = reference.project_fwd(needles, camera, 0)
     shown = expected.extents[:, 0] > 1000
     assert shown.sum() > 50, "the needles must be long"
@@ -45,7 +46,7 @@ def test_extents_stay_bounded_beside_the_image(any_device):
     camera = Camera(np.eye(4), 50, 50, 50, 50, 100, 100)
     gaussians = replace(synthetic_scene(3)[0], means=np.array([[0, 0, 1.0], [2, 0, 1], [40, 0, 1]]) * 0.0105)
     gaussians.log_scales[:] = np.log(0.5)
-    splats = ops.project_fwd(any_device, upload(any_device, gaussians), camera, 0)
+    splats = ops.project_fwd(any_device, Renderer(any_device).place(gaussians), camera, 0)
     extents, logits = splats.extents.get()[:, 0], splats.opacities.get()
     r = np.sqrt(2 * np.log(255 * logits))
     expected = np.sqrt(1 + (1 + FRUSTUM_MARGIN) ** 2)

@@ -21,5 +21,5 @@ if __name__ == "__main__":
             rows = order[: int(factor * count)]
             fewer = replace(scene, points=scene.points[rows], colors=scene.colors[rows])
             with tempfile.TemporaryDirectory() as folder:
-                gaussians = train(fewer, replace(CONFIG, size="fixed"), device, Path(folder))
+                gaussians = train(fewer, replace(CONFIG, size="fixed"), Path(folder), device)
             print(f"{count} known, {len(gaussians)} trained: {held_out(gaussians, scene, device):.2f} dB", flush=True)

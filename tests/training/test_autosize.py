@@ -15,27 +15,26 @@ from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, to_uint8
 from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
 from clsplat.training.autosize.explanation import size_chart
+from clsplat.training.autosize.reduction import costliest_rows, unvalidated
 from clsplat.training.autosize.rule import (
-    Point,
+    Candidate,
     Search,
     Trial,
-    can_search,
-    costliest_rows,
+    candidate,
     halvings,
-    looks,
     most_grown,
     most_identifiable,
-    next_trial,
-    point,
+    next_phase,
     sh_bytes,
-    split,
-    stops,
-    surely_short,
-    unvalidated,
+    surely_too_few,
+    trial_bounds,
+    validation_times,
 )
+from clsplat.training.autosize.validation import can_validate, split
 from clsplat.training.loop import train
 
 NOISE = 0.03
@@ -100,16 +99,16 @@ def test_blocks_of_some_photos_validate() -> None:
     assert np.all(sum(mask.astype(int) for mask in held.values()) <= 4), "no place of all photos is missing"
     alone = split([views[0], views[5]])
     assert [view.name for view in alone[1]] == ["0"], "a photo without a pixel that counts cannot validate"
-    assert can_search(views[:8]) and not can_search(views[:7])
+    assert can_validate(views[:8]) and not can_validate(views[:7])
 
 
 @pytest.mark.parametrize(("larger", "pays"), [(30.04, True), (30.06, False)])
 def test_half_the_gaussians_pay_if_they_lose_less_than_half_a_price(larger: float, pays: bool) -> None:
     """At 0.1 dB per doubling a loss of 0.05 dB pays for 1 / sqrt(2) of the Gaussians."""
     config = replace(CONFIG, size_price=0.1)
-    smaller = point(1, 362, 3, [[30.0, 31.0, 35.0]], config)
+    smaller = candidate(1, 362, 3, [[30.0, 31.0, 35.0]], config)
     photos = np.array([30.0, 31.0, 35.0]) + larger - 30 + 0.03 * np.array([-1, 0, 1])
-    trial = Trial(False, smaller, point(1, 512, 3, [photos.tolist()], config))
+    trial = Trial(False, smaller, candidate(1, 512, 3, [photos.tolist()], config))
     assert trial.gain == pytest.approx(larger - 30) and trial.price == pytest.approx(0.05, rel=1e-3)
     assert trial.takes_smaller == pays
 
@@ -119,7 +118,7 @@ def test_the_photos_in_the_middle_tell_the_gain() -> None:
     McLaughlin 1963): that of the winsorised differences, over the half that counts."""
     differences = np.array([9.0, 0.5, 0.3, 0.1, 0.2, 0.0, -0.1, -0.2, 0.05, -0.3, -0.6, -7.0])
     views = np.linspace(25, 30, 12)
-    sides = (point(1, n, 3, [v.tolist()], CONFIG) for n, v in ((100, views), (141, views + differences)))
+    sides = (candidate(1, n, 3, [v.tolist()], CONFIG) for n, v in ((100, views), (141, views + differences)))
     trial = Trial(False, *sides)
     assert trial.gain == pytest.approx(np.mean([0.1, 0.2, 0.0, -0.1, -0.2, 0.05]))
     winsorised = np.clip(differences, -0.2, 0.2)
@@ -132,12 +131,12 @@ def test_growth_goes_on_unless_it_surely_hurts() -> None:
     smaller = [30.0, 31.0, 25.0]
     for errors, hurts in (((-0.15, -0.10, -0.05), True), ((-0.27, -0.10, 0.07), False), ((0.03, 0.01, 0.02), False)):
         sides = (
-            point(1, n, 3, [views], CONFIG) for n, views in ((100, smaller), (200, list(np.add(smaller, errors))))
+            candidate(1, n, 3, [views], CONFIG) for n, views in ((100, smaller), (200, list(np.add(smaller, errors))))
         )
         trial = Trial(True, *sides)
         assert trial.takes_smaller == hurts, errors
         assert trial.gain < trial.price
-    same = point(1, 100, 3, [smaller], CONFIG)
+    same = candidate(1, 100, 3, [smaller], CONFIG)
     assert Trial(True, same, same).takes_smaller, "nothing has grown"
 
 
@@ -147,23 +146,23 @@ def test_growth_that_pays_many_times_needs_no_trial() -> None:
 
     def grown(gain: float) -> list[Trial]:
         """By a factor of sqrt(2)."""
-        sides = (point(1, n, 3, [[psnr, psnr]], CONFIG) for n, psnr in ((1000, 30.0), (1414, 30 + gain / 2)))
+        sides = (candidate(1, n, 3, [[psnr, psnr]], CONFIG) for n, psnr in ((1000, 30.0), (1414, 30 + gain / 2)))
         return [Trial(True, *sides)]
 
-    assert surely_short([], 0.1) == 0
-    assert surely_short(grown(1.6), 0.1) == pytest.approx(4 * 1414, rel=1e-3)
-    assert surely_short(grown(0.1001), 0.1) == pytest.approx(1414, rel=1e-2)
-    assert surely_short(grown(0.09), 0.1) == surely_short(grown(-3.0), 0.1) == 0, "at once"
+    assert surely_too_few([], 0.1) == 0
+    assert surely_too_few(grown(1.6), 0.1) == pytest.approx(4 * 1414, rel=1e-3)
+    assert surely_too_few(grown(0.1001), 0.1) == pytest.approx(1414, rel=1e-2)
+    assert surely_too_few(grown(0.09), 0.1) == surely_too_few(grown(-3.0), 0.1) == 0, "at once"
     config = replace(CONFIG, iterations=2000, size_price=0.1)
     for most, todo in ((5500, "grow"), (5700, "try")):
-        assert next_trial(Search(most, grown(1.6)), 600, config, 10**6) == todo
-    same = point(1, 100, 3, [[30.0, 31.0]], CONFIG)
-    assert surely_short([Trial(True, same, same)], 0.1) == 0, "nothing has grown"
+        assert next_phase(Search(most, grown(1.6)), 600, config, 10**6) == todo
+    same = candidate(1, 100, 3, [[30.0, 31.0]], CONFIG)
+    assert surely_too_few([Trial(True, same, same)], 0.1) == 0, "nothing has grown"
 
 
 def test_windows_of_growth_end_where_the_next_trial_is_due() -> None:
     """By sqrt(2) in a trial, by 2 without one, but no further than growth surely pays, or the bound."""
-    sides = (point(1, n, 3, [[psnr, psnr]], CONFIG) for n, psnr in ((1000, 30.0), (1414, 30.8)))
+    sides = (candidate(1, n, 3, [[psnr, psnr]], CONFIG) for n, psnr in ((1000, 30.0), (1414, 30.8)))
     grown = [Trial(True, *sides)]
     config = replace(CONFIG, size_price=0.1)
     for most, todo, expected in (
@@ -171,7 +170,7 @@ def test_windows_of_growth_end_where_the_next_trial_is_due() -> None:
         (1414, "grow", 2828),
         (4000, "grow", 5657),
         (4000, "rest", 4000),
-        (4000, "shrink", 4000),
+        (4000, "prune", 4000),
     ):
         assert most_grown(Search(most, grown), todo, config, 10**6) == pytest.approx(expected, rel=1e-3), todo
     for todo in ("try", "grow"):
@@ -182,7 +181,11 @@ def test_windows_of_growth_end_where_the_next_trial_is_due() -> None:
 
 def trials_of(grows: bool, *takes_smaller: bool) -> list[Trial]:
     return [
-        Trial(grows, Point(1, 100, 0, 30.0, [30.0, 31.0], 0.0), Point(1, 200, 0, psnr, [psnr, psnr + 1], 0.5 - won))
+        Trial(
+            grows,
+            Candidate(1, 100, 0, 30.0, [30.0, 31.0], 0.0),
+            Candidate(1, 200, 0, psnr, [psnr, psnr + 1], 0.5 - won),
+        )
         for won in takes_smaller
         for psnr in [29.0 if won else 31.0]
     ]
@@ -198,21 +201,21 @@ def test_trials_follow_each_other() -> None:
         ([True, False, True], "try"),
         ([False, True, True], "try"),
     ):
-        assert next_trial(Search(100, trials_of(True, *lost)), 600, config, 1000) == todo, lost
-    assert next_trial(Search(100), 1000, config, 1000) == "rest", "in the middle of the run"
-    assert next_trial(Search(100), 200, config, 100) == "rest", "at the cap"
+        assert next_phase(Search(100, trials_of(True, *lost)), 600, config, 1000) == todo, lost
+    assert next_phase(Search(100), 1000, config, 1000) == "rest", "in the middle of the run"
+    assert next_phase(Search(100), 200, config, 100) == "rest", "at the cap"
     # What growth came to does not matter to pruning.
     grown = trials_of(True, False, False)
     cases: tuple[tuple[list[bool], int, str], ...] = (
-        ([], 1200, "shrink"),
-        ([True], 1300, "shrink"),
-        ([True, False], 1400, "shrink"),
-        ([False, False], 1400, "shrink"),
+        ([], 1200, "prune"),
+        ([True], 1300, "prune"),
+        ([True, False], 1400, "prune"),
+        ([False, False], 1400, "prune"),
         ([False, False, False], 1500, "settle"),
         ([True] * 5, 1700, "settle"),
     )
     for pruned, iteration, todo in cases:
-        assert next_trial(Search(100, [*grown, *trials_of(False, *pruned)]), iteration, config, 1000) == todo, pruned
+        assert next_phase(Search(100, [*grown, *trials_of(False, *pruned)]), iteration, config, 1000) == todo, pruned
 
 
 def test_steps_of_pruning_grow_while_they_pay() -> None:
@@ -243,19 +246,22 @@ def test_parameters_are_no_more_than_values() -> None:
 def test_worth_counts_doublings_of_bytes() -> None:
     config = replace(CONFIG, size_price=0.25)
     assert [sh_bytes(d) for d in range(4)] == [56, 92, 152, 236]
-    small, large = point(1, 64, 0, [[20.0, 21.0], [20.0, 23.0]], config), point(1, 128, 3, [[20.0, 22.0]], config)
+    small, large = (
+        candidate(1, 64, 0, [[20.0, 21.0], [20.0, 23.0]], config),
+        candidate(1, 128, 3, [[20.0, 22.0]], config),
+    )
     assert small.views == large.views == [20, 22], "the mean of all looks, photo by photo"
     assert small.psnr == 21 and small.worth == pytest.approx(21 - 0.25 * np.log2(64 * 56))
     assert small.worth - large.worth == pytest.approx(0.25 * (1 + np.log2(236 / 56)))
 
 
 def test_stops_are_within_the_run() -> None:
-    assert stops(replace(CONFIG, iterations=2000)) == [*range(200, 1001, 200), *range(1200, 1701, 100)]
-    assert stops(replace(CONFIG, iterations=7000))[:3] == [700, 1400, 2100]
-    found = sorted(looks(replace(CONFIG, iterations=2000)))
+    assert trial_bounds(replace(CONFIG, iterations=2000)) == [*range(200, 1001, 200), *range(1200, 1701, 100)]
+    assert trial_bounds(replace(CONFIG, iterations=7000))[:3] == [700, 1400, 2100]
+    found = sorted(validation_times(replace(CONFIG, iterations=2000)))
     assert found[:4] == [350, 400, 550, 600] and found[-1] == 1700
     for iterations in (1, 2, 3, 10, 19):
-        found = stops(replace(CONFIG, iterations=iterations))
+        found = trial_bounds(replace(CONFIG, iterations=iterations))
         assert found and 1 <= found[0] and found[-1] <= iterations
 
 
@@ -268,7 +274,7 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     # A price at which the start is not the best.
     config = replace(CONFIG, iterations=200, checkpoint_every=1000, size_price=8.0)
     sizes: list[int] = []
-    whole = train(scene, config, device, tmp_path / "whole", progress=lambda r: sizes.append(r["num_gaussians"]))
+    whole = train(scene, config, tmp_path / "whole", device, progress=lambda r: sizes.append(r["num_gaussians"]))
     report = json.loads((tmp_path / "whole" / "size.json").read_text())
     trials = report["trials"]
     assert [trial["n"] for trial in trials][:2] == [[56, 80], [28, 56]] and max(sizes) == 80
@@ -295,8 +301,8 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            train(scene, config, device, tmp_path / "parts", resume=iteration > 132, progress=interrupt)
-    resumed = train(scene, config, device, tmp_path / "parts", resume=True)
+            train(scene, config, tmp_path / "parts", device, resume=iteration > 132, progress=interrupt)
+    resumed = train(scene, config, tmp_path / "parts", device, resume=True)
     assert len(resumed) == len(whole)
     for name, array in whole.arrays().items():
         assert resumed.arrays()[name].tobytes() == array.tobytes(), name
@@ -310,7 +316,7 @@ def test_a_step_leaves_what_the_photos_would_miss(device: Device) -> None:
     gaussians.means[:20] = scene.points
     gaussians.logit_opacities[:] = 2
     gaussians.logit_opacities[20:] = -5
-    rows = costliest_rows(gaussians, 0.7, scene.train, CONFIG, device)
+    rows = costliest_rows(gaussians, 0.7, scene.train, Renderer(device))
     assert len(rows) == 19 and set(rows) <= set(range(20))
 
 
@@ -319,7 +325,7 @@ def test_blocks_that_validate_have_no_say_in_prices(device: Device) -> None:
     scene = known_scene(5, device, copies=1, views=20)
     gaussians = synthetic_scene(9, 4)[0].astype(np.float32)
     training, _ = split(scene.train)
-    shown = unvalidated(gaussians, scene.train, CONFIG, device)
+    shown = unvalidated(gaussians, scene.train, Renderer(device))
     assert [view.name for view in shown] == [view.name for view in scene.train]
     for part, view, whole in zip(training, shown, scene.train, strict=True):
         if part is whole:
@@ -336,7 +342,7 @@ def test_a_fifth_of_many_photos_says_what_gaussians_are_worth(photos: int, prici
     gaussians = synthetic_scene(9, 4)[0].astype(np.float32)
     camera = Camera.look_at((0, 0, -5), (0, 0, 0), (0, 1, 0), 20, 16, 16)
     view = View("photo", camera, np.zeros((16, 16, 3), np.uint8))
-    assert len(unvalidated(gaussians, [view] * photos, CONFIG, device)) == pricing
+    assert len(unvalidated(gaussians, [view] * photos, Renderer(device))) == pricing
 
 
 def test_flat_walls_need_little(device: Device, tmp_path: Path) -> None:
@@ -345,7 +351,7 @@ def test_flat_walls_need_little(device: Device, tmp_path: Path) -> None:
     scene = known_scene(20, device, copies=10)
     walls = [replace(view, image=np.full_like(view.image, 128)) for view in (*scene.train, *scene.test)]
     scene = replace(scene, train=walls[::2], test=walls[1::2])
-    gaussians = train(scene, TrainConfig(iterations=600), device, tmp_path)
+    gaussians = train(scene, TrainConfig(iterations=600), tmp_path, device)
     assert len(gaussians) < 70 and held_out(gaussians, scene, device) > 48
     trials = json.loads((tmp_path / "size.json").read_text())["trials"]
     assert max(max(trial["psnr"]) for trial in trials) <= 20 * np.log10(255)
@@ -357,7 +363,7 @@ def test_too_few_photos_to_validate(device: Device, tmp_path: Path) -> None:
     error = ErrorConfig(start=1, every=1)
     config = replace(CONFIG, iterations=20, strategy="error", error=error)
     assert len(scene.train) == 6
-    gaussians = train(scene, config, device, tmp_path)
+    gaussians = train(scene, config, tmp_path, device)
     assert len(gaussians) <= 5 and not (tmp_path / "size.json").exists()
 
 
@@ -373,6 +379,6 @@ def test_it_finds_the_size_of_known_scenes(
     quality (tests/training/measure_known.py). Measured: 127, 255 and 511 Gaussians, 31.6, 31.0 and 30.4 dB.
     """
     scene = known_scene(count, device, copies=8)
-    gaussians = train(scene, CONFIG, device, tmp_path)
+    gaussians = train(scene, CONFIG, tmp_path, device)
     assert plateau / 1.5 <= len(gaussians) <= 1.5 * plateau
     assert held_out(gaussians, scene, device) > best - 0.2

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from clsplat.config import RenderConfig
 from clsplat.device import Device
 from clsplat.metrics import to_uint8
 from clsplat.reference.composite import hits
-from clsplat.render import forward, render, upload
+from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.scene import View
 from clsplat.testing import synthetic_scene
 from clsplat.training.contributions import contributions
@@ -23,17 +23,18 @@ def test_weights_and_errors_are_those_of_the_pixels(device: Device, on_device: b
     gaussians = gaussians.astype(np.float32)
     rng = np.random.default_rng(0)
     image = to_uint8(
-        render(gaussians, camera, background=BACKGROUND).rgb + rng.normal(0, 0.2, (camera.height, camera.width, 3))
+        render(gaussians, camera, background=BACKGROUND, device="reference").rgb
+        + rng.normal(0, 0.2, (camera.height, camera.width, 3))
     )
     mask = rng.random((camera.height, camera.width)) < 0.5 if masked else None
     views = [View("a.png", camera, image, mask), View("b.png", camera, 255 - image)]
-    given = upload(device, gaussians) if on_device else gaussians
-    found = contributions(device, given, views, RenderConfig(), np.array(BACKGROUND), 3)
+    given = Renderer(device).place(gaussians) if on_device else gaussians
+    found = contributions(Renderer(device, background=BACKGROUND), given, views, 3)
 
-    run = forward(None, upload(None, gaussians), camera, RenderConfig(), np.array(BACKGROUND), 3)
+    run = Renderer("reference", background=BACKGROUND).forward(gaussians, camera, 3)
     expected = Contributions(np.zeros(N), np.zeros(N), np.zeros(N))
     for view in views:
-        residuals = run.image.image - view.image / 255
+        residuals = run.image.rgb - view.image / 255
         counted = np.ones(residuals.shape[:2]) if view.mask is None else view.mask.astype(float)
         squares = (residuals**2).sum(axis=2) * counted
         transmittance = np.empty(squares.shape)
@@ -43,7 +44,7 @@ def test_weights_and_errors_are_those_of_the_pixels(device: Device, on_device: b
             expected.errors[hit.splat] += (weight * squares[hit.box]).sum()
         for i in range(0, N, 7):
             without = gaussians.take(np.delete(np.arange(N), i))
-            left = render(without, camera, background=BACKGROUND).rgb - view.image / 255
+            left = render(without, camera, background=BACKGROUND, device="reference").rgb - view.image / 255
             expected.prices[i] += ((left**2).sum(axis=2) * counted).sum() - squares.sum()
     assert (expected.weights > 0).any()
     # float32: sums over some thousand pixels; of each a fraction of the largest.

@@ -13,6 +13,7 @@ from clsplat.testing import synthetic_scene
 from clsplat.training.densify import STRATEGIES, Contributions, Strategy
 from clsplat.training.densify.adc import CHILD_SHRINK, Adc
 from clsplat.training.densify.schedule import Schedule
+from clsplat.training.densify.strategy import MOST_GAUSSIANS
 
 N = 200
 CONFIG = TrainConfig(strategy="adc", size="fixed", iterations=2000, adc=AdcConfig(start=350))
@@ -58,7 +59,7 @@ def test_edits_are_consistent_capped_and_repeatable(
     for _ in range(2):
         instance, gaussians = observed(config, strategy=strategy)
         before = gaussians.astype(np.float32)
-        edit = instance.edit(iteration, gaussians, survey)
+        edit = instance.edit(iteration, gaussians, cap, survey)
         assert all((a == b).all() for a, b in zip(before.arrays().values(), gaussians.arrays().values(), strict=True))
         m = len(edit.gaussians.validate())
         assert 0 < m <= cap
@@ -74,7 +75,7 @@ def test_edits_are_consistent_capped_and_repeatable(
 
 def test_small_gaussians_are_cloned_and_large_ones_split() -> None:
     strategy, gaussians = observed(rows=slice(N // 2 - 1, N // 2 + 1))
-    edit = strategy.edit(100, gaussians, survey)
+    edit = strategy.edit(100, gaussians, MOST_GAUSSIANS, survey)
     assert len(edit.rows) == N + 2
     small, large = N // 2 - 1, N // 2
     clones = np.flatnonzero(edit.rows == small)
@@ -98,7 +99,7 @@ def test_splits_are_distributed_as_the_parent() -> None:
     gaussians.quats[:] = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]  # a quarter turn about z: x goes to y
     strategy = Adc(CONFIG, 1.0, len(gaussians))
     strategy.observe(reference, np.ones((4000, 2)), np.full((4000, 2), 1.0), *SIZE)
-    edit = strategy.edit(100, gaussians, survey)
+    edit = strategy.edit(100, gaussians, MOST_GAUSSIANS, survey)
     spread = (edit.gaussians.means - gaussians.means[0]).std(axis=0)
     # 8000 draws: the standard deviation is known to 1/sqrt(16000) = 0.8 %, four of which are 3 %.
     np.testing.assert_allclose(spread, [0.1, 0.5, 0.05], rtol=0.03)
@@ -107,11 +108,11 @@ def test_splits_are_distributed_as_the_parent() -> None:
 def test_transparent_gaussians_go_but_never_all() -> None:
     strategy, gaussians = observed(rows=slice(0, 0))
     gaussians.logit_opacities[:3] = logit(np.float32(0.004))
-    edit = strategy.edit(100, gaussians, survey)
+    edit = strategy.edit(100, gaussians, MOST_GAUSSIANS, survey)
     assert edit.rows.tolist() == list(range(3, N))
     strategy, gaussians = observed(rows=slice(0, 0))
     gaussians.logit_opacities[:] = logit(np.float32(0.001)) + np.linspace(0, 1, N, dtype=np.float32)
-    edit = strategy.edit(100, gaussians, survey)
+    edit = strategy.edit(100, gaussians, MOST_GAUSSIANS, survey)
     assert edit.rows.tolist() == list(range(N - CONFIG.adc.min_gaussians, N))
 
 
@@ -119,22 +120,21 @@ def test_huge_gaussians_go_only_after_a_reset() -> None:
     for iteration, remaining in ((100, N), (400, N // 2)):
         config = replace(CONFIG, adc=replace(CONFIG.adc, reset_every=300))
         strategy, gaussians = observed(config, rows=slice(0, 0))
-        edit = strategy.edit(iteration, gaussians, survey)
+        edit = strategy.edit(iteration, gaussians, MOST_GAUSSIANS, survey)
         assert len(edit.rows) == remaining
 
 
 def test_the_cap_takes_the_largest_gradients_first() -> None:
-    config = replace(CONFIG, max_gaussians=N + 2)
-    strategy, gaussians = observed(config)
+    strategy, gaussians = observed()
     strategy.statistics["grad_sum"][[7, 11]] *= 3
-    edit = strategy.edit(100, gaussians, survey)
+    edit = strategy.edit(100, gaussians, N + 2, survey)
     assert sorted(edit.rows[edit.fresh].tolist()) == [7, 11]
 
 
 def test_reset_lowers_opacities_and_clears_their_moments() -> None:
     config = replace(CONFIG, adc=replace(CONFIG.adc, reset_every=150))
     strategy, gaussians = observed(config)
-    edit = strategy.edit(150, gaussians, survey)
+    edit = strategy.edit(150, gaussians, MOST_GAUSSIANS, survey)
     assert edit.reset_opacities
     np.testing.assert_allclose(edit.gaussians.opacities, config.adc.reset_opacity, rtol=1e-5)
     # Nothing else changed: 150 is no multiple of `every`.
@@ -146,10 +146,10 @@ def test_opacities_decay_in_the_place_of_resets() -> None:
     strategy, gaussians = observed(config, rows=slice(0, 0))
     gaussians.logit_opacities[:16] = -200  # of opacity 0; the least number keeps them
     gaussians.logit_opacities[16:] = [-300] * (N - 16)
-    edit = strategy.edit(100, gaussians, survey)
+    edit = strategy.edit(100, gaussians, MOST_GAUSSIANS, survey)
     assert np.isfinite(edit.gaussians.logit_opacities).all()
     strategy, gaussians = observed(config, rows=slice(0, 0))
-    edit = strategy.edit(100, gaussians, survey)
+    edit = strategy.edit(100, gaussians, MOST_GAUSSIANS, survey)
     assert not edit.reset_opacities
     np.testing.assert_allclose(edit.gaussians.opacities, 0.45, rtol=1e-5)
     assert not strategy.due(150), "nothing resets between rounds"
@@ -160,7 +160,7 @@ def test_on_white_the_first_round_resets(background: str) -> None:
     config = replace(CONFIG, data=replace(CONFIG.data, background=background))
     for iteration, resets in ((100, background == "white"), (200, False)):
         strategy, gaussians = observed(config, rows=slice(0, 0))
-        edit = strategy.edit(iteration, gaussians, survey)
+        edit = strategy.edit(iteration, gaussians, MOST_GAUSSIANS, survey)
         assert edit.reset_opacities == resets
         assert (edit.gaussians.opacities.max() < 0.02) == resets
 

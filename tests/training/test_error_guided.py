@@ -64,9 +64,8 @@ def test_opaque_parents_have_finite_children() -> None:
 def test_the_largest_errors_are_split() -> None:
     rng = np.random.default_rng(0)
     errors = rng.permutation(N).astype(float)
-    strategy = ErrorGuided(replace(CONFIG, max_gaussians=1000), 1.0, N)
-    strategy.max_gaussians = 1000
-    edit = strategy.edit(200, scene(), seeing(np.ones(N), errors))
+    strategy = ErrorGuided(CONFIG, 1.0, N)
+    edit = strategy.edit(200, scene(), 1000, seeing(np.ones(N), errors))
     target = strategy.schedule.count_after(200, N, 1000)
     assert N < len(edit.rows) == target < 1000
     parents = np.unique(edit.rows[edit.fresh])
@@ -87,7 +86,7 @@ def test_at_the_cap_those_of_least_price_make_room(harmful: int, gone: int) -> N
     gaussians = scene()
     gaussians.logit_opacities[order[70]] = logit(0.004)
     strategy = ErrorGuided(replace(CONFIG, error=ErrorConfig(replaced=0.05, replaced_most=0.2)), 1.0, N)
-    edit = strategy.edit(600, gaussians, seeing(weights, errors, prices))
+    edit = strategy.edit(600, gaussians, N, seeing(weights, errors, prices))
     assert len(edit.rows) == N
     assert np.setdiff1d(np.arange(N), edit.rows).tolist() == sorted([*order[:gone], order[70]])
     split_most = [i for i in order[::-1] if i != order[70]][: gone + 1]
@@ -99,12 +98,11 @@ def test_while_there_is_room_only_real_harm_goes() -> None:
     share = 2.0
     prices, errors = np.full(N, 1.0), np.full(N, share)
     prices[:5] = -HARM * share * np.array([0.9, 0.5, 0.1, 1.1, 3])
-    strategy = ErrorGuided(replace(CONFIG, max_gaussians=2 * N), 1.0, N)
-    strategy.max_gaussians = 2 * N
-    gone = np.setdiff1d(np.arange(N), strategy.edit(200, scene(), seeing(np.ones(N), errors, prices)).rows)
+    strategy = ErrorGuided(CONFIG, 1.0, N)
+    gone = np.setdiff1d(np.arange(N), strategy.edit(200, scene(), 2 * N, seeing(np.ones(N), errors, prices)).rows)
     assert gone.tolist() == [3, 4]
     prices[:] = -share
-    edit = strategy.edit(200, scene(), seeing(np.ones(N), errors, prices))
+    edit = strategy.edit(200, scene(), 2 * N, seeing(np.ones(N), errors, prices))
     assert len(np.setdiff1d(np.arange(N), edit.rows)) == CONFIG.error.replaced_most * N
 
 
@@ -112,19 +110,18 @@ def test_while_there_is_room_only_real_harm_goes() -> None:
 def test_none_makes_room_by_a_survey_of_few_photos(share: float, gone: int) -> None:
     """Neither the least useful nor those that do harm in it: the other photos may need them."""
     for cap in (N, 2 * N):
-        strategy = ErrorGuided(replace(CONFIG, max_gaussians=cap), 1.0, N)
-        strategy.max_gaussians = cap
+        strategy = ErrorGuided(CONFIG, 1.0, N)
         prices = np.full(N, 1.0)
         prices[:5] = -2 * HARM
-        edit = strategy.edit(200, scene(), seeing(np.ones(N), np.ones(N), prices, share))
+        edit = strategy.edit(200, scene(), cap, seeing(np.ones(N), np.ones(N), prices, share))
         assert len(np.setdiff1d(np.arange(N), edit.rows)) == gone
 
 
 def test_what_has_no_error_is_not_split() -> None:
     errors = np.zeros(N)
     errors[:3] = 1
-    strategy = ErrorGuided(replace(CONFIG, max_gaussians=2 * N), 1.0, N)
-    edit = strategy.edit(1500, scene(), seeing(np.zeros(N), errors))
+    strategy = ErrorGuided(CONFIG, 1.0, N)
+    edit = strategy.edit(1500, scene(), 2 * N, seeing(np.zeros(N), errors))
     assert len(edit.rows) == N + 3
 
 
@@ -132,5 +129,5 @@ def test_what_has_no_error_is_not_split() -> None:
 def test_nothing_lives(logit_opacity: float) -> None:
     gaussians = scene()
     gaussians.logit_opacities[:] = logit_opacity
-    edit = ErrorGuided(CONFIG, 1.0, N).edit(600, gaussians, seeing(np.ones(N), np.ones(N)))
+    edit = ErrorGuided(CONFIG, 1.0, N).edit(600, gaussians, N, seeing(np.ones(N), np.ones(N)))
     assert (edit.rows == np.arange(N)).all()

@@ -135,7 +135,7 @@ DISK_FULL = """
 import importlib, resource, sys
 from clsplat.cli import main
 
-train = importlib.import_module("clsplat.train")
+train = importlib.import_module("clsplat.training.recorder")
 save, saved = train.save_state, []
 def filling(path, *arguments):
     if path in saved:  # no file grows beyond 4 kB from the second checkpoint on
@@ -182,7 +182,7 @@ def test_a_device_that_fails_in_the_middle(
     arguments = ("train", dataset, "-o", tmp_path, *TRAIN)
     message = fails(capsys, *arguments)
     assert f"iteration 15: the OpenCL driver failed: clEnqueueNDRangeKernel failed: {reason}" in message
-    assert "--resume goes on from there" in message and str(tmp_path) in message
+    assert "--resume continues from it" in message and str(tmp_path) in message
     monkeypatch.undo()
     run(*arguments, "--resume")
     assert (tmp_path / "scene.ply").read_bytes() == whole

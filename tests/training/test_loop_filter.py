@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from test_loop import CONFIG, same, scene  # noqa: F401  (a fixture)
 
-from clsplat import ops, reference
+from clsplat import reference
 from clsplat.constants import FILTER_VARIANCE
-from clsplat.render import fetch
-from clsplat.training.autosize import rule as size
-from clsplat.training.checkpoint import load_state, move
-from clsplat.training.loop import _apply, _edit, filtered, initial_state, train
+from clsplat.renderer import fetch
+from clsplat.training.autosize import search
+from clsplat.training.checkpoint import load_state
+from clsplat.training.densify.strategy import MOST_GAUSSIANS
+from clsplat.training.loop import Training, train
+from clsplat.training.state import initial_state
 
 FILTERED = replace(CONFIG, filter_3d=True)
 
@@ -34,12 +36,12 @@ def test_nothing_is_thinner_than_the_filter(needles, device, tmp_path):
     evaluated = []
 
     def evaluate(gaussians):
-        evaluated.append(thinnest(gaussians, cameras))
+        evaluated.append(thinnest(fetch(gaussians), cameras))
         return {}
 
-    plain = train(needles, CONFIG, device, tmp_path / "False")
+    plain = train(needles, CONFIG, tmp_path / "False", device)
     config = replace(FILTERED, eval_every=10)
-    shown = train(needles, config, device, tmp_path / "True", evaluate=evaluate)
+    shown = train(needles, config, tmp_path / "True", device, evaluate=evaluate)
     assert thinnest(plain, cameras) < 0.5, "the scene must be too fine without the filter"
     assert thinnest(shown, cameras) > 0.99  # means have moved since the sizes were measured
     assert len(evaluated) == 6 and min(evaluated) > 0.99, "after an edit, too"
@@ -50,20 +52,20 @@ def test_nothing_is_thinner_than_the_filter(needles, device, tmp_path):
 @pytest.mark.parametrize("strategy", ["adc", "error"])
 def test_a_run_that_was_interrupted_ends_with_the_same_bits(needles, device, tmp_path, strategy):
     config = replace(FILTERED, strategy=strategy, max_gaussians=100)
-    whole = train(needles, config, device, tmp_path / "whole")
+    whole = train(needles, config, tmp_path / "whole", device)
 
     def stop(record):
         if record["iteration"] == 37:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(needles, config, device, tmp_path / "cut", progress=stop)
-    assert same(train(needles, config, device, tmp_path / "cut", resume=True), whole)
+        train(needles, config, tmp_path / "cut", device, progress=stop)
+    assert same(train(needles, config, tmp_path / "cut", device, resume=True), whole)
 
 
 def test_both_optimisers_train_alike(needles, device, tmp_path):
     ends = [
-        train(needles, replace(FILTERED, iterations=9, optimizer=o), device, tmp_path / o)
+        train(needles, replace(FILTERED, iterations=9, optimizer=o), tmp_path / o, device)
         for o in ("device", "numpy")
     ]
     for name in ("means", "log_scales", "logit_opacities", "sh"):  # spheres have no orientation but rounding
@@ -77,15 +79,12 @@ def test_a_reset_lowers_what_is_shown(needles, device, tmp_path):
     state = initial_state(needles, config)
     state.iteration = 30
     state.gaussians.logit_opacities[:] = 3
-    move(state, device)
-    on_device = state.gaussians
-    state.pixels = ops.pixel_sizes(device, on_device, [v.camera for v in needles.train])
-    before = fetch(filtered(state, device)).opacities
-    pixels = state.pixels
-    _apply(_edit(state, needles.train, config, device), state)
-    move(state, device)
-    state.pixels = pixels
-    after = fetch(filtered(state, device)).opacities
+    training = Training(needles, config, device, state)
+    training.refresh_filter()
+    before, pixels = fetch(state.shown(training.renderer)).opacities, state.filter.pixels
+    training.densify(MOST_GAUSSIANS)
+    state.filter.pixels = pixels
+    after = fetch(state.shown(training.renderer)).opacities
     assert before.min() < 0.1 < before.max(), "the filter must matter"
     np.testing.assert_allclose(after, np.minimum(before, config.adc.reset_opacity), rtol=1e-3)
 
@@ -95,15 +94,15 @@ def test_the_search_for_the_size_sees_what_is_shown(needles, device, tmp_path):
     config = replace(FILTERED, size="auto", iterations=100, size_price=8.0, checkpoint_every=1000)
     cameras = [view.camera for view in needles.train]
     validated = []
-    validate = size.validate
+    validate = search.validate
 
     def spy(gaussians, *rest):
-        validated.append(thinnest(gaussians, cameras))
+        validated.append(thinnest(fetch(gaussians), cameras))
         return validate(gaussians, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(size, "validate", spy)
-        whole = train(needles, config, device, tmp_path / "whole")
+        patch.setattr(search, "validate", spy)
+        whole = train(needles, config, tmp_path / "whole", device)
     assert len(validated) > 4 and min(validated) > 0.99
     assert len(whole) < len(needles.points) and thinnest(whole, cameras) > 0.99
 
@@ -112,5 +111,5 @@ def test_the_search_for_the_size_sees_what_is_shown(needles, device, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(needles, config, device, tmp_path / "cut", progress=stop)
-    assert same(train(needles, config, device, tmp_path / "cut", resume=True), whole)
+        train(needles, config, tmp_path / "cut", device, progress=stop)
+    assert same(train(needles, config, tmp_path / "cut", device, resume=True), whole)

@@ -65,7 +65,7 @@ def test_shares_never_die() -> None:
 def test_dead_gaussians_move_onto_live_ones() -> None:
     dead = 20
     strategy, gaussians = Mcmc(CONFIG, 1.0, N), scene(dead)
-    edit = strategy.edit(600, gaussians, survey)
+    edit = strategy.edit(600, gaussians, N, survey)
     assert len(edit.rows) == N  # full: nothing is added
     assert (edit.rows[:dead] >= dead).all()
     assert (edit.rows[dead:] == np.arange(dead, N)).all()
@@ -83,8 +83,8 @@ def test_dead_gaussians_move_onto_live_ones() -> None:
 
 
 def test_new_gaussians_are_added_to_relocated_ones() -> None:
-    strategy, gaussians = Mcmc(replace(CONFIG, max_gaussians=N + 50), 1.0, N), scene(20)
-    edit = strategy.edit(1600, gaussians, survey)  # growth is late: all at once
+    strategy, gaussians = Mcmc(CONFIG, 1.0, N), scene(20)
+    edit = strategy.edit(1600, gaussians, N + 50, survey)  # growth is late: all at once
     assert len(edit.rows) == N + 50
     assert edit.fresh[N:].all()
     assert (edit.fresh == (np.bincount(edit.rows)[edit.rows] > 1)).all()
@@ -95,8 +95,8 @@ def test_new_gaussians_are_added_to_relocated_ones() -> None:
 
 
 def test_nothing_lives() -> None:
-    strategy, gaussians = Mcmc(replace(CONFIG, max_gaussians=2 * N), 1.0, N), scene(N)
-    edit = strategy.edit(600, gaussians, survey)
+    strategy, gaussians = Mcmc(CONFIG, 1.0, N), scene(N)
+    edit = strategy.edit(600, gaussians, 2 * N, survey)
     assert (edit.rows == np.arange(N)).all() and not edit.fresh.any()
 
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from clsplat.config import OptimConfig, RenderConfig
+from clsplat.config import OptimConfig
 from clsplat.metrics import to_uint8
 from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.scene import View
 from clsplat.testing import synthetic_scene
 from clsplat.training import photo_poses as poses
@@ -50,7 +51,7 @@ def test_a_camera_is_aligned_with_the_scene(device):
     photo = to_uint8(render(scene, camera, device=device).rgb)
     twist = np.array([0.01, -0.008, 0.006, 0.02, -0.03, 0.01])
     off = View("a.png", poses.refined(camera, poses.exponential(twist)), photo)
-    found = poses.aligned(scene, off, 2.0, OptimConfig(), RenderConfig(), device, (0.0, 0.0, 0.0))
+    found = poses.aligned(scene, off, 2.0, OptimConfig(), Renderer(device))
     before, after = (np.abs(c.viewmat - camera.viewmat).max() for c in (off.camera, found.camera))
     assert before > 0.02
     assert after < 0.05 * before

@@ -65,6 +65,7 @@ def search_size(training: "Training", after: After, after_fork: After) -> None:
 def _decide(training: "Training", search: Search, iteration: int, after_fork: After) -> State:
     """End the current trial, decide the next phase, and train the smaller side of its trial; the state to go on
     with."""
+    training.state.move(None)  # one side of a trial at a time is on the device
     state, trials = replace(training.state), search.trials
     if search.small_side:
         larger = _candidate(training, iteration, search.validated)
@@ -79,7 +80,7 @@ def _decide(training: "Training", search: Search, iteration: int, after_fork: Af
     if phase == "settle":
         search = replace(search, settled=iteration, degrees=_degrees(here, iteration))
         best = max(search.degrees, key=lambda c: c.worth).sh_degree
-        here.state.rows = here.state.rows.on(None).with_degree(best).on(here.optimizer.home)
+        here.state.rows = here.state.rows.with_degree(best)
     elif phase in ("try", "prune"):
         search = replace(search, small_side=_train_small_side(here, phase, iteration, after_fork))
     here.state.search = replace(search, most=most_grown(search, phase, training.config, most))
@@ -87,14 +88,17 @@ def _decide(training: "Training", search: Search, iteration: int, after_fork: Af
 
 
 def _train_small_side(training: "Training", phase: Decision, iteration: int, after: After) -> SmallSide:
-    """Fork a training and train the fork to the end of the trial: with the same Gaussians, or with the costliest."""
+    """Fork a training and train the fork to the end of the trial: with the same Gaussians, or with the costliest.
+
+    The rows of the training are on the host.
+    """
     state, config = training.state, training.config
     rows = np.arange(len(state.gaussians))
     if phase == "prune":
         left = 2 ** -halvings(state.search.trials if state.search else [])
         gaussians, views = fetch(state.shown(training.renderer)), state.corrected(training.scene.train)
         rows = costliest_rows(gaussians, left, views, training.renderer)
-    side = training.fork(state.fork(state.rows.on(None).take(rows)))
+    side = training.fork(state.fork(state.rows.take(rows)))
     validation, validated = _validation_views(training), []
     end = next(bound for bound in trial_bounds(config) if bound > iteration)
     for time in sorted(time for time in validation_times(config) if iteration < time <= end):

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from copy import copy
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config import TrainConfig
@@ -74,11 +75,14 @@ class Strategy:
 
     def on(self, device: "Device | None") -> "Strategy":
         """The strategy with its statistics on the device, or on the host for None."""
+
+        def placed(name: str, array: Any) -> Any:
+            if device is None:
+                return download(array)
+            return device.upload(name, array, array.dtype) if isinstance(array, np.ndarray) else array
+
         result = copy(self)
-        result.statistics = {
-            name: device.upload(name, array, array.dtype) if device else download(array)
-            for name, array in self.statistics.items()
-        }
+        result.statistics = {name: placed(name, array) for name, array in self.statistics.items()}
         return result
 
     def take(self, rows: Array) -> "Strategy":
