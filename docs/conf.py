@@ -9,7 +9,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 sys.path[:0] = [str(ROOT), str(HERE / "_ext")]
-# The notebooks' kernels are processes of their own.
+# The kernels of the notebooks run in separate processes.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
 
 project = "clsplat"
@@ -33,21 +33,21 @@ smartquotes_action = "qe"  # no dashes: options begin with two hyphens
 
 
 def package_digest():
-    """Of what a notebook's outputs depend on beside its own cells."""
+    """Digest of the files that a notebook's outputs depend on, besides its own cells."""
     digest = hashlib.sha256()
     for path in sorted([*ROOT.glob("clsplat/**/*.py"), *ROOT.glob("cl/*"), *ROOT.glob("docs/results/*")]):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-# Notebooks are executed where they or the package changed; their outputs are kept below _build only.
+# A notebook is executed if it or the package has changed. Its outputs are stored in _build only.
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(HERE / "_build" / "notebooks" / package_digest())
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True
-# Progress bars, and how many warnings a driver had about a kernel.
+# stderr has progress bars and the number of a driver's warnings about a kernel.
 nb_output_stderr = "remove"
 
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
@@ -64,7 +64,7 @@ autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
 
-# Vector graphics on white paper: readable on the dark theme, too.
+# Vector graphics on a white background are readable with the dark theme, too.
 plot_formats = ["svg"]
 plot_html_show_formats = False
 plot_html_show_source_link = False
@@ -73,14 +73,14 @@ plot_apply_rcparams = True
 
 
 def escape_bars(app, what, name, obj, options, lines):
-    """Docstrings are read in the source first, where |x| is a magnitude, not a substitution."""
+    """Escape bars in docstrings: |x| is a magnitude there, not a substitution of reStructuredText."""
     for i, line in enumerate(lines):
         parts = re.split(r"(`+.+?`+)", line)
         lines[i] = "".join(p if k % 2 else p.replace("|", r"\|") for k, p in enumerate(parts))
 
 
 def copy_notebooks():
-    """Sphinx reads what lies below docs/: copies whose links to pages of docs/ are shortened by that folder."""
+    """Copy the notebooks to docs/, where Sphinx finds them, and adapt their links to pages of docs/."""
     (HERE / "notebooks").mkdir(exist_ok=True)
     names = {path.name for path in ROOT.glob("notebooks/*.ipynb")}
     for path in HERE.glob("notebooks/*.ipynb"):

@@ -1,12 +1,15 @@
-"""Parts of pages made from the package while they are built, so that they cannot disagree with it.
+"""Directives that generate parts of pages from the package during the build, so that both always agree.
 
-``{constants}`` lists clsplat/constants.py; ``{config} NAME`` a dataclass of clsplat/config.py; ``{command} NAME``
-is what ``clsplat NAME --help`` prints; ``{presets}`` lists what each preset sets; ``{bench_kernels} FILE [WORKLOAD]``
-shows the results that ``clsplat bench kernels -o FILE`` measured, or the stages of one workload of them;
-``{bench_knobs} FILE`` the table of ``clsplat bench knobs -o FILE``; ``{bench_stability} FILE`` the rows and charts
-that ``clsplat bench stability`` left in the folder of FILE;
-``{bench_quality} FILE [COST]`` where and when ``clsplat bench quality`` measured the records in FILE, or charts and
-table of one cost; ``{published_quality}`` chart and table of the original paper.
+``{constants}``: table of clsplat/constants.py.
+``{config} NAME``: table of a dataclass of clsplat/config.py.
+``{command} NAME``: output of ``clsplat NAME --help``.
+``{presets}``: settings of each preset.
+``{bench_kernels} FILE [WORKLOAD]``: results of ``clsplat bench kernels -o FILE``, or the stages of one workload.
+``{bench_knobs} FILE``: table of ``clsplat bench knobs -o FILE``.
+``{bench_stability} FILE``: rows and charts that ``clsplat bench stability`` wrote to the folder of FILE.
+``{bench_quality} FILE [COST]``: place and date at which ``clsplat bench quality`` measured the records in FILE, or
+charts and table of one cost.
+``{published_quality}``: chart and table of the original paper.
 """
 
 import ast
@@ -39,7 +42,7 @@ HEADER_RULE = "|---"
 
 
 def _docstring(statement: ast.stmt | None) -> str | None:
-    """The text of a string that stands alone, as it does under the name it describes; on one line."""
+    """Text of a string statement, such as the docstring below a constant, on one line."""
     if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
         if isinstance(statement.value.value, str):
             return " ".join(statement.value.value.split())
@@ -47,7 +50,7 @@ def _docstring(statement: ast.stmt | None) -> str | None:
 
 
 def _prose(text: str) -> str:
-    """A docstring's plain text as Markdown: everything but its code spans escaped."""
+    """Convert the plain text of a docstring to Markdown: escape everything except code spans."""
     parts = re.split(r"(``.+?``|`.+?`)", text)
     return "".join(p if i % 2 else re.sub(r"([\\*_<>|\[\]$])", r"\\\1", p) for i, p in enumerate(parts))
 
@@ -67,7 +70,7 @@ def _value(value: Any) -> str:
 
 
 def constants_table() -> str:
-    """Markdown table of the public constants; those that share a docstring share a row."""
+    """Markdown table of the public constants. Constants that share a docstring share a row."""
     body = ast.parse(inspect.getsource(constants)).body
     rows, names = [_row("constant", "value", "reason and source"), HEADER_RULE * 3 + "|"], []
     for statement, following in zip(body, [*body[1:], None], strict=True):
@@ -97,7 +100,7 @@ def _default(value: Any) -> str:
 
 
 def config_table(name: str) -> str:
-    """Markdown: the docstring of a configuration class and the table of its fields."""
+    """Docstring of a configuration class and table of its fields, as Markdown."""
     cls = getattr(config, name)
     body = ast.parse(inspect.getsource(cls)).body[0].body
     texts = {
@@ -117,7 +120,7 @@ def config_table(name: str) -> str:
 
 
 def _flags(settings: dict[str, Any], within: str = "") -> list[str]:
-    """Settings as they are written on the command line."""
+    """Settings in the notation of the command line."""
     texts = []
     for name, value in settings.items():
         if isinstance(value, dict):
@@ -128,8 +131,8 @@ def _flags(settings: dict[str, Any], within: str = "") -> list[str]:
 
 
 def presets_table() -> str:
-    """Markdown table of the presets, with the flags that would do the same."""
-    rows = [_row("preset", "the same as"), HEADER_RULE * 2 + "|"]
+    """Markdown table of the presets with the equivalent flags."""
+    rows = [_row("preset", "equivalent flags"), HEADER_RULE * 2 + "|"]
     for name in presets.PRESETS:
         settings = presets.read_settings(presets.FOLDER / f"{name}.json")
         rows.append(_row(_code(name), " ".join(map(_code, _flags(settings)))))
@@ -137,7 +140,7 @@ def presets_table() -> str:
 
 
 def help_text(command: str) -> str:
-    """What ``clsplat COMMAND --help`` prints on a terminal of 100 columns without colours."""
+    """Output of ``clsplat COMMAND --help`` on a terminal of 100 columns without colours."""
     text = io.StringIO()
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "100"
@@ -150,7 +153,7 @@ def help_text(command: str) -> str:
 
 
 class Table(SphinxDirective):
-    """Base: parses Markdown that is made from a module."""
+    """Base class: parse Markdown that is generated from a module."""
 
     def parse(self, text: str, module: ModuleType) -> list[nodes.Node]:
         self.env.note_dependency(module.__file__)
@@ -183,7 +186,7 @@ class Presets(Table):
 
 
 class Command(SphinxDirective):
-    """``{command} NAME``; the name of a sub-command follows that of its command."""
+    """``{command} NAME``; NAME can be a command and a sub-command."""
 
     required_arguments = 1
     final_argument_whitespace = True
@@ -196,7 +199,7 @@ class Command(SphinxDirective):
 
 
 class BenchKernels(SphinxDirective):
-    """``{bench_kernels} FILE [WORKLOAD]``; the file lies beside the page."""
+    """``{bench_kernels} FILE [WORKLOAD]``; FILE is relative to the page."""
 
     required_arguments = 1
     optional_arguments = 1
@@ -212,7 +215,7 @@ class BenchKernels(SphinxDirective):
 
 
 class BenchKnobs(SphinxDirective):
-    """``{bench_knobs} FILE``; the file lies beside the page."""
+    """``{bench_knobs} FILE``; FILE is relative to the page."""
 
     required_arguments = 1
 
@@ -223,7 +226,7 @@ class BenchKnobs(SphinxDirective):
 
 
 class BenchStability(SphinxDirective):
-    """``{bench_stability} FILE``; the file and its charts lie in a folder beside the page."""
+    """``{bench_stability} FILE``; FILE is relative to the page, and its charts are in the same folder."""
 
     required_arguments = 1
 
@@ -235,28 +238,28 @@ class BenchStability(SphinxDirective):
         folder = self.arguments[0].rpartition("/")[0]
         for name in stability.charts(results):
             failure = EXPERIMENTS[name].failure
-            parts.append(f"![{failure}: measured without and with the remedy]({folder}/{stability.chart_file(name)})")
+            parts.append(f"![{failure}: results without and with the remedy]({folder}/{stability.chart_file(name)})")
         return self.parse_text_to_nodes("\n\n".join(parts))
 
 
 class Charts(SphinxDirective):
-    """Base: pages with charts that are drawn while they are built."""
+    """Base class: draw charts while the pages are built."""
 
     def chart(self, figure: Figure, name: str, text: str) -> str:
-        """Markdown of a picture, which is written to docs/generated."""
+        """Write a picture to docs/generated; return its Markdown."""
         folder = Path(self.env.srcdir) / "generated"
         folder.mkdir(exist_ok=True)
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
         return f"![{text}](/generated/{name}.svg)"
 
     def table(self, rows: list[list[str]]) -> str:
-        """Markdown of a table, the first row of which is the header."""
+        """Markdown of a table whose first row is the header."""
         head, *body = [_row(*map(_prose, row)) for row in rows]
         return "\n".join([head, HEADER_RULE * len(rows[0]) + "|", *body])
 
 
 class BenchQuality(Charts):
-    """``{bench_quality} FILE [COST]``; the file lies beside the page."""
+    """``{bench_quality} FILE [COST]``; FILE is relative to the page."""
 
     required_arguments = 1
     optional_arguments = 1
@@ -269,14 +272,14 @@ class BenchQuality(Charts):
         if len(self.arguments) == 1:
             parts = [self.list(summary.origins(records))]
             if failed := summary.failures(records):
-                parts.append(self.table([["failed", "why"], *map(list, failed)]))
+                parts.append(self.table([["failed", "reason"], *map(list, failed)]))
             return self.parse_text_to_nodes("\n\n".join(parts))
         cost, parts = self.arguments[1], []
         metrics = summary.measured_metrics(finished)
-        for metric in metrics if cost == "seconds" else metrics[:1]:  # the table has them all
-            text = f"{summary.METRICS[metric].name} against {summary.COSTS[cost].name}; the figures stand below"
+        for metric in metrics if cost == "seconds" else metrics[:1]:  # the table has all metrics
+            axes = f"{summary.METRICS[metric].name} against {summary.COSTS[cost].name}"
             figure = charts.quality_chart(finished, cost, metric)
-            parts += [self.chart(figure, f"{Path(path).stem}-{cost}-{metric}", text)]
+            parts += [self.chart(figure, f"{Path(path).stem}-{cost}-{metric}", f"{axes}; see the table below")]
             parts += [self.list(summary.verdict(finished, cost, metric))]
         return self.parse_text_to_nodes("\n\n".join([*parts, self.table(summary.table(finished, cost))]))
 
@@ -289,7 +292,7 @@ class PublishedQuality(Charts):
 
     def run(self) -> list[nodes.Node]:
         self.env.note_dependency(str(charts.PUBLISHED))
-        text = "PSNR against training time as published in 2023; the figures stand below"
+        text = "PSNR against training time as published in 2023; see the table below"
         picture = self.chart(charts.published_chart("psnr"), "quality-published", text)
         return self.parse_text_to_nodes(f"{picture}\n\n{self.table(charts.published_table())}")
 

@@ -1,11 +1,11 @@
-"""The camera's axes, and where a pixel's centre lies."""
+"""Axes of the camera frame, and positions of the pixel centres."""
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 figure, (frame, grid) = plt.subplots(1, 2, figsize=(9, 3.6), width_ratios=(1.15, 1))
 
-# Left: an oblique view of the camera frame; columns are where x, y, z point on the paper.
+# Left: an oblique view of the camera frame. The rows of `axes` are the directions of x, y and z on the paper.
 axes = np.array([[0.9, -0.22], [0.0, -0.95], [0.75, 0.3]])
 
 

@@ -1,4 +1,4 @@
-"""Tiles that the exact test keeps, and those a box around the splat would have."""
+"""Tiles that the exact test keeps, compared with those of a box around the splat."""
 
 import matplotlib.pyplot as plt
 import numpy as np
