@@ -56,7 +56,7 @@ def mean_metrics(
 def evaluate(
     gaussians: Gaussians,
     views: Iterable[View],
-    out: Path,
+    out: Path | str,
     renderer: Renderer | None = None,
 ) -> dict[str, Any]:
     """Render views and compare them with their photos.
@@ -67,7 +67,7 @@ def evaluate(
         In the coordinates of the views, on the host or on the renderer's device.
     views : iterable of View
         At least one; usually a scene's held-out views.
-    out : Path
+    out : Path or str
         Folder for metrics.json, index.html, and the pictures in truth/, render/ and difference/; created if missing.
     renderer : Renderer, optional
         Its background is that of the photos where they were transparent. Default: ``Renderer()``.
@@ -86,6 +86,7 @@ def evaluate(
         If there is no view, a view's photo is not of its camera's size, or `out` cannot be written.
     """
     kinds = ("truth", "render", "difference")
+    out = Path(out)
     try:
         for kind in kinds:
             (out / kind).mkdir(parents=True, exist_ok=True)

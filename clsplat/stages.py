@@ -229,5 +229,5 @@ class Stages(Protocol):
     def argsort_segments(self, keys: Array, bits: int, ranges: Array, values: Array = None) -> Array: ...
 
 
-STAGES: tuple[str, ...] = tuple(name for name in vars(Stages) if not name.startswith("_"))
+FUNCTIONS: tuple[str, ...] = tuple(name for name in vars(Stages) if not name.startswith("_"))
 """Names of the functions of `Stages`, in the order of the pipeline."""

@@ -16,7 +16,7 @@ from clsplat.bench.workloads import Workload
 from clsplat.config import RenderConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.renderer import Renderer
-from clsplat.stages import STAGES
+from clsplat.stages import FUNCTIONS
 from clsplat.training.loop import Training
 
 WARM_UP = 2
@@ -38,7 +38,7 @@ class _Spent:
 def _watched(training: Training, kernels: bool) -> Iterator[_Spent]:
     """Time a training's stages, or the kernels they launch as STAGE/KERNEL, by waiting after each."""
     device, launches = training.device, training.renderer.stages
-    spent, functions = _Spent(), {name: getattr(launches, name) for name in STAGES}
+    spent, functions = _Spent(), {name: getattr(launches, name) for name in FUNCTIONS}
     launch, stage = device.launch, ""
 
     def timed(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

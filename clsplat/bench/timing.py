@@ -47,6 +47,7 @@ def training_of(workload: Workload, config: TrainConfig, device: Device) -> Trai
     rows = Rows(workload.gaussians, Moments.zeros(workload.gaussians), strategy)
     scene = Scene([workload.view], [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     training = Training(scene, config, device, State(ITERATION - 1, 0.0, workload.extent, rows))
+    training.state.move(training.optimizer.home)
     training.photos.keep_within(4 * workload.view.image.nbytes)  # the photo and its mask stay on the device
     return training
 

@@ -141,7 +141,7 @@ def trained(data, device):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(quality, "measure", measured)
-        last = run_cell(cell, scene, device, records.append)
+        last = run_cell(cell.config, scene, device, records.append)
     assert last == records[-1]
     return cell, scene, records, states
 
@@ -199,7 +199,7 @@ class TestOneTraining:
         monkeypatch.setattr(quality, "train", training)
         monkeypatch.setattr(quality, "measure", measured)
         records = []
-        run_cell(cell, scene, device, records.append)
+        run_cell(cell.config, scene, device, records.append)
         assert [r["seconds"] for r in records] == [2 * r["iteration"] for r in records]
 
     def test_frames_per_second_is_of_the_median(self, trained, device, monkeypatch):

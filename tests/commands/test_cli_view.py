@@ -63,7 +63,7 @@ def test_view_goes_to_the_photos(
     save_gaussians(tmp_path / "scene.ply", gaussians, offset=(10.0, 0.0, 0.0))  # the dataset's is 0
     run("view", tmp_path / "scene.ply", "--data", dataset, "--port", 18090)
     scene = load_scene(dataset, DataConfig())
-    _, _, viewpoint, views, _ = made[0]
+    _, viewpoint, views = made[0]
     assert len(views) == 9
     np.testing.assert_array_equal(viewpoint.camera.viewmat, scene.train[0].camera.viewmat)
     np.testing.assert_allclose(held[0][1].means, gaussians.means + np.float32([10, 0, 0]), rtol=1e-6)

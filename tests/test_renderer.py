@@ -1,0 +1,62 @@
+"""The renderer: its default device, the reference by name, Gaussians of host and device."""
+
+import numpy as np
+import pytest
+
+import clsplat.device
+from clsplat import Renderer, render
+from clsplat.errors import DeviceError, InputError
+from clsplat.gaussians import Gaussians
+from clsplat.render import renderings
+from clsplat.renderer import default_device, fetch
+from clsplat.testing import synthetic_scene
+
+
+def test_the_default_is_one_device():
+    assert Renderer().device is Renderer().device is default_device()
+    gaussians, camera = synthetic_scene(20)
+    assert render(gaussians, camera).rgb.dtype == np.float32, "not the float64 reference"
+
+
+def test_the_reference_is_asked_for_by_name():
+    gaussians, camera = synthetic_scene(20)
+    assert Renderer("reference").device is None
+    assert render(gaussians, camera, device="reference").rgb.dtype == np.float64
+    with pytest.raises(InputError, match=r'device: expected a Device, None or "reference", found \'cpu\''):
+        render(gaussians, camera, device="cpu")
+
+
+def test_without_opencl_the_error_names_the_reference(monkeypatch):
+    monkeypatch.setattr(clsplat.device, "list_devices", list)
+    default_device.cache_clear()
+    try:
+        with pytest.raises(DeviceError, match=r'no OpenCL device found: .*device="reference"'):
+            Renderer()
+        gaussians, camera = synthetic_scene(5)
+        assert np.isfinite(render(gaussians, camera, device="reference").rgb).all()
+    finally:
+        default_device.cache_clear()
+
+
+@pytest.mark.parametrize("where", ["device", "reference"])
+def test_gaussians_of_host_and_device(device, where, monkeypatch):
+    gaussians, camera = synthetic_scene(30)
+    gaussians = gaussians.astype(np.float32)
+    placed = Renderer(device).place(gaussians)
+    renderer = Renderer(device if where == "device" else "reference")
+    expected, found = (next(renderings(renderer, g, [camera])).rgb for g in (gaussians, placed))
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_what_is_on_the_device_is_not_uploaded_again(device, monkeypatch):
+    gaussians, camera = synthetic_scene(30)
+    renderer = Renderer(device)
+    placed = renderer.place(gaussians.astype(np.float32))
+    assert renderer.place(placed) is placed
+    uploads = []
+    upload = device.upload
+    monkeypatch.setattr(device, "upload", lambda what, *a: uploads.append(what) or upload(what, *a))
+    next(renderings(renderer, placed, [camera]))
+    assert not set(uploads) & set(Gaussians.__dataclass_fields__)
+    for name, array in fetch(placed).arrays().items():
+        np.testing.assert_array_equal(array, gaussians.astype(np.float32).arrays()[name])

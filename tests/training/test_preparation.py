@@ -1,0 +1,92 @@
+"""One meaning of a configuration: Python's three lines and `clsplat train` write the same bytes."""
+
+# ruff: noqa: F811 (fixtures are imported and then named as arguments)
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import run, write_dataset
+from test_triangulation import START, posed, write_transforms  # noqa: F401  (a fixture)
+
+from clsplat import TrainConfig, prepare, save_gaussians, train
+from clsplat.config import DataConfig, InitConfig
+from clsplat.errors import InputError
+from clsplat.scene import View
+from clsplat.training.preparation import open_device
+
+
+def from_python(data: Path, config: TrainConfig, out: Path) -> bytes:
+    scene, config = prepare(data, config)
+    gaussians = train(scene, config, out)
+    save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
+    return (out / "scene.ply").read_bytes()
+
+
+def test_eight_photos(tmp_path: Path) -> None:
+    """Fewer than `few.below`: the configuration is adapted to them."""
+    write_dataset(tmp_path / "data", 8)
+    run("train", tmp_path / "data", "-o", tmp_path / "command", "--iterations", 30, "--init.random-points", 300)
+    config = TrainConfig(iterations=30, init=InitConfig(random_points=300))
+    found = from_python(tmp_path / "data", config, tmp_path / "python")
+    assert found == (tmp_path / "command" / "scene.ply").read_bytes()
+    scene, adapted = prepare(tmp_path / "data", config)
+    assert len(scene.train) == 7 and adapted.dropout > 0 == config.dropout
+    plain = train(scene, replace(config, size="fixed", strategy="adc"), tmp_path / "plain")
+    save_gaussians(tmp_path / "plain.ply", plain)
+    assert found != (tmp_path / "plain.ply").read_bytes(), "the adaptation must matter"
+
+
+def test_poses_without_points(posed: list[View], tmp_path: Path) -> None:
+    path = write_transforms(tmp_path, posed)
+    run("train", path, "-o", tmp_path / "command", "--iterations", 5, "--test-every", 0, "--max-gaussians", 500)
+    config = TrainConfig(iterations=5, max_gaussians=500, data=DataConfig(test_every=0))
+    assert from_python(path, config, tmp_path / "python") == (tmp_path / "command" / "scene.ply").read_bytes()
+    told: list[str] = []
+    scene, _ = prepare(path, config, tell=told.append)
+    assert len(scene.points) == START and f"start: {START} points, from photos and poses" in told[1]
+
+
+def test_a_resumed_run_of_many_photos_needs_no_points(posed: list[View], tmp_path: Path) -> None:
+    config = TrainConfig(data=DataConfig(test_every=0))
+    many = replace(config, few=replace(config.few, below=0))
+    path = write_transforms(tmp_path, posed)
+    assert not len(prepare(path, many, resume=True)[0].points)
+    few, again = (prepare(path, config, resume=resume)[1] for resume in (False, True))
+    assert few == again and few.max_gaussians is not None, "the points of few photos limit the Gaussians"
+
+
+def test_masks_are_found_in_the_dataset_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_dataset(tmp_path / "data", 9)
+    (tmp_path / "data" / "masks").mkdir()
+    monkeypatch.chdir(tmp_path)
+    config = TrainConfig(data=DataConfig(masks="masks"), init=InitConfig(triangulate=False))
+    with pytest.raises(InputError, match=r"data/masks/0\.png: expected the mask of photo 0\.png"):
+        prepare("data", config)
+
+
+def test_a_start_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    write_dataset(tmp_path, 9)
+    config = TrainConfig(memory_limit="1MB", init=InitConfig(triangulate=False))
+    with pytest.raises(InputError, match=r"--memory-limit: expected at least .* for 100000 Gaussians at 40x32"):
+        prepare(tmp_path, config)
+
+
+def test_devices_are_opened_once() -> None:
+    config = TrainConfig()
+    assert open_device(config) is open_device(replace(config, iterations=5))
+    limited = replace(config, memory_limit="64MB")
+    assert open_device(limited) is open_device(limited) is not open_device(config)
+    assert open_device(limited).memory_limit == 64 * 10**6
+    with pytest.raises(InputError, match="--memory-limit: expected"):
+        open_device(replace(config, memory_limit="64"))
+
+
+def test_training_without_a_device_takes_that_of_the_configuration(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "data", 9)
+    config = TrainConfig(iterations=3, memory_limit="64MB", init=InitConfig(triangulate=False, random_points=50))
+    scene, config = prepare(tmp_path / "data", config)
+    device = open_device(config)
+    before = device.memory_peak
+    assert np.isfinite(train(scene, config, tmp_path / "out").means).all()
+    assert device.memory_peak > before
