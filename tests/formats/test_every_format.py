@@ -10,7 +10,7 @@ from bounds import BOUNDS, assert_within, matched, random_gaussians, save
 
 from clsplat.constants import SH_C0
 from clsplat.errors import InputError
-from clsplat.formats import FORMATS, compact, load_gaussians, save_gaussians, suffix_of
+from clsplat.formats import FORMATS, quantisation, load_gaussians, save_gaussians, suffix_of
 from clsplat.formats.ply import LOGIT_MAX
 from clsplat.gaussians import Gaussians
 
@@ -245,10 +245,10 @@ def test_the_longest_suffix_counts(tmp_path):
 
 
 def test_an_expansion_beyond_any_scene_is_refused(monkeypatch):
-    compact.check_expansion("a", compact.EXPANSION_FREE, 1)
-    compact.check_expansion("a", 100 * compact.EXPANSION_FREE, compact.EXPANSION_FREE)
+    quantisation.check_expansion("a", quantisation.EXPANSION_FREE, 1)
+    quantisation.check_expansion("a", 100 * quantisation.EXPANSION_FREE, quantisation.EXPANSION_FREE)
     with pytest.raises(InputError, match="exhaust memory"):
-        compact.check_expansion("a", 100 * compact.EXPANSION_FREE + 1, compact.EXPANSION_FREE)
+        quantisation.check_expansion("a", 100 * quantisation.EXPANSION_FREE + 1, quantisation.EXPANSION_FREE)
 
 
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog"])
@@ -263,8 +263,8 @@ def test_neighbours_follow_each_other(tmp_path, suffix):
 def test_morton_order_keeps_neighbours_together():
     rng = np.random.default_rng(0)
     points = rng.permutation(np.stack(np.meshgrid(*3 * [np.arange(8.0)]), axis=-1).reshape(-1, 3))
-    ordered = points[compact.morton_order(points)].astype(int)
+    ordered = points[quantisation.morton_order(points)].astype(int)
     # The code's bits are those of z, y, x in turn.
     codes = [sum((p[axis] >> bit & 1) << (3 * bit + axis) for axis in range(3) for bit in range(3)) for p in ordered]
     assert codes == sorted(codes) and ordered[1].tolist() == [1, 0, 0] and ordered[4].tolist() == [0, 0, 1]
-    assert sorted(compact.morton_order(np.zeros((5, 3)))) == [0, 1, 2, 3, 4]
+    assert sorted(quantisation.morton_order(np.zeros((5, 3)))) == [0, 1, 2, 3, 4]

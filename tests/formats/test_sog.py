@@ -10,7 +10,7 @@ from bounds import random_gaussians
 from PIL import Image
 
 from clsplat.errors import InputError
-from clsplat.formats import compact, load_gaussians, save_gaussians
+from clsplat.formats import quantisation, load_gaussians, save_gaussians
 from clsplat.formats.sog import load_sog, save_sog
 
 N = 2
@@ -142,7 +142,7 @@ def test_a_palette_stands_for_more_than_its_size(tmp_path):
     gaussians.sh[:, 1:] = kinds[np.arange(20_000) % 300]
     save_sog(tmp_path / "a.sog", gaussians)
     found = load_sog(tmp_path / "a.sog")[0]
-    rows = compact.morton_order(gaussians.means)
+    rows = quantisation.morton_order(gaussians.means)
     error = np.abs(found.sh[:, 1:] - gaussians.sh[rows, 1:])
     assert error.max() <= 1.8 / 256
 
@@ -202,7 +202,7 @@ def test_bombs_are_refused_before_they_unfold(tmp_path, monkeypatch):
     large = picture([], 1024, 1024)
     bundle(path, meta2(), PICTURES | {"means_l.webp": large})
     assert len(load_sog(path)[0]) == N  # small enough to harm nobody
-    monkeypatch.setattr(compact, "EXPANSION_FREE", 1 << 16)
+    monkeypatch.setattr(quantisation, "EXPANSION_FREE", 1 << 16)
     with pytest.raises(InputError, match="exhaust memory"):
         load_sog(path)
     bundle(path, meta2(), PICTURES | {"zeros": bytes(1 << 22)})

@@ -9,7 +9,7 @@ import pytest
 import zstandard
 
 from clsplat.errors import InputError
-from clsplat.formats import compact
+from clsplat.formats import quantisation
 from clsplat.formats.spz import fractional_bits, load_spz, save_spz
 from clsplat.gaussians import Gaussians
 
@@ -202,8 +202,8 @@ def test_a_bomb_is_refused_before_it_unfolds(tmp_path, monkeypatch):
     path = tmp_path / "a.spz"
     n = 1 << 16
     path.write_bytes(gzip.compress(header(n=n, degree=0) + bytes(20 * n)))
-    assert path.stat().st_size * compact.EXPANSION_MAX < 20 * n
+    assert path.stat().st_size * quantisation.EXPANSION_MAX < 20 * n
     assert len(load_spz(path)[0]) == n  # small enough to harm nobody
-    monkeypatch.setattr(compact, "EXPANSION_FREE", 1 << 10)
+    monkeypatch.setattr(quantisation, "EXPANSION_FREE", 1 << 10)
     with pytest.raises(InputError, match="exhaust memory"):
         load_spz(path)
