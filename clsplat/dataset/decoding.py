@@ -20,12 +20,12 @@ from clsplat.panorama import FACES, bordered, face_positions, rotated
 from clsplat.scene import View
 
 SIZE_MAX = 1 << 20
-"""Largest width or height of a photo, px. A larger declared size means a damaged file; undistortion would take time in
-proportion to it."""
+"""Largest width or height of a photo, px. A larger declared size means a damaged file; undistortion would take time
+in proportion to it."""
 
 ASPECT_TOLERANCE = 0.01
-"""Largest relative difference between the aspect ratios of a photo and its camera. The size of a smaller copy may differ
-by up to a pixel in addition."""
+"""Largest relative difference between the aspect ratios of a photo and its camera. The size of a smaller copy may
+differ by up to a pixel in addition."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +129,8 @@ def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
     Raises
     ------
     InputError
-        If a pose is not a rigid motion, a photo or mask cannot be decoded, or its shape differs from its camera's; the
-        message names it.
+        If a pose is not a rigid motion, a photo or mask cannot be decoded, or its shape differs from its camera's;
+        the message names it.
     """
     from tqdm import tqdm
 

@@ -38,8 +38,8 @@ def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path 
     names : sequence of str
         Paths inside `root`, checked by `checked_name`. The suffix may be missing or differ from the file's.
     downscale : int
-        Requested reduction: 1, 2, 4 or 8. For 2, ``images_2/a.jpg`` is preferred to ``images/a.jpg``, unless it exists
-        for fewer photos; 4 and 8 likewise.
+        Requested reduction: 1, 2, 4 or 8. For 2, ``images_2/a.jpg`` is preferred to ``images/a.jpg``, unless it
+        exists for fewer photos; 4 and 8 likewise.
 
     Returns
     -------
@@ -62,8 +62,8 @@ def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path 
             return small, 1
         if found_small:
             warnings.warn(
-                f"{root}: copies {downscale} times smaller exist for only {found_small} of {found} photos; all photos "
-                "are reduced from the full size instead",
+                f"{root}: copies {downscale} times smaller exist for only {found_small} of {found} photos; all "
+                "photos are reduced from the full size instead",
                 stacklevel=2,
             )
     if found:
@@ -116,9 +116,7 @@ def find_mask(folder: Path, name: str) -> Path:
     for file in candidates:
         if _is_file(file):
             return file
-    raise InputError(
-        f"cannot find the mask of photo {name}: neither {candidates[0]} nor {candidates[1].name} exists"
-    )
+    raise InputError(f"cannot find the mask of photo {name}: neither {candidates[0]} nor {candidates[1].name} exists")
 
 
 def mask_folder(root: Path, masks: str) -> Path:

@@ -20,8 +20,8 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF)
 """Suffixes, in lower case, of the files that count as photos."""
 
 SHARPNESS_EDGE = 640
-"""Longer edge, in pixels, to which photos are reduced before their sharpness is measured. Motion blur is still visible
-at this size; noise is averaged out."""
+"""Longer edge, in pixels, to which photos are reduced before their sharpness is measured. Motion blur is still
+visible at this size; noise is averaged out."""
 
 FRAMES = "clsplat_frames.json"
 """Name of the file that marks a folder of photos as frames of a video, in the order of their names. It records the
@@ -32,7 +32,7 @@ TRANSPARENT = ("RGBA", "RGBa", "LA", "La", "PA")
 
 
 def photo_folder(path: Path) -> Path:
-    """Return the folder with the photos of the dataset `path`: its folder ``images`` if it exists, otherwise `path`."""
+    """Return the folder with the photos of a dataset: its folder ``images`` if it exists, otherwise `path` itself."""
     return path / "images" if (path / "images").is_dir() else path
 
 
