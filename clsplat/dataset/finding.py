@@ -70,7 +70,7 @@ def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path 
         return full, downscale
     sizes = [d for d in (2, 4, 8) if any(_find(root, name, d) is not None for name in names)]
     raise PhotosMissing(
-        f"cannot find {root / names[0]} nor any of the {len(names) - 1} other photos"
+        f"cannot find any of the {len(names)} photos, the first of them {root / names[0]}"
         + (f"; smaller copies exist: use downscale {' or '.join(map(str, sizes))}" if sizes else "")
     )
 

@@ -79,8 +79,18 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
         raise InputError(f"test_every: expected 0 or more, found {config.test_every}")
     dataset = _read_dataset(path, config, verbose)
     dataset = replace(dataset, photos=by_faces(dataset.photos))
-    photos = {photo.name: photo for photo in dataset.photos}
     views = sorted(load_views(dataset, config), key=lambda view: view.name)
+    train, test = _split(views, dataset, config.test_every)
+    if not train:
+        raise InputError(
+            f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
+        )
+    return _with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
+
+
+def _split(views: list[View], dataset: Dataset, test_every: int) -> tuple[list[View], list[View]]:
+    """Split views, sorted by name, into those to train on and those held out."""
+    photos = {photo.name: photo for photo in dataset.photos}
     train: list[View] = []
     test: list[View] = []
     numbers: dict[str, int] = {}  # the faces of a panorama share a number, so that they are held out together
@@ -89,13 +99,9 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
         is_test = photo.held_out
         if is_test is None:
             index = numbers.setdefault(str(photo.path) if photo.face else view.name, len(numbers))
-            is_test = config.test_every > 0 and index % config.test_every == 0
+            is_test = test_every > 0 and index % test_every == 0
         (test if is_test else train).append(view)
-    if not train:
-        raise InputError(
-            f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
-        )
-    return _with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
+    return train, test
 
 
 def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: bool = False) -> Scene:

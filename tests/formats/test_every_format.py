@@ -10,7 +10,7 @@ from bounds import BOUNDS, assert_within, matched, random_gaussians, save
 
 from clsplat.constants import SH_C0
 from clsplat.errors import InputError
-from clsplat.formats import FORMATS, quantisation, load_gaussians, save_gaussians, suffix_of
+from clsplat.formats import FORMATS, load_gaussians, quantisation, save_gaussians, suffix_of
 from clsplat.formats.ply import LOGIT_MAX
 from clsplat.gaussians import Gaussians
 

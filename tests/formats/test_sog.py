@@ -10,7 +10,7 @@ from bounds import random_gaussians
 from PIL import Image
 
 from clsplat.errors import InputError
-from clsplat.formats import quantisation, load_gaussians, save_gaussians
+from clsplat.formats import load_gaussians, quantisation, save_gaussians
 from clsplat.formats.sog import load_sog, save_sog
 
 N = 2
