@@ -13,8 +13,8 @@ from clsplat.camera import Camera
 from clsplat.commands.console import say_cameras
 from clsplat.config import SfmConfig
 from clsplat.dataset.photos import photo_sharpness
-from clsplat.dataset.sfm.reconstruction import RECORD, SparseModel, read_sparse
-from clsplat.dataset.sfm.summary import Preview, draw_cameras, preview
+from clsplat.dataset.sfm.reconstruction import RECORD
+from clsplat.dataset.sfm.summary import Preview, SparseModel, draw_cameras, preview, read_sparse
 from clsplat.errors import InputError
 
 NAMES = ["a.png", "b.png", "c.png"]

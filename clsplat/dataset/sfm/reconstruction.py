@@ -12,12 +12,11 @@ import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.config import SfmConfig
 from clsplat.dataset.lenses import camera_models
@@ -70,67 +69,6 @@ def read_record(folder: Path) -> dict[str, Any] | None:
             f"cannot read {path}, the record of a structure from motion: {error!r}; delete its folder to recover the "
             "cameras again"
         ) from error
-
-
-@dataclass(frozen=True, eq=False)
-class SparseModel:
-    """Poses and points of a COLMAP model, for summaries and pictures.
-
-    Parameters
-    ----------
-    names : list of str
-        Names of the V photos with a pose, sorted.
-    positions, directions : (V, 3) float64
-        Positions of the cameras in world units, and their viewing directions as unit vectors.
-    points_seen : (V,) int
-        Number of points of the model in each photo.
-    points : (P, 3) float64
-        Sparse points in world units.
-    colors : (P, 3) uint8
-        RGB of the points.
-    error : float
-        Mean reprojection error, in pixels of the matched photos.
-    track_length : float
-        Mean number of photos per point.
-    """
-
-    names: list[str]
-    positions: NDArray[np.float64]
-    directions: NDArray[np.float64]
-    points_seen: NDArray[np.int64]
-    points: NDArray[np.float64]
-    colors: NDArray[np.uint8]
-    error: float
-    track_length: float
-
-
-def read_sparse(model: Path) -> SparseModel:
-    """Read a COLMAP model in its binary or text format.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
-    import pycolmap
-
-    try:
-        found = pycolmap.Reconstruction(model)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"cannot read {model} as a COLMAP model: {error}") from error
-    images = sorted((i for i in found.images.values() if i.has_pose), key=lambda image: image.name)
-    poses = [image.cam_from_world() for image in images]
-    points = list(found.points3D.values())
-    return SparseModel(
-        [image.name for image in images],
-        np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3),
-        np.array([pose.rotation.matrix()[2] for pose in poses]).reshape(-1, 3),
-        np.array([image.num_points3D for image in images]),
-        np.array([point.xyz for point in points]).reshape(-1, 3),
-        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        float(found.compute_mean_reprojection_error()),
-        float(found.compute_mean_track_length()),
-    )
 
 
 def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, verbose: bool = False) -> Path:

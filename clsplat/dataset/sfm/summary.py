@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
 from clsplat.dataset.photos import list_photos, photo_folder, photo_sharpness
-from clsplat.dataset.sfm import reconstruction as sfm
+from clsplat.dataset.sfm.reconstruction import read_record
+from clsplat.errors import InputError
 
 ERROR_MAX = 1.5
 """Mean reprojection error above which a warning is given, px. Values of real scenes: docs/howto/photos.md."""
@@ -34,6 +35,67 @@ PICTURE_POINTS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
+class SparseModel:
+    """Poses and points of a COLMAP model, for summaries and pictures.
+
+    Parameters
+    ----------
+    names : list of str
+        Names of the V photos with a pose, sorted.
+    positions, directions : (V, 3) float64
+        Positions of the cameras in world units, and their viewing directions as unit vectors.
+    points_seen : (V,) int
+        Number of points of the model in each photo.
+    points : (P, 3) float64
+        Sparse points in world units.
+    colors : (P, 3) uint8
+        RGB of the points.
+    error : float
+        Mean reprojection error, in pixels of the matched photos.
+    track_length : float
+        Mean number of photos per point.
+    """
+
+    names: list[str]
+    positions: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    points_seen: NDArray[np.int64]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    error: float
+    track_length: float
+
+
+def read_sparse(model: Path) -> SparseModel:
+    """Read a COLMAP model in its binary or text format.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    import pycolmap
+
+    try:
+        found = pycolmap.Reconstruction(model)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"cannot read {model} as a COLMAP model: {error}") from error
+    images = sorted((i for i in found.images.values() if i.has_pose), key=lambda image: image.name)
+    poses = [image.cam_from_world() for image in images]
+    points = list(found.points3D.values())
+    return SparseModel(
+        [image.name for image in images],
+        np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3),
+        np.array([pose.rotation.matrix()[2] for pose in poses]).reshape(-1, 3),
+        np.array([image.num_points3D for image in images]),
+        np.array([point.xyz for point in points]).reshape(-1, 3),
+        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        float(found.compute_mean_reprojection_error()),
+        float(found.compute_mean_track_length()),
+    )
+
+
+@dataclass(frozen=True, eq=False)
 class Preview:
     """The result of structure from motion.
 
@@ -48,7 +110,7 @@ class Preview:
     """
 
     photos: list[str]
-    model: sfm.SparseModel
+    model: SparseModel
     sharpness: NDArray[np.float64]
 
     def summary(self) -> str:
@@ -109,17 +171,17 @@ def preview(dataset: Path) -> Preview | None:
     InputError
         If the record, the model or a photo is damaged.
     """
-    record = sfm.read_record(dataset)
+    record = read_record(dataset)
     if record is None:
         return None
     photos = dataset / record["photos"]
     names = list_photos(photos)
     with ThreadPoolExecutor() as pool:
         values = list(pool.map(lambda name: photo_sharpness(photo_folder(photos) / name), names))
-    return Preview(names, sfm.read_sparse(dataset / "sparse" / "0"), np.array(values))
+    return Preview(names, read_sparse(dataset / "sparse" / "0"), np.array(values))
 
 
-def draw_cameras(path: Path, model: sfm.SparseModel) -> None:
+def draw_cameras(path: Path, model: SparseModel) -> None:
     """Write a PNG with the cameras and points of a model, from above and from the side.
 
     Parameters
