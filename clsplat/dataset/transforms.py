@@ -19,7 +19,7 @@ from clsplat.dataset.finding import checked_name, find_mask, locate, mask_folder
 from clsplat.dataset.lenses import Intrinsics
 from clsplat.dataset.photos import photo_size
 from clsplat.errors import InputError
-from clsplat.formats.ply import read_points
+from clsplat.formats.ply_container import read_points
 
 PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE")
