@@ -58,7 +58,7 @@ ONLY_IN = {
     "viser": {"show"},
     "av": {"dataset"},
     "pillow_heif": {"dataset"},
-    "sqlite3": set(),  # beside pycolmap's in one process it ends in a bus error, see FOLLOWER in matching.py
+    "sqlite3": set(),  # beside pycolmap's in one process it ends in a bus error, see COUNT_ROWS in matching.py
 }
 
 

@@ -1,7 +1,7 @@
-"""From a folder or a video to posed photos in memory.
+"""Datasets: from a folder of photos or a video to a `Scene` of posed photos in memory.
 
-Belongs here: finding and decoding photos, COLMAP models, ``transforms.json``, camera models, structure from motion.
-Does not belong here: Gaussians, training, and files of Gaussians.
+Belongs here: locating and decoding photos, frames of videos, COLMAP models, ``transforms.json``, lens models,
+structure from motion. Does not belong here: Gaussians, training, and files of Gaussians (`clsplat.formats`).
 """
 
 from clsplat.dataset.loading import load_scene, with_points

@@ -1,4 +1,4 @@
-"""Reader of COLMAP models, binary and text; the layout is that of COLMAP's documentation, "Output Format"."""
+"""Read COLMAP models, binary and text. The layout is described in COLMAP's documentation, "Output Format"."""
 
 import os
 import struct
@@ -35,19 +35,20 @@ MODELS: tuple[tuple[str, int], ...] = (
     ("EUCM", 6),
     ("EQUIRECTANGULAR", 2),
 )
-"""Camera models and their numbers of parameters; the index is the number that binary files hold."""
+"""COLMAP's camera models: name and number of parameters. The index is the model's number in binary files."""
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-"""Where a dataset may have its model, in order."""
+"""Folders of a dataset that are searched for a model, in this order."""
 
 Model = tuple[
     dict[int, Intrinsics], list[tuple[str, int, NDArray[np.float64]]], NDArray[np.float64], NDArray[np.uint8]
 ]
-"""Cameras by id; name, camera id and viewmat of each photo; points (P, 3) in world units; their colours (P, 3)."""
+"""Content of a model: cameras by id; name, camera id and viewmat of each photo; points (P, 3) in world units; their
+colours (P, 3)."""
 
 
 def find_model(root: Path) -> Path | None:
-    """The folder of the COLMAP model of the dataset `root`, or None."""
+    """Find the folder of the COLMAP model of the dataset `root`; None if it has no model."""
     for folder in FOLDERS:
         if any((root / folder / f"cameras.{ending}").is_file() for ending in ("bin", "txt")):
             return root / folder
@@ -55,19 +56,19 @@ def find_model(root: Path) -> Path | None:
 
 
 def read_dataset(root: Path, model: Path, config: DataConfig, photos: Path | None = None) -> Dataset:
-    """Read a COLMAP model and find its photos and masks.
+    """Read a COLMAP model and locate its photos and masks.
 
     Parameters
     ----------
     root : Path
-        The dataset's folder. Photos are looked for in its folder ``images`` (``images_2`` and so on, as
-        `config.downscale` says), or in itself.
+        Folder of the dataset. Photos are searched in its folder ``images`` (``images_2`` etc. for
+        `config.downscale` 2 etc.), then in `root` itself.
     model : Path
         Folder of the model.
     config : DataConfig
         Size of the photos, folder of the masks.
     photos : Path, optional
-        Where to look for photos instead of `root`; the photos are upright there.
+        Folder to search for photos instead of `root`. The model then describes the photos turned upright.
 
     Returns
     -------
@@ -77,9 +78,9 @@ def read_dataset(root: Path, model: Path, config: DataConfig, photos: Path | Non
     Raises
     ------
     PhotosMissing
-        If there is none of the photos.
+        If no photo is found.
     InputError
-        If a file is damaged or does not fit the others, or a mask is missing; the message names it.
+        If a file is damaged or contradicts another, or a mask is missing; the message names it.
     """
     cameras, images, points, colors = read_model(model)
     names = [name for name, _, _ in images]
@@ -107,12 +108,12 @@ def read_dataset(root: Path, model: Path, config: DataConfig, photos: Path | Non
 
 
 def read_model(folder: Path) -> Model:
-    """Read ``cameras``, ``images`` and ``points3D``, each from ``.bin`` or otherwise ``.txt``.
+    """Read ``cameras``, ``images`` and ``points3D``, each from ``.bin`` if it exists, otherwise from ``.txt``.
 
     Raises
     ------
     InputError
-        If a file is missing or damaged, or has no images; the message names it.
+        If a file is missing or damaged, or there are no images; the message names the file.
     """
     cameras_path, cameras = _read(folder, "cameras", _cameras_bin, _cameras_txt)
     images_path, images = _read(folder, "images", _images_bin, _images_txt)
@@ -143,11 +144,11 @@ def _read(folder: Path, name: str, read_bin: Any, read_txt: Any) -> tuple[Path, 
     for path, read in ((folder / f"{name}.bin", read_bin), (folder / f"{name}.txt", read_txt)):
         if path.is_file():
             return path, read(path)
-    raise InputError(f"{folder / name}.bin: expected this file or {name}.txt beside the other files, found neither")
+    raise InputError(f"cannot find {folder / name}.bin or {name}.txt")
 
 
 def _viewmat(quat: Any, translation: Any, name: str, path: Path) -> NDArray[np.float64]:
-    largest = max(map(abs, quat))  # divided by first: the squares of what a damaged file holds may overflow
+    largest = max(map(abs, quat))  # scaled down first: the squares of a damaged file's numbers may overflow
     known = 0 < largest < np.inf and np.isfinite((*quat, *translation)).all()
     scaled = np.array(quat) / largest if known else np.full(4, np.nan)
     w, x, y, z = scaled / np.linalg.norm(scaled)
@@ -164,7 +165,7 @@ def _viewmat(quat: Any, translation: Any, name: str, path: Path) -> NDArray[np.f
 
 
 class _Bytes:
-    """A binary file, read from front to back and never beyond its end, whatever its counts say."""
+    """A binary file that is read from front to back, with an InputError instead of a read beyond its end."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.data, self.at = path, path.read_bytes(), 0
@@ -189,13 +190,13 @@ class _Bytes:
 
     def end(self) -> None:
         if self.at != len(self.data):
-            raise InputError(f"{self.path}: expected {self.at} bytes by its own counts, found {len(self.data)}")
+            raise InputError(f"{self.path}: expected {self.at} bytes by the counts in it, found {len(self.data)}")
 
     def _expect(self, size: int) -> None:
         if size > len(self.data) - self.at:
             raise InputError(
                 f"{self.path}: expected {size} more bytes at byte {self.at}, found {len(self.data) - self.at}; the "
-                "file is cut off or damaged"
+                "file is truncated or damaged"
             )
 
 
@@ -218,7 +219,7 @@ def _images_bin(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple
     for _ in range(file.count()):
         _, *pose, camera = file.take(head)
         name = file.text()
-        file.skip(24 * file.count())  # keypoints: x, y and the point's id
+        file.skip(24 * file.count())  # keypoints: x, y and id of the point
         yield name, camera, tuple(pose[:4]), tuple(pose[4:])
     file.end()
 
@@ -268,7 +269,7 @@ def _images_txt(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple
             except ValueError as error:
                 raise _damaged(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from error
             yield row
-            next(lines, None)  # its keypoints; the line may be empty
+            next(lines, None)  # the line of its keypoints, which may be empty
 
 
 def _points_txt(path: Path) -> Iterator[tuple[float, ...]]:

@@ -1,4 +1,4 @@
-"""From a dataset's photos and cameras to views: files found, distortion undone, pixels decoded and resampled."""
+"""Decode the photos of a dataset to `View` objects: undistorted, reduced, with their masks and cameras."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -20,15 +20,17 @@ from clsplat.panorama import FACES, bordered, face_positions, rotated
 from clsplat.scene import View
 
 SIZE_MAX = 1 << 20
-"""Pixels per edge; a larger size is damage, and undistortion takes time in proportion to it."""
+"""Largest width or height of a photo, px. A larger declared size means a damaged file; undistortion would take time
+in proportion to it."""
 
 ASPECT_TOLERANCE = 0.01
-"""By how much a photo's aspect ratio may differ from its camera's; a smaller copy is off by up to a pixel besides."""
+"""Largest relative difference between the aspect ratios of a photo and its camera. The size of a smaller copy may
+differ by up to a pixel in addition."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedPhoto:
-    """A photo as a dataset declares it.
+    """A photo and its camera, as a dataset declares them.
 
     Parameters
     ----------
@@ -39,13 +41,14 @@ class PosedPhoto:
     viewmat : (4, 4) float64
         World to camera, in world units.
     intrinsics : Intrinsics
-        With distortion, at the size the dataset declares.
+        Camera with its distortion, at the size that the dataset declares.
     mask : Path, optional
-        File of its mask.
+        File of the mask.
     held_out : bool, optional
-        Whether the dataset keeps it for testing; None where it does not say.
+        Whether the dataset assigns the photo to the test set; None if it does not define a split.
     face : str, optional
-        Of the panorama at `path`: the name of the face (`clsplat.panorama.FACES`) whose viewmat this is.
+        Name of a face of a cube (`clsplat.panorama.FACES`), if this photo is a face of the panorama at `path`;
+        `viewmat` is then that of the face.
     """
 
     name: str
@@ -58,7 +61,7 @@ class PosedPhoto:
 
 
 def by_faces(photos: list[PosedPhoto]) -> list[PosedPhoto]:
-    """The photos, with each equirectangular panorama, of viewmat, as six: ``a_front.jpg`` and so on for ``a.jpg``."""
+    """Replace each equirectangular panorama by six photos, the faces of a cube: ``a_front.jpg`` ... for ``a.jpg``."""
     result = []
     for photo in photos:
         if photo.intrinsics.model != "EQUIRECTANGULAR":
@@ -73,7 +76,7 @@ def by_faces(photos: list[PosedPhoto]) -> list[PosedPhoto]:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """What a reader finds out before any photo is decoded.
+    """A dataset before its photos are decoded, as the readers return it.
 
     Parameters
     ----------
@@ -82,11 +85,11 @@ class Dataset:
     points : (P, 3) float64
         Sparse points, in world units; P may be 0.
     colors : (P, 3) uint8
-        Their colours.
+        RGB of the points.
     reduce : int
-        Edge of the squares of pixels that are averaged into one; 1 where the files have the size asked for.
+        Edge, in pixels, of the squares that are averaged to one pixel; 1 if the files have the requested size.
     upright : bool
-        The cameras describe the photos turned as their EXIF orientation says, not as they are stored.
+        Whether the cameras describe the photos turned by their EXIF orientation, rather than as stored.
     """
 
     photos: list[PosedPhoto]
@@ -98,7 +101,7 @@ class Dataset:
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """How a photo becomes a view, known from the files' headers."""
+    """Everything needed to decode a photo to a view, determined from the files' headers."""
 
     photo: PosedPhoto
     camera: Camera
@@ -108,27 +111,26 @@ class _Plan:
 
 
 def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
-    """Decode a dataset's photos on several threads.
+    """Decode the photos of a dataset on several threads.
 
     All cameras and the headers of all files are checked before the first photo is decoded.
 
     Parameters
     ----------
     dataset : Dataset
-        From a reader.
     config : DataConfig
-        Its background is put behind transparent photos, and masks may be inverted.
+        Background behind transparent photos; whether masks are inverted.
 
     Returns
     -------
     list of View
-        In the order of the dataset's photos: undistorted, reduced.
+        Undistorted and reduced photos, in the order of `dataset.photos`.
 
     Raises
     ------
     InputError
-        If a pose is no rigid motion, a photo or mask cannot be decoded, or its shape is not its camera's; the message
-        names it.
+        If a pose is not a rigid motion, a photo or mask cannot be decoded, or its shape differs from its camera's;
+        the message names it.
     """
     from tqdm import tqdm
 
@@ -139,7 +141,7 @@ def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
 
 
 def load_view(photo: PosedPhoto, dataset: Dataset, config: DataConfig) -> View:
-    """Decode one of a dataset's photos, as `load_views` does, with its errors."""
+    """Decode one photo of a dataset; like `load_views`, with the same errors."""
     return _view(_plan(photo, dataset, config.invert_masks), dataset.reduce, config)
 
 
@@ -149,24 +151,24 @@ def _plan(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> _Plan:
     turned = orientation(photo.path) >= 5 if dataset.upright else False
     upright = dataset.upright
     if not upright and not _fits((width, height), declared) and _fits((height, width), declared):
-        # The pixels as stored have the other aspect: the cameras were found on photos that a program had turned.
+        # Width and height are swapped: the cameras were computed from photos that had been turned upright.
         upright = turned = orientation(photo.path) >= 5
     if turned:
         width, height = height, width
     if not _fits((width, height), declared):
         raise InputError(
-            f"{photo.path}: expected a photo of {declared.width}x{declared.height} pixels or a smaller copy of it, "
-            f"as its camera says, found {width}x{height}"
+            f"{photo.path}: expected {declared.width}x{declared.height} pixels, the size of its camera, or a smaller "
+            f"copy, found {width}x{height}"
         )
     sx, sy = width / declared.width, height / declared.height
     if photo.face:
-        # In the middle of a face, pixels are as small as on the panorama's equator.
+        # The centre of a face has as many pixels per angle as the equator of the panorama.
         edge = round(width / np.pi / dataset.reduce) * dataset.reduce
         target = Intrinsics("PINHOLE", (edge / 2 / sx, edge / 2 / sy, edge / 2 / sx, edge / 2 / sy), 0, 0)
         across = down = edge
     else:
         target = rendered(declared)
-        # An undistorted photo loses the last fraction of a pixel, one that is reduced what does not fill a square.
+        # Undistortion cuts off the last fraction of a pixel; reduction cuts off pixels that do not fill a square.
         across, down = floor(target.width * sx + 1e-6), floor(target.height * sy + 1e-6)
     fx, fy, cx, cy = (v * s / dataset.reduce for v, s in zip(target.params[:4], (sx, sy, sx, sy), strict=True))
     if min(across, down) < dataset.reduce:
@@ -192,7 +194,7 @@ def _view(plan: _Plan, reduce: int, config: DataConfig) -> View:
     image, mask = _pixels(plan, reduce, BACKGROUNDS[config.background])
     clear = None
     if config.random_background and is_transparent(photo.path):
-        # What shows of the background is what changes with it.
+        # The visible share of the background is the difference between the photo on white and on black.
         white, black = (_pixels(plan, reduce, BACKGROUNDS[name])[0].astype(float) for name in ("white", "black"))
         clear = np.rint((white - black).mean(axis=2)).astype(np.uint8)
     return View(photo.name, camera, np.ascontiguousarray(image), mask, clear)
@@ -201,10 +203,10 @@ def _view(plan: _Plan, reduce: int, config: DataConfig) -> View:
 def _pixels(
     plan: _Plan, reduce: int, background: tuple[float, float, float]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Photo and mask: decoded, undistorted, reduced."""
+    """Decode, undistort and reduce a photo and its mask."""
     photo, camera = plan.photo, plan.camera
     image = read_photo(photo.path, background, plan.upright)
-    # Inverted before it is averaged: a pixel counts if all that it is made of does.
+    # Inverted before the reduction: a reduced pixel is used only if all its source pixels are.
     mask = None if photo.mask is None else _fitted_mask(photo.mask, *image.shape[1::-1]) ^ plan.invert_mask
     positions = None
     if photo.face:
@@ -217,11 +219,11 @@ def _pixels(
         image = np.stack([_resample(image[..., channel], positions, 1) for channel in range(3)], axis=-1)
         mask = None if mask is None else _resample(mask, positions, 0)
     if reduce > 1:
-        # Sum by sum: NumPy's mean over two axes of bytes takes several times as long.
+        # Explicit sums: NumPy's mean over two axes of uint8 is several times slower.
         squares = _squares(image, camera, reduce)
         total = sum(squares[:, i, :, j].astype(np.uint16) for i in range(reduce) for j in range(reduce))
         image = np.rint(total / reduce**2).astype(np.uint8)
-        # A pixel that is averaged from a masked one does not count either.
+        # A pixel averaged from a masked one is masked as well.
         mask = None if mask is None else np.asarray(_squares(mask, camera, reduce).all(axis=(1, 3)))
     if camera.model == "fisheye":
         seen = _image_circle(camera)
@@ -231,7 +233,7 @@ def _pixels(
 
 
 def _image_circle(camera: Camera) -> NDArray[np.bool_]:
-    """Where a fisheye's image shows anything, (H, W): beyond, the lens's polynomial has no angle."""
+    """Compute the mask (H, W) of a fisheye's image circle. Outside it, the lens polynomial yields no angle."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return np.asarray(np.isfinite(camera.rays(u, v)[..., 0]))
 
@@ -242,11 +244,11 @@ def _squares(pixels: NDArray[Any], camera: Camera, edge: int) -> NDArray[Any]:
 
 
 def _fitted_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
-    """The mask at the photo's size: the nearest of its pixels where it has another one."""
+    """Read a mask and resize it to the photo's size, by nearest neighbour."""
     mask = read_mask(path)
     if not _fits((mask.shape[1], mask.shape[0]), Intrinsics("PINHOLE", (), width, height)):
         raise InputError(
-            f"{path}: expected a mask of the photo's shape, {width}x{height} pixels or another size of it, found "
+            f"{path}: expected a mask with the aspect ratio of the photo, {width}x{height} pixels, found "
             f"{mask.shape[1]}x{mask.shape[0]}"
         )
     rows = ((np.arange(height) + 0.5) * mask.shape[0] / height).astype(int)
@@ -254,30 +256,48 @@ def _fitted_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     return mask[np.ix_(rows, columns)]
 
 
-# Photos of one camera share it; photos with cameras of their own do not pile up.
+# Photos of one camera share an entry. The small size bounds the memory if every photo has its own camera.
 @lru_cache(maxsize=2)
 def _positions(intrinsics: Intrinsics, size: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Row and column indices, (2, H, W), at which an undistorted image's pixels lie in the distorted photo.
+    """Compute where the pixels of an undistorted image lie in the distorted photo.
 
-    `size` is the photo's width and height, `shape` the undistorted image's (H, W), in the same pixels.
+    Parameters
+    ----------
+    intrinsics : Intrinsics
+        The distorted camera.
+    size : (int, int)
+        Width and height of the photo, px.
+    shape : (int, int)
+        Height and width of the undistorted image, in the same pixels.
+
+    Returns
+    -------
+    (2, H, W) float32
+        Row and column indices, which count from pixel centres.
+
+    Raises
+    ------
+    InputError
+        If a pixel lies outside the photo.
     """
     sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
     fx, fy, cx, cy = undistorted(intrinsics).params
     positions = np.empty((2, *shape), dtype=np.float32)
-    with np.errstate(all="ignore"):  # what overflows is outside
+    with np.errstate(all="ignore"):  # positions that overflow lie outside, which is checked below
         x = ((np.arange(shape[1]) + 0.5) / sx - cx) / fx
         y = ((np.arange(shape[0]) + 0.5) / sy - cy) / fy
         for row in range(shape[0]):
             rays = np.stack([x, np.full_like(x, y[row]), np.ones_like(x)], axis=-1)
             positions[1, row], positions[0, row] = (project(intrinsics, rays) * (sx, sy)).T
-    # COLMAP looks at the photo's border alone; a pixel outside is more than the half that rounding may cost.
+    # COLMAP fits the undistorted camera to the photo's border only. Rounding accounts for half a pixel; a whole pixel
+    # outside is an error.
     inside = (positions > -1) & (positions < np.array(size[::-1]).reshape(2, 1, 1) + 1)
     if not inside.all():
         raise InputError(
             f"camera model {intrinsics.model}: expected a distortion that can be undone over the whole photo, found "
             f"parameters {intrinsics.params}"
         )
-    return positions - np.float32(0.5)  # indices count from pixel centres
+    return positions - np.float32(0.5)
 
 
 def _resample(channel: NDArray[Any], positions: NDArray[np.float32], order: int) -> NDArray[Any]:

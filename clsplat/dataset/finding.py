@@ -1,4 +1,4 @@
-"""Where the files of a dataset's photos and masks are."""
+"""Locate the files of a dataset's photos and masks from the names that its cameras give."""
 
 import warnings
 from collections.abc import Sequence
@@ -10,17 +10,17 @@ from clsplat.errors import InputError
 
 
 class PhotosMissing(InputError):
-    """None of a dataset's photos was found."""
+    """No photo of a dataset was found."""
 
 
 def checked_name(name: Any, source: Path) -> str:
-    """A path inside a dataset with forward slashes and without ``./``.
+    """Check a path inside a dataset and return it with forward slashes and without ``./``.
 
     Raises
     ------
     InputError
-        If it is no text, empty, absolute, or climbs out of the dataset; the message names the file `source` that
-        has it.
+        If it is not text, is empty or absolute, or leads out of the dataset; the message names the file `source` that
+        contains it.
     """
     path = PurePosixPath(name.replace("\\", "/")) if isinstance(name, str) else PurePosixPath()
     if not path.parts or path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts or "\0" in name:
@@ -29,28 +29,29 @@ def checked_name(name: Any, source: Path) -> str:
 
 
 def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path | None], int]:
-    """Find the files of photos, in the size asked for where the dataset has it.
+    """Locate the files of photos, in the requested size if the dataset has it.
 
     Parameters
     ----------
     root : Path
-        The dataset's folder.
+        Folder of the dataset.
     names : sequence of str
-        Paths inside it, checked; the ending may be missing or another one.
+        Paths inside `root`, checked by `checked_name`. The suffix may be missing or differ from the file's.
     downscale : int
-        For 2, 4 or 8, ``images_2/a.jpg`` is preferred to ``images/a.jpg``, unless it exists for fewer photos.
+        Requested reduction: 1, 2, 4 or 8. For 2, ``images_2/a.jpg`` is preferred to ``images/a.jpg``, unless it
+        exists for fewer photos; 4 and 8 likewise.
 
     Returns
     -------
     files : list of Path or None
-        Per name; None where there is no file. At least one is not None.
+        One entry per name; None if it has no file. At least one is not None.
     reduce : int
-        What remains of `downscale` after the choice of the folder.
+        Factor by which the files are still to be reduced: 1 if they already have the requested size.
 
     Raises
     ------
     PhotosMissing
-        If none is found; the message says which sizes exist.
+        If no photo is found; the message names the smaller sizes that exist.
     """
     full = [_find(root, name) for name in names]
     found = sum(file is not None for file in full)
@@ -61,21 +62,21 @@ def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path 
             return small, 1
         if found_small:
             warnings.warn(
-                f"{root}: copies {downscale} times smaller exist for {found_small} of {found} photos only; all are "
-                "resampled from the full size instead",
+                f"{root}: copies {downscale} times smaller exist for only {found_small} of {found} photos; all "
+                "photos are reduced from the full size instead",
                 stacklevel=2,
             )
     if found:
         return full, downscale
     sizes = [d for d in (2, 4, 8) if any(_find(root, name, d) is not None for name in names)]
     raise PhotosMissing(
-        f"{root / names[0]}: expected this photo and {len(names) - 1} others, found none of them"
-        + (f" but copies in smaller sizes: use downscale {' or '.join(map(str, sizes))}" if sizes else "")
+        f"cannot find any of the {len(names)} photos, the first of them {root / names[0]}"
+        + (f"; smaller copies exist: use downscale {' or '.join(map(str, sizes))}" if sizes else "")
     )
 
 
 def warn_of_missing(source: Path, names: Sequence[str], files: Sequence[Path | None]) -> None:
-    """Warn once of all the photos that `source` names and that have no file."""
+    """Warn, once, about the photos that `source` names but that have no file."""
     missing = [name for name, file in zip(names, files, strict=True) if file is None]
     if missing:
         warnings.warn(
@@ -89,7 +90,7 @@ def _find(root: Path, name: str, downscale: int = 1) -> Path | None:
     path = root / (name if downscale == 1 else f"{folder}_{downscale}/{rest}")
     if _is_file(path):
         return path
-    # Smaller copies often have another ending, and Blender's transforms leave it out.
+    # Smaller copies often have another suffix, and the transforms of Blender scenes omit it.
     stem = path.with_suffix("") if path.suffix.lower() in SUFFIXES else path
     candidates = (stem.with_name(stem.name + case) for suffix in SUFFIXES for case in (suffix, suffix.upper()))
     return next((file for file in candidates if _is_file(file)), None)
@@ -98,37 +99,35 @@ def _find(root: Path, name: str, downscale: int = 1) -> Path | None:
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
-    except OSError:  # a name that is longer than the system's files have
+    except OSError:  # the name is longer than the file system allows
         return False
 
 
 def find_mask(folder: Path, name: str) -> Path:
-    """File of the mask of the photo `name` in `folder`: ``NAME.png``, or ``NAME.jpg.png``.
+    """Locate the mask of the photo `name` in `folder`: for ``a.jpg``, ``a.png`` or ``a.jpg.png``.
 
     Raises
     ------
     InputError
-        If there is none.
+        If the photo has no mask.
     """
     plain = folder / name
     candidates = [plain.with_suffix(".png"), plain.with_name(plain.name + ".png")]
     for file in candidates:
         if _is_file(file):
             return file
-    raise InputError(
-        f"{candidates[0]}: expected the mask of photo {name} there or in {candidates[1].name}, found none"
-    )
+    raise InputError(f"cannot find the mask of photo {name}: neither {candidates[0]} nor {candidates[1].name} exists")
 
 
 def mask_folder(root: Path, masks: str) -> Path:
-    """The folder of masks: `masks` inside the dataset `root` where that exists, otherwise from where we are.
+    """Locate the folder of masks: `masks` inside the dataset `root`, or relative to the working directory.
 
     Raises
     ------
     InputError
-        If it does not exist.
+        If neither exists.
     """
     for folder in (root / masks, Path(masks)):
         if folder.is_dir():
             return folder
-    raise InputError(f"masks: expected a folder, found none at {root / masks} nor at {Path(masks)}")
+    raise InputError(f"masks: expected a folder, found neither {root / masks} nor {Path(masks)}")

@@ -1,4 +1,4 @@
-"""COLMAP's camera models, through pycolmap: fisheyes as they are, other distorted cameras made pinholes."""
+"""COLMAP's camera models, through pycolmap: fisheyes are kept, other distorted cameras become pinholes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -7,22 +7,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Not for its names: a Pillow that is loaded after pycolmap 4.2.1 takes over some of the zlib inside it and crashes
-# when it writes a PNG. Loaded first, it keeps its own.
+# Imports Pillow before pycolmap. Loaded after pycolmap 4.2.1, Pillow uses parts of the zlib inside pycolmap and
+# crashes when it writes a PNG.
 import clsplat.dataset.photos  # noqa: F401
 from clsplat.errors import InputError
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A camera as COLMAP describes it, without its pose.
+    """The intrinsics of a camera, as COLMAP defines them.
 
     Parameters
     ----------
     model : str
         Name of a COLMAP camera model.
     params : tuple of float
-        Its parameters in COLMAP's order, focal lengths and principal point in pixels.
+        Parameters in COLMAP's order; focal lengths and principal point in pixels.
     width, height : int
         Image size in pixels.
     """
@@ -33,7 +33,7 @@ class Intrinsics:
     height: int
 
 
-# How the parameters of COLMAP's fisheyes whose radius is a polynomial of the angle become OPENCV_FISHEYE's.
+# Conversions of parameters to OPENCV_FISHEYE, for COLMAP's fisheyes whose radius is a polynomial of the angle.
 _FISHEYES: dict[str, Callable[..., tuple[float, ...]]] = {
     "OPENCV_FISHEYE": lambda *params: params,
     "FISHEYE": lambda fx, fy, cx, cy: (fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0),
@@ -44,13 +44,18 @@ _FISHEYES: dict[str, Callable[..., tuple[float, ...]]] = {
 
 
 def rendered(intrinsics: Intrinsics) -> Intrinsics:
-    """The camera that is rendered in a photo's place.
+    """Choose the camera with which a photo is rendered.
 
     Returns
     -------
     Intrinsics
-        Of model OPENCV_FISHEYE and the photo's size where the model is a fisheye with a polynomial of the angle:
-        kernels project to it, and nothing of the photo is lost. Otherwise as `undistorted`, with its errors.
+        For fisheyes whose radius is a polynomial of the angle: model OPENCV_FISHEYE at the photo's size. The kernels
+        project to this model, so that no part of the photo is lost. For other models: `undistorted`.
+
+    Raises
+    ------
+    InputError
+        As `undistorted`.
     """
     if intrinsics.model in _FISHEYES:
         _camera(intrinsics)  # checks the number of parameters
@@ -59,18 +64,18 @@ def rendered(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def undistorted(intrinsics: Intrinsics) -> Intrinsics:
-    """The pinhole camera that COLMAP's undistorter makes of a camera.
+    """Compute the pinhole camera of an undistorted photo, as COLMAP's undistorter does.
 
     Parameters
     ----------
     intrinsics : Intrinsics
-        Any perspective or fisheye model.
+        Camera of any perspective or fisheye model.
 
     Returns
     -------
     Intrinsics
-        Of model PINHOLE. Where the camera is one already, its size stays; otherwise it sees the largest centred
-        rectangle that holds no pixel from outside the photo (COLMAP's blank_pixels = 0).
+        Camera of model PINHOLE. A camera without distortion keeps its size. Otherwise the image is the largest
+        centred rectangle that contains no pixel from outside the photo (COLMAP's blank_pixels = 0).
 
     Raises
     ------
@@ -97,9 +102,9 @@ def undistorted(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def is_pinhole(intrinsics: Intrinsics) -> bool:
-    """Whether the camera maps straight lines to straight lines: no distortion coefficient is set.
+    """Whether the camera maps straight lines to straight lines: all distortion coefficients are zero.
 
-    Fisheye models are none even with all coefficients zero, since their radius grows with the angle.
+    Fisheye models are never pinholes, even with zero coefficients, since their radius grows with the angle.
     """
     if intrinsics.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return True
@@ -108,19 +113,19 @@ def is_pinhole(intrinsics: Intrinsics) -> bool:
 
 
 def project(intrinsics: Intrinsics, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where points appear in the distorted photo.
+    """Project points to the distorted photo.
 
     Parameters
     ----------
     intrinsics : Intrinsics
-        Of any model.
+        Camera of any model.
     points : (N, 3) float64
-        In camera coordinates (x right, y down, z forward).
+        Points in camera coordinates (x right, y down, z forward).
 
     Returns
     -------
     (N, 2) float64
-        In pixels, from the upper left corner of the photo; NaN behind the camera.
+        Positions in pixels, from the upper left corner of the photo; NaN for points behind the camera.
     """
     pixels: NDArray[np.float64] = _camera(intrinsics).img_from_cam(points)
     return pixels
@@ -145,7 +150,7 @@ def _camera(intrinsics: Intrinsics) -> Any:
 
 
 def camera_models() -> list[str]:
-    """Camera models that can become a pinhole."""
+    """List the COLMAP camera models that can become a pinhole."""
     import pycolmap
 
     return [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]

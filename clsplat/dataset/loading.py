@@ -1,4 +1,4 @@
-"""From a folder to a `Scene`: what kind of dataset it is, which photos are held out, where the origin lies."""
+"""Load a folder as a `Scene`: detect the kind of dataset, hold out photos, choose the origin and the near plane."""
 
 import warnings
 from dataclasses import replace
@@ -18,73 +18,69 @@ from clsplat.errors import InputError
 from clsplat.scene import Scene, View
 
 OFFSET_EXTENTS = 1000
-"""Scene extents that the cameras may lie from the origin before it is moved to them. There float32 still tells apart
-6e-5 extents; farther out positions would lose what training moves them by."""
+"""Largest distance of the cameras from the origin, in scene extents, at which the origin is kept. Farther out, it is
+moved to the cameras. At this distance float32 resolves 6e-5 extents; a coarser resolution would lose the small steps
+of training."""
 
 NEAR_SHARE = 0.1
-"""Of the depth of a scene's nearest points, before which nothing is drawn. In the scenes of the original, whose near
-plane is at 0.2, that is about as much; castle_p30 gains 4 dB (docs/stability.md)."""
+"""Depth of the near plane as a fraction of the depth of the nearest points. In the scenes of the original paper this
+is close to the 0.2 world units of its code. Effect: docs/stability.md."""
 
 NEAR_QUANTILE = 0.01
-"""Of the depths of the points that a photo shows: the nearest of all may be a wrong one."""
+"""Quantile of the depths of the points in a photo that counts as the depth of the nearest points. The nearest point
+itself may be an outlier."""
 
 NEAR_POINTS = 10_000
-"""So many points are enough to find that out."""
+"""Approximate number of points from which the near plane is computed; the others are skipped."""
 
 
 def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> Scene:
-    """Load a dataset with its photos.
+    """Load a dataset and decode its photos.
 
     Parameters
     ----------
     path : str or Path
-        A folder with a COLMAP model (in ``sparse/0``, ``sparse``, ``colmap/sparse/0`` or itself) and photos (in
-        ``images`` or itself); or with ``transforms.json`` or ``transforms_train.json``; or with photos alone, whose
-        cameras are then recovered by `clsplat.dataset.sfm.reconstruction` and kept there. The first of these that
-        fits counts.
+        Folder of one of these kinds; the first that fits is used:
+
+        * a COLMAP model (in ``sparse/0``, ``sparse``, ``colmap/sparse/0`` or the folder itself) and photos (in
+          ``images`` or the folder itself);
+        * ``transforms.json`` or ``transforms_train.json``;
+        * photos alone, whose cameras are recovered by `clsplat.dataset.sfm.reconstruction` and stored in the folder.
     config : DataConfig
-        Which photos are read, and how.
+        Size, background, masks and split of the photos.
     verbose : bool
-        Show COLMAP's own messages.
+        Whether to show COLMAP's own messages.
 
     Returns
     -------
     Scene
-        Photos undistorted, sorted by name; every `config.test_every`-th held out unless the dataset says which.
-        Their cameras draw nothing before the `near_plane`.
+        Undistorted photos, sorted by name. Every `config.test_every`-th photo is held out, unless the dataset defines
+        a split. Their cameras draw nothing before the depth `near_plane`.
 
     Raises
     ------
     InputError
-        If nothing usable is found, a file is missing or damaged, or no photo is left to train on; the message names
-        the file.
+        If the folder holds no dataset, a file is missing or damaged, or no photo is left to train on; the message
+        names the file.
 
     Warns
     -----
     UserWarning
-        If some of the photos with a camera have no file, or only some exist in the size asked for.
+        If some photos with a camera have no file, or only some exist in the requested size.
     """
     path = Path(path)
     if not path.is_dir():
-        raise InputError(f"{path}: expected a dataset's folder, found {'a file' if path.exists() else 'nothing'}")
+        raise InputError(
+            f"{path}: expected the folder of a dataset, found {'a file' if path.exists() else 'nothing'}"
+        )
     if config.downscale not in (1, 2, 4, 8):
         raise InputError(f"downscale: expected 1, 2, 4 or 8, found {config.downscale}")
     if config.test_every < 0:
         raise InputError(f"test_every: expected 0 or more, found {config.test_every}")
-    dataset = _find(path, config, verbose)
+    dataset = _read_dataset(path, config, verbose)
     dataset = replace(dataset, photos=by_faces(dataset.photos))
-    photos = {photo.name: photo for photo in dataset.photos}
     views = sorted(load_views(dataset, config), key=lambda view: view.name)
-    train: list[View] = []
-    test: list[View] = []
-    numbers: dict[str, int] = {}  # the faces of a panorama have one number: they are held out together
-    for view in views:
-        photo = photos[view.name]
-        is_test = photo.held_out
-        if is_test is None:
-            index = numbers.setdefault(str(photo.path) if photo.face else view.name, len(numbers))
-            is_test = config.test_every > 0 and index % config.test_every == 0
-        (test if is_test else train).append(view)
+    train, test = _split(views, dataset, config.test_every)
     if not train:
         raise InputError(
             f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
@@ -92,27 +88,43 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
     return _with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
 
 
-def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: bool = False) -> Scene:
-    """The scene with points triangulated from the photos to train on, where it has none, and filled up.
+def _split(views: list[View], dataset: Dataset, test_every: int) -> tuple[list[View], list[View]]:
+    """Split views, sorted by name, into those to train on and those held out."""
+    photos = {photo.name: photo for photo in dataset.photos}
+    train: list[View] = []
+    test: list[View] = []
+    numbers: dict[str, int] = {}  # the faces of a panorama share a number, so that they are held out together
+    for view in views:
+        photo = photos[view.name]
+        is_test = photo.held_out
+        if is_test is None:
+            index = numbers.setdefault(str(photo.path) if photo.face else view.name, len(numbers))
+            is_test = test_every > 0 and index % test_every == 0
+        (test if is_test else train).append(view)
+    return train, test
 
-    Training would start from random points, which cost 3 to 7 dB in short runs (docs/stability.md).
+
+def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: bool = False) -> Scene:
+    """Triangulate points from the training photos, if the scene has none, and add points between them.
+
+    Without points, training starts from random ones. The cost is measured in docs/stability.md.
 
     Parameters
     ----------
     scene : Scene
-        From `load_scene`.
+        As returned by `load_scene`.
     path : str or Path
-        The dataset that it was loaded from: features come from the photos as large as they are there, up to
+        The dataset from which it was loaded. Features are detected in the photos at their full size, up to
         `clsplat.dataset.sfm.triangulation.EDGE_MAX`.
     config : DataConfig
-        That it was loaded with.
+        The options with which it was loaded.
     verbose : bool
-        Show COLMAP's own messages.
+        Whether to show COLMAP's own messages.
 
     Returns
     -------
     Scene
-        Without points as before where the photos show too few.
+        The scene with points; still without points if the photos show too few.
 
     Raises
     ------
@@ -133,17 +145,18 @@ def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: boo
 
 
 def _full_size(path: Path, config: DataConfig) -> Dataset:
-    """The dataset with its photos' own size; that of `config` where only smaller copies are here."""
+    """Read the dataset with photos of full size; with the size of `config` if only smaller copies exist."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is missing has been told
+        warnings.simplefilter("ignore")  # load_scene has warned of missing photos
         try:
-            dataset = _find(path, replace(config, downscale=1), verbose=False)
+            dataset = _read_dataset(path, replace(config, downscale=1), verbose=False)
         except InputError:
-            dataset = _find(path, config, verbose=False)
+            dataset = _read_dataset(path, config, verbose=False)
     return replace(dataset, photos=by_faces(dataset.photos))
 
 
-def _find(path: Path, config: DataConfig, verbose: bool) -> Dataset:
+def _read_dataset(path: Path, config: DataConfig, verbose: bool) -> Dataset:
+    """Read a dataset of any kind; recover the cameras if it has none."""
     record = sfm.read_record(path)
     model = colmap.find_model(path)
     has_transforms = bool(transforms.find_transforms(path))
@@ -162,14 +175,14 @@ def _find(path: Path, config: DataConfig, verbose: bool) -> Dataset:
     photos, options = path, config.sfm
     if record is not None:
         photos = path / record["photos"]
-        # Nobody who recovered the cameras with options of their own wants them redone with the defaults.
+        # Cameras that were recovered with other options are kept, unless options are given now.
         options = options if options != SfmConfig() else SfmConfig(**record["options"])
     model = sfm.reconstruct(photos, options, path, verbose)
     return colmap.read_dataset(path, model, config, photos)
 
 
 def _near_origin(scene: Scene) -> Scene:
-    """The scene with its cameras around the origin, if they were too far from it for float32."""
+    """Move the origin of the scene to its cameras, if they are too far from it for float32."""
     views = scene.train + scene.test
     centre = np.mean([view.camera.position for view in views], axis=0)
     if np.linalg.norm(centre) <= OFFSET_EXTENTS * scene.extent:
@@ -182,16 +195,16 @@ def _near_origin(scene: Scene) -> Scene:
 
 
 def near_plane(scene: Scene) -> float:
-    """A depth in world units before which the scene's points say that there is nothing.
+    """Compute a depth of the near plane at which the scene's points show that nothing is closer.
 
-    Gaussians that a camera nearly touches, of a wall beside the photographer for example, spread over its whole
-    image: the photo next to it needs them, this one does not know them, and a held-out one is spoilt.
+    A Gaussian very close to a camera, for example of a wall next to the photographer, covers the camera's whole
+    image. A neighbouring photo may need this Gaussian. A held-out photo from such a camera would be covered by it.
 
     Returns
     -------
     float
-        `NEAR_SHARE` of the depth of the nearest points, by the training photo that comes nearest to them; `NEAR`
-        where no photo shows points enough.
+        Depth in world units: `NEAR_SHARE` times the depth of the nearest points in any training photo; `NEAR` if no
+        photo shows enough points.
     """
     points = scene.points[:: max(1, len(scene.points) // NEAR_POINTS)]
     nearest = np.inf
@@ -200,7 +213,7 @@ def near_plane(scene: Scene) -> float:
         x, y, depths = points_camera[points_camera[:, 2] > 0].T
         u, v = camera.fx * x / depths + camera.cx, camera.fy * y / depths + camera.cy
         seen = depths[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)]
-        if len(seen) * NEAR_QUANTILE >= 1:  # of fewer it would be the nearest point, which may be a wrong one
+        if len(seen) * NEAR_QUANTILE >= 1:  # otherwise the quantile is the nearest point
             nearest = min(nearest, float(np.quantile(seen, NEAR_QUANTILE)))
     return NEAR_SHARE * nearest if np.isfinite(nearest) else NEAR
 
@@ -208,7 +221,7 @@ def near_plane(scene: Scene) -> float:
 def _with_near_planes(scene: Scene) -> Scene:
     near = near_plane(scene)
 
-    def told(part: list[View]) -> list[View]:
+    def with_near(part: list[View]) -> list[View]:
         return [replace(view, camera=replace(view.camera, near=near)) for view in part]
 
-    return replace(scene, train=told(scene.train), test=told(scene.test))
+    return replace(scene, train=with_near(scene.train), test=with_near(scene.test))

@@ -1,4 +1,4 @@
-"""Photos as files: which there are, how large they are, and their pixels as 8-bit RGB."""
+"""Photo files: list them, read their size and orientation, decode them to 8-bit RGB."""
 
 import io
 import os
@@ -14,31 +14,32 @@ from PIL import ExifTags, Image, ImageOps
 from clsplat.errors import InputError
 
 HEIF = (".heic", ".heif")
-"""Endings, in lower case, of photos that are read by pillow-heif."""
+"""Suffixes, in lower case, of the photos that need pillow-heif."""
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF)
-"""Endings, in lower case, of the files that count as photos."""
+"""Suffixes, in lower case, of the files that count as photos."""
 
 SHARPNESS_EDGE = 640
-"""Longer edge, in pixels, of the copies whose sharpness is compared: motion blurs wider than this, noise is finer."""
+"""Longer edge, in pixels, to which photos are reduced before their sharpness is measured. Motion blur is still
+visible at this size; noise is averaged out."""
 
 FRAMES = "clsplat_frames.json"
-"""File among photos that are the frames of a video, in the order of their names: which video, and how they were
-chosen."""
+"""Name of the file that marks a folder of photos as frames of a video, in the order of their names. It records the
+video and how the frames were chosen."""
 
 TRANSPARENT = ("RGBA", "RGBa", "LA", "La", "PA")
-"""Pillow's modes with an alpha channel."""
+"""Pillow image modes with an alpha channel."""
 
 
 def photo_folder(path: Path) -> Path:
-    """Where the photos of the dataset `path` are: its folder ``images``, or `path` itself where there is none."""
+    """Return the folder with the photos of a dataset: its folder ``images`` if it exists, otherwise `path` itself."""
     return path / "images" if (path / "images").is_dir() else path
 
 
 def list_photos(path: Path) -> list[str]:
-    """Names of the photos of the dataset `path`, sorted, relative to `photo_folder`, with forward slashes.
+    """List the photos of the dataset `path`: sorted names, relative to `photo_folder`, with forward slashes.
 
-    Sub-folders count inside ``images`` only: elsewhere they may hold masks, smaller copies and results.
+    Sub-folders are searched inside ``images`` only. Elsewhere they may hold masks, smaller copies or results.
     """
     folder = photo_folder(path)
     files = folder.glob("*") if folder == path else folder.rglob("*")
@@ -51,7 +52,10 @@ def list_photos(path: Path) -> list[str]:
 
 @cache
 def heif_is_read() -> bool:
-    """Teach Pillow to read HEIF, where pillow-heif is installed; such photos come upright."""
+    """Register pillow-heif with Pillow and return whether it is installed.
+
+    pillow-heif applies the orientation itself: HEIF photos are upright when opened.
+    """
     try:
         from pillow_heif import register_heif_opener
     except ImportError:
@@ -61,7 +65,10 @@ def heif_is_read() -> bool:
 
 
 class _Bounded(io.BufferedReader):
-    """A file that makes room for no more bytes than it has: decoders ask for as many as damaged headers announce."""
+    """A file whose `read` allocates no more bytes than the file has.
+
+    Decoders request as many bytes as the header declares, which in a damaged file may be any number.
+    """
 
     def read(self, size: int | None = -1, /) -> bytes:
         rest = max(0, os.fstat(self.fileno()).st_size - self.tell())
@@ -72,39 +79,38 @@ class _Bounded(io.BufferedReader):
 def _opened(path: Path) -> Iterator[Image.Image]:
     if path.suffix.lower() in HEIF and not heif_is_read():
         raise InputError(
-            f"{path}: expected the package pillow-heif, which reads this photo, found none: pip install "
-            "'clsplat[heic]', or convert the photos to JPEG"
+            f"cannot read {path}: the package pillow-heif is not installed; pip install 'clsplat[heic]', or convert "
+            "the photos to JPEG"
         )
     try:
         with _Bounded(io.FileIO(path)) as file, Image.open(file) as image:
             yield image
     except InputError:
         raise
-    except Exception as error:  # damaged files make decoders raise anything: OSError, SyntaxError, zlib.error ...
-        raise InputError(
-            f"{path}: expected an image that can be decoded, found {error or type(error).__name__}"
-        ) from error
+    # Decoders raise many kinds of exceptions on damaged files: OSError, SyntaxError, zlib.error ...
+    except Exception as error:
+        raise InputError(f"cannot read {path} as an image: {error or type(error).__name__}") from error
 
 
 def photo_size(path: Path) -> tuple[int, int]:
-    """Width and height of the pixels as stored; reads the file's header only.
+    """Read the width and height of a photo as stored, in pixels, from the file's header.
 
     Raises
     ------
     InputError
-        If the file is no image.
+        If the file is not an image.
     """
     with _opened(path) as image:
         return image.size
 
 
 def orientation(path: Path) -> int:
-    """EXIF orientation, 1 to 8; 1 where the file names none or an unknown one. A PNG is decoded for it.
+    """Read the EXIF orientation, 1 to 8; 1 if it is missing or unknown. A PNG is decoded for this.
 
     Raises
     ------
     InputError
-        If the file is no image.
+        If the file is not an image.
     """
     with _opened(path) as image:
         tag = image.getexif().get(ExifTags.Base.Orientation, 1)
@@ -112,15 +118,15 @@ def orientation(path: Path) -> int:
 
 
 def is_plain(path: Path) -> bool:
-    """Whether every reader sees these pixels alike: an upright JPEG or PNG, 8-bit RGB or grey.
+    """Whether every program decodes the photo to the same pixels: an upright JPEG or PNG, 8-bit RGB or grey.
 
     Raises
     ------
     InputError
-        If the file is no image.
+        If the file is not an image.
     """
     with _opened(path) as image:
-        # An MPO is a JPEG with further pictures behind the first, as some phones and 3D cameras write it.
+        # An MPO is a JPEG followed by further pictures, as some phones and 3D cameras write it.
         plain = image.format in ("JPEG", "MPO", "PNG") and image.mode in ("RGB", "L")
         transparent = "transparency" in image.info
     return plain and not transparent and orientation(path) == 1
@@ -132,16 +138,16 @@ def is_transparent(path: Path) -> bool:
     Raises
     ------
     InputError
-        If the file is no image.
+        If the file is not an image.
     """
     with _opened(path) as image:
         return image.mode in TRANSPARENT or "transparency" in image.info
 
 
 def write_upright_png(source: Path, target: Path) -> None:
-    """Write the photo `source` as an upright 8-bit RGB PNG, whatever the ending of `target`.
+    """Write the photo `source` as an upright 8-bit RGB PNG, whatever the suffix of `target`.
 
-    EXIF data other than the orientation go along: structure from motion finds the focal length there.
+    EXIF data other than the orientation are copied: structure from motion reads the focal length from them.
 
     Raises
     ------
@@ -153,7 +159,7 @@ def write_upright_png(source: Path, target: Path) -> None:
         exif = upright.getexif()
         rgb = Image.fromarray(_rgb(upright, (0.0, 0.0, 0.0), source))
     target.parent.mkdir(parents=True, exist_ok=True)
-    rgb.save(target, format="PNG", exif=exif, compress_level=1)  # read once, then deleted: speed before size
+    rgb.save(target, format="PNG", exif=exif, compress_level=1)  # a temporary file: fast rather than small
 
 
 def read_photo(path: Path, background: tuple[float, float, float], upright: bool) -> NDArray[np.uint8]:
@@ -162,11 +168,11 @@ def read_photo(path: Path, background: tuple[float, float, float], upright: bool
     Parameters
     ----------
     path : Path
-        Any kind of file in `SUFFIXES`: grey, palette, CMYK, transparent, 16 bits (of which the upper 8 count).
+        File of any kind in `SUFFIXES`: grey, palette, CMYK, transparent, 16 bits (the upper 8 are used).
     background : (3,) float
         RGB in [0, 1] behind transparent pixels.
     upright : bool
-        Turn the pixels as the EXIF orientation says; otherwise they stay as they are stored.
+        Whether to turn the pixels by the EXIF orientation; otherwise they are returned as stored.
 
     Returns
     -------
@@ -176,7 +182,7 @@ def read_photo(path: Path, background: tuple[float, float, float], upright: bool
     Raises
     ------
     InputError
-        If the file is damaged, no image, or has floating-point or 32-bit pixels; the message names it.
+        If the file is damaged, is not an image, or has floating-point or 32-bit pixels; the message names it.
     """
     with _opened(path) as image:
         return _rgb(ImageOps.exif_transpose(image) if upright else image, background, path)
@@ -188,7 +194,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     Raises
     ------
     InputError
-        If the file cannot be decoded, or has no white but greys: a mask of 0 and 1 would hide everything.
+        If the file cannot be decoded, or has grey pixels but no white ones: a mask of 0 and 1 would hide everything.
     """
     with _opened(path) as image:
         values = _rgb(image, (0.0, 0.0, 0.0), path).max(axis=2)
@@ -215,7 +221,7 @@ def _rgb(image: Image.Image, background: tuple[float, float, float], path: Path)
 
 
 def photo_sharpness(path: Path) -> float:
-    """`sharpness` of a photo at `SHARPNESS_EDGE`.
+    """Measure the `sharpness` of a photo reduced to `SHARPNESS_EDGE`.
 
     Raises
     ------
@@ -223,15 +229,17 @@ def photo_sharpness(path: Path) -> float:
         If the file cannot be decoded.
     """
     with _opened(path) as image:
-        image.draft("L", (SHARPNESS_EDGE, SHARPNESS_EDGE))  # JPEG: decodes a smaller copy, in a fraction of the time
+        image.draft("L", (SHARPNESS_EDGE, SHARPNESS_EDGE))  # decodes a JPEG at a smaller size, which is faster
         grey = Image.fromarray(_rgb(image, (0.0, 0.0, 0.0), path)).convert("L")
     grey.thumbnail((SHARPNESS_EDGE, SHARPNESS_EDGE))
     return sharpness(np.asarray(grey))
 
 
 def sharpness(grey: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian of an image (H, W): less for a blurred photo of the same (Pech-Pacheco et al. 2000,
-    doi:10.1109/ICPR.2000.903548)."""
+    """Measure the sharpness of a grey image (H, W): the variance of its Laplacian, which blur lowers.
+
+    Pech-Pacheco et al. 2000, doi:10.1109/ICPR.2000.903548.
+    """
     g = grey.astype(np.float32)
     laplacian = g[1:-1, :-2] + g[1:-1, 2:] + g[:-2, 1:-1] + g[2:, 1:-1] - 4 * g[1:-1, 1:-1]
     return float(laplacian.var(dtype=np.float64)) if laplacian.size else 0.0

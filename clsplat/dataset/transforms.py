@@ -1,7 +1,8 @@
-"""Reader of transforms.json: the dialects of NeRF's Blender scenes, instant-ngp and nerfstudio.
+"""Read transforms.json in the dialects of NeRF's Blender scenes, instant-ngp and nerfstudio.
 
-A camera is a camera-to-world matrix in OpenGL axes (x right, y up, z back) and intrinsics, of the file or of the
-frame. nerfstudio's ``applied_transform`` is contained in its cameras and points already, and is left as it is.
+A camera consists of a camera-to-world matrix in OpenGL axes (x right, y up, z back) and intrinsics, given for the
+whole file or per frame. nerfstudio's ``applied_transform`` is already contained in its cameras and points, and is
+ignored.
 """
 
 import json
@@ -18,20 +19,24 @@ from clsplat.dataset.finding import checked_name, find_mask, locate, mask_folder
 from clsplat.dataset.lenses import Intrinsics
 from clsplat.dataset.photos import photo_size
 from clsplat.errors import InputError
-from clsplat.formats.ply import read_points
+from clsplat.formats.ply_container import read_points
 
 PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE")
-"""Values of ``camera_model``; whichever it is, the coefficients that are given count and the others are zero."""
+"""Accepted values of ``camera_model``. For all of them, the given distortion coefficients are used and missing ones
+are zero."""
 
 Json = dict[str, Any]
 
 
 def find_transforms(root: Path) -> list[tuple[Path, bool | None]]:
-    """The files with the cameras of the dataset `root`, each with whether its photos are held out.
+    """Find the files with the cameras of the dataset `root`.
 
-    ``transforms_train.json`` and ``transforms_test.json`` (or ``_val``), otherwise ``transforms.json`` (None: no
-    split); empty where there is neither.
+    Returns
+    -------
+    list of (Path, bool or None)
+        Each file with whether its photos are held out: ``transforms_train.json`` and ``transforms_test.json`` (or
+        ``_val``); otherwise ``transforms.json`` with None, since it defines no split. Empty if there is neither.
     """
     train = root / "transforms_train.json"
     if train.is_file():
@@ -42,26 +47,26 @@ def find_transforms(root: Path) -> list[tuple[Path, bool | None]]:
 
 
 def read_dataset(root: Path, config: DataConfig) -> Dataset:
-    """Read the transforms.json of the dataset `root` and find its photos, masks and points.
+    """Read the transforms.json of the dataset `root` and locate its photos, masks and points.
 
     Parameters
     ----------
     root : Path
-        The dataset's folder, for which `find_transforms` finds a file.
+        Folder of the dataset, in which `find_transforms` finds a file.
     config : DataConfig
-        Size of the photos, folder of the masks (before the frames' own ``mask_path``).
+        Size of the photos, folder of the masks (takes precedence over the frames' ``mask_path``).
 
     Returns
     -------
     Dataset
-        Photos without a file are left out with a warning. Points come from ``ply_file_path``.
+        Photos without a file are left out with a warning. Points are read from ``ply_file_path``.
 
     Raises
     ------
     PhotosMissing
-        If there is none of the photos.
+        If no photo is found.
     InputError
-        If a file is damaged, a value is missing or no number, or a mask is missing; the message names it.
+        If a file is damaged, a value is missing or not a number, or a mask is missing; the message names it.
     """
     metas = [(path, held_out, _read_json(path)) for path, held_out in find_transforms(root)]
     frames = [
@@ -93,10 +98,10 @@ def _read_json(path: Path) -> Json:
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
     except (RecursionError, ValueError) as error:
-        raise InputError(f"{path}: expected JSON, found an error: {error}") from error
+        raise InputError(f"cannot read {path} as JSON: {error}") from error
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise InputError(f'{path}: expected a list "frames" with at least one photo, found none')
+        raise InputError(f'{path}: expected a list "frames" with at least one frame, found none')
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise InputError(f'{path}: expected a "file_path" in every frame, found none in frame {number}')
@@ -104,7 +109,7 @@ def _read_json(path: Path) -> Json:
 
 
 def _is_held_out(frame: Json, meta: Json, held_out: bool | None) -> bool | None:
-    """The split of the files' names, or nerfstudio's lists of file names."""
+    """Whether a frame is held out, by the name of its file (`held_out`) or by nerfstudio's lists of file names."""
     lists = [meta[key] for key in ("test_filenames", "val_filenames") if isinstance(meta.get(key), list)]
     return any(frame["file_path"] in names for names in lists) if lists and held_out is None else held_out
 
@@ -123,7 +128,7 @@ def _is_number(value: Any) -> bool:
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # an int beyond all floats
+    except OverflowError:  # an int larger than any float
         return False
 
 
@@ -133,7 +138,7 @@ def _number_or(default: float, frame: Json, key: str, where: str) -> float:
 
 
 def _intrinsics(frame: Json, where: str, file: Path, downscaled: int) -> Intrinsics:
-    """Intrinsics at the declared size; where none is declared, that of the file times `downscaled`."""
+    """Read the intrinsics of a frame, at its declared size; by default that of the file times `downscaled`."""
     stored = photo_size(file)
     width = round(_number_or(stored[0] * downscaled, frame, "w", where))
     height = round(_number_or(stored[1] * downscaled, frame, "h", where))
@@ -143,7 +148,7 @@ def _intrinsics(frame: Json, where: str, file: Path, downscaled: int) -> Intrins
     if model == "EQUIRECTANGULAR":
         return Intrinsics("EQUIRECTANGULAR", (float(width), float(height)), width, height)
     fx, fy = _focal(frame, "x", width, where), _focal(frame, "y", height, where)
-    fx, fy = fx or fy, fy or fx  # one alone stands for square pixels
+    fx, fy = fx or fy, fy or fx  # a single focal length means square pixels
     if fx is None or fy is None:
         raise InputError(f"{where}: expected fl_x or camera_angle_x, found neither")
     cx, cy = _number_or(width / 2, frame, "cx", where), _number_or(height / 2, frame, "cy", where)
@@ -162,7 +167,7 @@ def _intrinsics(frame: Json, where: str, file: Path, downscaled: int) -> Intrins
     if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
         return Intrinsics("PINHOLE", (fx, fy, cx, cy), width, height)
     if (k4 or k5 or k6) and model != "FULL_OPENCV":
-        # nerfstudio's k4 belongs to r^8, OpenCV's divides: neither may be taken for the other.
+        # In nerfstudio k4 is the coefficient of r^8, in OpenCV it is in the denominator. The file does not say which.
         raise InputError(f"{where}: expected at most k1, k2, k3, p1, p2 for a {model} camera, found k4, k5 or k6")
     return Intrinsics("FULL_OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6), width, height)
 
@@ -180,7 +185,7 @@ def _focal(frame: Json, axis: str, edge: int, where: str) -> float | None:
 
 
 def _viewmat(frame: Json, path: Path, name: str) -> NDArray[np.float64]:
-    """World to camera in OpenCV axes."""
+    """Convert a frame's matrix to a viewmat: world to camera, in OpenCV axes."""
     try:
         matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
     except (OverflowError, TypeError, ValueError):
@@ -189,17 +194,17 @@ def _viewmat(frame: Json, path: Path, name: str) -> NDArray[np.float64]:
     if matrix.shape in ((4, 4), (3, 4)):
         rotation = matrix[:3, :3] * (1.0, -1.0, -1.0)
         viewmat[:3, :3] = rotation.T
-        with np.errstate(over="ignore", invalid="ignore"):  # of a damaged file; refused below
+        with np.errstate(over="ignore", invalid="ignore"):  # numbers of a damaged file; rejected below
             viewmat[:3, 3] = -rotation.T @ matrix[:3, 3]
     else:
         viewmat[:] = np.nan
     if not np.isfinite(viewmat).all():
-        raise InputError(f"{path}: expected a finite 4x4 transform_matrix for frame {name}, found another or none")
+        raise InputError(f"{path}: expected a finite 4x4 transform_matrix for frame {name}, found none or another")
     return viewmat
 
 
 def _read_points(root: Path, meta: Json, source: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Positions (P, 3) and colours (P, 3) of ``ply_file_path``; grey where it has no colours."""
+    """Read the positions (P, 3) and colours (P, 3) of ``ply_file_path``; points without colours become grey."""
     if "ply_file_path" not in meta:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
     path = root / checked_name(meta["ply_file_path"], source)
@@ -207,8 +212,8 @@ def _read_points(root: Path, meta: Json, source: Path) -> tuple[NDArray[np.float
         with path.open("rb") as file:
             vertices = read_points(path, file)
     except OSError as error:
-        raise InputError(f"{path}: expected a PLY file of points, as {source.name} says: {error.strerror}") from error
-    with np.errstate(invalid="ignore"):  # signalling NaN
+        raise InputError(f"cannot read {path}, the points of {source.name}: {error.strerror}") from error
+    with np.errstate(invalid="ignore"):  # the cast of a signalling NaN
         points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     if not np.isfinite(points).all():
         raise InputError(f"{path}: expected finite points, found NaN or infinity")

@@ -1,7 +1,8 @@
-"""Readers and writers of files of Gaussians: one module each, enrolled by one line in `FORMATS`.
+"""Files of Gaussians: a reader and a writer for each format in `FORMATS`.
 
-Belongs here: one module per format and what formats share. Does not belong here: photos, cameras and datasets
-(`clsplat.dataset`), and pruning a scene until it fits (`clsplat.pruning`).
+Belongs here: one module per format, and what formats share: `validity` (all of them), `quantisation` and `codebook`
+(the compact ones), `ply_container` (the two in PLY), `anatomy` (bytes by part). Does not belong here: photos, cameras
+and datasets (`clsplat.dataset`), and pruning a scene until it fits (`clsplat.pruning`).
 """
 
 from collections.abc import Callable
@@ -24,7 +25,7 @@ __all__ = ["FORMATS", "load_gaussians", "save_gaussians"]
 Loader = Callable[[str | Path], tuple[Gaussians, Mode, NDArray[np.float64]]]
 Saver = Callable[[str | Path, Gaussians, Mode, ArrayLike | None], None]
 
-# Suffix of the file name -> (load, save); of several that fit, the longest counts.
+# Suffix of the file name -> (load, save). If several suffixes fit, the longest is used.
 FORMATS: dict[str, tuple[Loader, Saver]] = {
     ".ply": (load_ply, save_ply),
     ".compressed.ply": (load_compressed_ply, save_compressed_ply),
@@ -35,21 +36,28 @@ FORMATS: dict[str, tuple[Loader, Saver]] = {
 
 
 def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
-    """Read Gaussians from a file in a format of `FORMATS`, told by its suffix, or from a folder with an unpacked SOG.
+    """Read Gaussians from a file in a format of `FORMATS`, chosen by its suffix, or from a folder with an unpacked
+    SOG.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; for an unpacked SOG, its folder or the meta.json in it.
 
     Returns
     -------
     gaussians : Gaussians
         float32, at least one.
     mode : {"classic", "antialiased"}
-        The rendering mode the file says it was trained for; classic where the format does not say.
+        Rendering mode for which the scene was trained, according to the file; classic if the format does not store
+        it.
     offset : (3,) float64
-        What was subtracted from the world's coordinates, in world units; zeros where the format does not say.
+        What was subtracted from the world's coordinates, in world units; zeros if the format does not store it.
 
     Raises
     ------
     InputError
-        If no format has this suffix, or the file is not of its format.
+        If no format has this suffix, or the file is not a valid file of its format; the message names it.
     """
     unpacked = Path(path).is_dir() or Path(path).name == META
     return load_sog(path) if unpacked else _format(path)[0](path)
@@ -58,16 +66,16 @@ def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float6
 def save_gaussians(
     path: str | Path, gaussians: Gaussians, mode: Mode = "classic", offset: ArrayLike | None = None
 ) -> None:
-    """Write Gaussians to a file in the format of `FORMATS` that its suffix names.
+    """Write Gaussians to a file in the format of `FORMATS` given by its suffix.
 
     Parameters
     ----------
     path : str or Path
-        The file; its folder must exist. It is replaced only once all is written.
+        The file; its folder must exist. An existing file is replaced only after everything is written.
     gaussians : Gaussians
         At least one, finite.
     mode : {"classic", "antialiased"}
-        The rendering mode they were trained for.
+        Rendering mode for which the scene was trained.
     offset : (3,) array_like, optional
         What was subtracted from the world's coordinates, in world units.
 
@@ -75,12 +83,17 @@ def save_gaussians(
     ------
     InputError
         If no format has this suffix, the Gaussians cannot be stored, or the file cannot be written.
+
+    Warns
+    -----
+    UserWarning
+        If the format cannot hold the mode, the offset, bands of the spherical harmonics or some values.
     """
     _format(path)[1](path, gaussians, mode, offset)
 
 
 def suffix_of(path: str | Path) -> str:
-    """The suffix in `FORMATS` that a file's name ends with, and has something before; empty if none."""
+    """Return the suffix in `FORMATS` at the end of a file's name; empty if there is none, or nothing precedes it."""
     name = Path(path).name.lower()
     return max((suffix for suffix in FORMATS if name[1:].endswith(suffix)), key=len, default="")
 

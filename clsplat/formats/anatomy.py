@@ -1,6 +1,6 @@
-"""What a file of Gaussians is made of: format and version, bytes of each part, comments.
+"""The anatomy of a file of Gaussians: format and version, bytes by part, comments.
 
-For files that `clsplat.formats.load_gaussians` reads: damage is found there.
+The functions expect files that `clsplat.formats.load_gaussians` has read without an error.
 """
 
 import gzip
@@ -14,22 +14,23 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.formats import compressed_ply, ply, sog, splat, spz
+from clsplat.formats.ply_container import read_header
 
 
 @dataclass(frozen=True)
 class Anatomy:
-    """What a file is made of.
+    """The parts of a file.
 
     Parameters
     ----------
     format : str
-        Name and version, in words.
+        Name and version of the format.
     parts : dict of int
         Bytes by part of the scene.
     packed : bool
-        The parts are compressed together: their bytes are those before that.
+        Whether the parts are compressed together; `parts` are then the bytes before compression.
     comments : list of str
-        What the file says besides the Gaussians.
+        Comments and other information in the file.
     """
 
     format: str
@@ -40,24 +41,23 @@ class Anatomy:
 
 def _ply(path: Path) -> Anatomy:
     with open(path, "rb") as file:
-        header, size = ply.read_header(path, file)
-    elements, counts, order, comments = ply.parse_header(path, header)
-    kind = {"<": "binary, little endian", ">": "binary, big endian", "=": "text"}[order]
-    parts: Counter[str] = Counter({"header": len(header)})
-    if order == "=":
-        parts["rows of text"] = size - len(header)
-        return Anatomy(f"PLY, {kind}", dict(parts), comments=comments)
-    for (name, element), count in zip(elements.items(), counts, strict=True):
-        dtype = element.dtype(order)
+        header = read_header(path, file)
+    kind = {"<": "binary, little endian", ">": "binary, big endian", "=": "text"}[header.order]
+    parts: Counter[str] = Counter({"header": header.length})
+    if header.order == "=":
+        parts["rows of text"] = header.file_size - header.length
+        return Anatomy(f"PLY, {kind}", dict(parts), comments=header.comments)
+    for name, element in header.elements.items():
+        dtype = element.dtype(header.order)
         for column in dtype.names or ():
             part = _part_of(column) if name == "vertex" else name
-            parts[part] += count * dtype[column].itemsize
-    parts["more"] = size - sum(parts.values())
-    return Anatomy(f"PLY, {kind}", {name: n for name, n in parts.items() if n}, comments=comments)
+            parts[part] += header.rows[name] * dtype[column].itemsize
+    parts["other data"] = header.file_size - sum(parts.values())
+    return Anatomy(f"PLY, {kind}", {name: n for name, n in parts.items() if n}, comments=header.comments)
 
 
 def _part_of(column: str) -> str:
-    """The parameter to which a property of a PLY's vertex belongs."""
+    """Return the part of the scene to which a property of a PLY's vertex belongs."""
     groups = {"means": ply.MEANS, "colours (sh of band 0)": ply.SH0, "opacities": ("opacity",)}
     groups |= {"scales": ply.LOG_SCALES, "quaternions": ply.QUATS, "normals, unused": ply.NORMALS}
     if column.startswith("f_rest_"):
@@ -67,20 +67,19 @@ def _part_of(column: str) -> str:
 
 def _compressed_ply(path: Path) -> Anatomy:
     with open(path, "rb") as file:
-        header, _ = ply.read_header(path, file)
-    elements, counts, order, comments = ply.parse_header(path, header)
-    rows = dict(zip(elements, counts, strict=True))
+        header = read_header(path, file)
+    elements, rows, order = header.elements, header.rows, header.order
     names = {
         "packed_position": "means",
         "packed_rotation": "quaternions",
         "packed_scale": "scales",
         "packed_color": "colours and opacities",
     }
-    parts = {"header": len(header), "ranges of chunks": rows["chunk"] * elements["chunk"].dtype(order).itemsize}
+    parts = {"header": header.length, "ranges of chunks": rows["chunk"] * elements["chunk"].dtype(order).itemsize}
     parts |= {names[column]: rows["vertex"] * 4 for column in compressed_ply.PACKED}
     if "sh" in rows:
         parts["sh above band 0"] = rows["sh"] * elements["sh"].dtype(order).itemsize
-    return Anatomy("compressed PLY (PlayCanvas)", parts, comments=comments)
+    return Anatomy("compressed PLY (PlayCanvas)", parts, comments=header.comments)
 
 
 def _splat(path: Path) -> Anatomy:
@@ -138,4 +137,4 @@ ANATOMIES: dict[str, Callable[[Path], Anatomy]] = {
     ".spz": _spz,
     ".sog": _sog,
 }
-"""By the suffixes of `clsplat.formats.FORMATS`."""
+"""Functions by the suffixes of `clsplat.formats.FORMATS`."""

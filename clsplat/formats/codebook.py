@@ -1,4 +1,4 @@
-"""Codebooks: few numbers, or few rows of numbers, that stand for many."""
+"""Codebooks: a few numbers, or a few rows of numbers, that approximate many."""
 
 from typing import Any
 
@@ -8,32 +8,33 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 CODES = 256
-"""Entries of a codebook of numbers: an index is a byte."""
+"""Number of entries in a codebook of numbers, so that an index is one byte."""
 
 BINS = 1 << 16
-"""Of the histogram from which a codebook is laid."""
+"""Number of bins of the histogram from which a codebook is computed."""
 
 PALETTE_MAX = 1 << 16
-"""Entries of a palette of rows: an index is two bytes."""
+"""Largest number of entries in a palette of rows, so that an index is two bytes."""
 
 PALETTE_MIN = 1024
+"""Number of rows up to which each row has an entry of its own in the palette."""
+
 PALETTE_SHARE = 3
-"""Rows that share an entry of the palette, on average, if there are more than PALETTE_MIN: a fifth of
-the entries less saves 2 bytes of 24 for a Gaussian of degree 3 and loses 0.02 dB."""
+"""Mean number of rows per entry of the palette, for more than PALETTE_MIN rows. Measurement: docs/formats.md."""
 
 TRAINING = 64
-"""Rows per coarse cell that the cells' centres are found from."""
+"""Number of rows per coarse cell from which the centres of the cells are computed."""
 
 ITERATIONS = 4
-"""Of Lloyd's algorithm: 8 and 16 change the PSNR of a trained scene by less than 0.01 dB."""
+"""Number of iterations of Lloyd's algorithm. Measurement: docs/formats.md."""
 
 
 def codebook(values: Array) -> Array:
-    """256 numbers, ascending, float32, that stand for all values; exactly where there are no more different ones.
+    """Compute 256 numbers, ascending, float32, that approximate all values; exact for up to 256 different values.
 
-    Half of them are laid evenly over the range, half as dense as the third root of the values' density, which makes
-    the mean squared error least (Panter and Dite 1951, doi:10.1109/JRPROC.1951.230419); so no value within the range
-    is further than 1/256 of it from an entry.
+    Half of the entries are spaced evenly over the range of the values. The density of the other half is proportional
+    to the third root of the density of the values, which minimises the mean squared error (Panter and Dite 1951,
+    doi:10.1109/JRPROC.1951.230419). Hence each value is at most 1/256 of the range away from an entry.
     """
     flat = np.asarray(values, np.float32).ravel()
     low, high = float(flat.min()), float(flat.max())
@@ -49,17 +50,30 @@ def codebook(values: Array) -> Array:
 
 
 def nearest(book: Array, values: Array) -> Array:
-    """Index of the entry nearest to each value, uint8, of the values' shape; `book` as of `codebook`."""
+    """Find the index of the entry of a `codebook` nearest to each value, uint8, in the shape of `values`."""
     middles = (book[1:].astype(np.float64) + book[:-1]) / 2
     return np.searchsorted(middles, values).astype(np.uint8)
 
 
 def palette(rows: Array, weights: Array) -> tuple[Array, Array]:
-    """Rows (P, D), float32, that stand for all rows (N, D), and the index of the one for each, (N,) uint16.
+    """Compute rows that approximate all rows, by weighted k-means on two levels.
 
-    Two levels of weighted k-means: about sqrt(P) coarse cells, then as many entries in each cell as its share of the
-    weights (N,) calls for. A row is compared with about 2 sqrt(P) entries instead of P, which bounds the time for a
-    million.
+    There are about sqrt(P) coarse cells. The number of entries in a cell is proportional to its share of the weights.
+    A row is compared with about 2 sqrt(P) entries instead of P, which bounds the time for a million rows.
+
+    Parameters
+    ----------
+    rows : (N, D)
+        The rows to approximate.
+    weights : (N,)
+        Weights of their squared errors, positive.
+
+    Returns
+    -------
+    entries : (P, D) float32
+        The palette.
+    labels : (N,) uint16
+        Index of the entry of each row.
     """
     n = len(rows)
     rows = np.ascontiguousarray(rows, np.float32)
@@ -85,7 +99,7 @@ def palette(rows: Array, weights: Array) -> tuple[Array, Array]:
 
 
 def _means(rows: Array, weights: Array, count: int) -> Array:
-    """Centres (at most count, D) of clusters by Lloyd's iterations from rows at equal distances in weight."""
+    """Compute centres (at most count, D) of clusters by Lloyd's algorithm, from rows evenly spaced by weight."""
     if count >= len(rows):
         return rows
     reached = np.cumsum(weights, dtype=np.float64)
@@ -97,11 +111,12 @@ def _means(rows: Array, weights: Array, count: int) -> Array:
         firsts = np.flatnonzero(np.diff(labels[order], prepend=-1))
         mass = np.add.reduceat(weights[order], firsts)[:, None]
         sums = np.add.reduceat(rows[order] * weights[order, None], firsts, axis=0)
-        centres[labels[order][firsts]] = sums / mass  # those of no row stay
+        centres[labels[order][firsts]] = sums / mass  # centres without a row stay
     return centres
 
 
 def _closest(rows: Array, centres: Array) -> Array:
+    """Find the index of the nearest centre of each row, (N,)."""
     from scipy.cluster.vq import vq
 
     return vq(rows, centres, check_finite=False)[0]

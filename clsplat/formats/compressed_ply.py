@@ -1,9 +1,13 @@
-"""The .compressed.ply of PlayCanvas: chunks of 256 Gaussians, each number relative to its chunk's range.
+"""The .compressed.ply of PlayCanvas: chunks of 256 Gaussians, each number relative to the range of its chunk.
 
-A binary PLY of three elements: ``chunk`` (float minima and maxima of position, log scale and colour 0.5 + SH_C0 sh),
-``vertex`` (four uint32: position and log scale as 11, 10 and 11 bits from the highest; the quaternion wxyz as 2 bits
-for the index of its largest component and 10 bits for each of the others; colour and opacity as 8 bits each) and,
-where there are spherical harmonics, ``sh`` (bytes ``f_rest_*``, channel by channel, 32 steps for a unit around 128).
+A binary PLY with three elements:
+
+* ``chunk``: minima and maxima, as floats, of position, log scale and colour 0.5 + SH_C0 sh;
+* ``vertex``: four uint32. Position and log scale have 11, 10 and 11 bits, from the highest. The quaternion wxyz has 2
+  bits for the index of its largest component and 10 bits for each of the others. Colour and opacity have 8 bits each;
+* ``sh``, if there are spherical harmonics above band 0: bytes ``f_rest_*``, channel by channel, 32 steps per unit
+  around 128.
+
 Source: SuperSplat and splat-transform, https://github.com/playcanvas/splat-transform.
 """
 
@@ -17,10 +21,10 @@ from clsplat.atomic import replacing
 from clsplat.config import Mode
 from clsplat.constants import SH_C0
 from clsplat.errors import InputError
-from clsplat.formats.ply import REST_COUNTS, comments_of, parse_header, read_comments, read_header
+from clsplat.formats.ply import REST_COUNTS, comments_of, read_comments
+from clsplat.formats.ply_container import PlyHeader, check_length, read_header
 from clsplat.formats.quantisation import (
     SQRT1_2,
-    check_finite,
     checked,
     clamped,
     from_smallest_three,
@@ -30,6 +34,7 @@ from clsplat.formats.quantisation import (
     rounded,
     smallest_three,
 )
+from clsplat.formats.validity import check_finite, reading
 from clsplat.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -38,7 +43,7 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 CHUNK = 256
-"""Gaussians that share a range."""
+"""Number of Gaussians in a chunk."""
 
 RANGES = tuple(
     f"{end}_{name}"
@@ -46,20 +51,23 @@ RANGES = tuple(
     for end in ("min", "max")
     for name in group
 )
-"""Properties of a chunk, in the order in which they are written; older files lack the last six, for colours,
-whose range is 0..1 there."""
+"""Properties of a chunk, in the order in which they are written. Older files lack the last six, of colours; their
+range is then 0 to 1."""
 
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+"""Properties of a vertex."""
 
 BITS_POSITION = (11, 10, 11)
 BITS_ROTATION = (10, 10, 10)
 BITS_COLOR = (8, 8, 8)
+"""Bits of the three packed numbers, from the highest."""
 
 LOG_SCALE_MAX = 20.0
-"""Log scales are clamped to ± this, as by splat-transform: an outlier would widen the steps of its whole chunk."""
+"""Largest magnitude of a log scale, as in splat-transform. Without the limit, an outlier would coarsen the steps of
+its whole chunk."""
 
 SH_STEPS = 32
-"""Steps for a unit of spherical harmonics: bytes hold -4 to 4."""
+"""Number of steps per unit of the spherical harmonics; bytes hold -4 to 4."""
 
 
 def load_compressed_ply(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
@@ -67,25 +75,18 @@ def load_compressed_ply(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.f
 
     Returns
     -------
-    gaussians : Gaussians
-        float32.
-    mode : {"classic", "antialiased"}
-        What the file's comments say, as in a PLY of floats.
-    offset : (3,) float64
-        What the file's comments say was subtracted from the world's coordinates; zeros if they do not.
+    gaussians, mode, offset
+        As in `clsplat.formats.load_gaussians`. Mode and offset are read from comments, as in `load_ply`.
 
     Raises
     ------
     InputError
-        If the file cannot be read, is no compressed PLY, is truncated, or holds no Gaussian or values that are not
+        If the file cannot be read, is not a compressed PLY, is truncated, or holds no Gaussian or values that are not
         finite.
     """
-    try:
-        # What is not finite in the end is refused then.
-        with open(path, "rb") as file, np.errstate(over="ignore", invalid="ignore"):
-            return _load(path, file)
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable PLY file, found: {error.strerror or error}") from error
+    # Values that overflow are rejected at the end.
+    with reading(path), open(path, "rb") as file, np.errstate(over="ignore", invalid="ignore"):
+        return _load(path, file)
 
 
 def save_compressed_ply(
@@ -93,21 +94,15 @@ def save_compressed_ply(
 ) -> None:
     """Write Gaussians as a .compressed.ply file, sorted along a Z-order curve so that chunks are small in space.
 
-    Rounded are positions, log scales and colours to half a step of their chunk's range (2047 steps; 1023 for y, 255
-    for colours), quaternions to 1/1446 for each component but the largest, opacities to 1/510, spherical harmonics
-    to 1/64. Clamped, with a warning, are log scales beyond ±20 and spherical harmonics beyond ±4. Mode and offset
-    are comments, as in a PLY of floats.
+    Largest rounding errors: positions, log scales and colours half a step of the range of their chunk (2047 steps;
+    1023 for y, 255 for colours); quaternions 1/1446 for each component other than the largest; opacities 1/510;
+    spherical harmonics 1/64. Log scales beyond ±20 and spherical harmonics beyond ±4 are clamped with a warning. Mode
+    and offset become comments, as in `save_ply`.
 
     Parameters
     ----------
-    path : str or Path
-        The file; its folder must exist.
-    gaussians : Gaussians
-        At least one, finite.
-    mode : {"classic", "antialiased"}
-        The rendering mode the scene was trained for.
-    offset : (3,) array_like, optional
-        What was subtracted from the world's coordinates, in world units.
+    path, gaussians, mode, offset
+        As in `clsplat.formats.save_gaussians`.
 
     Raises
     ------
@@ -136,7 +131,7 @@ def save_compressed_ply(
     ).astype("<u4")
     elements = [_element(chunks, RANGES, "chunk"), _element(packed, PACKED, "vertex")]
     if k > 1:
-        # Bytes are read at the middle of their step.
+        # A byte stands for the middle of its step.
         rest = rounded(path, "sh above band 0", SH_STEPS * g.sh[:, 1:].transpose(0, 2, 1) + 127.5, 255)
         names = tuple(f"f_rest_{i}" for i in range(3 * (k - 1)))
         elements.append(_element(rest.reshape(n, -1), names, "sh"))
@@ -145,14 +140,14 @@ def save_compressed_ply(
 
 
 def _load(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
-    header, size = read_header(path, file)
-    elements, counts, order, comments = parse_header(path, header)
-    tables = _read(path, file, elements, counts, (order, len(header), size))
+    header = read_header(path, file)
+    tables = _read_tables(path, file, header)
     chunk, vertex = tables["chunk"], tables["vertex"]
-    of = np.arange(len(vertex)) // CHUNK
+    chunk_of = np.arange(len(vertex)) // CHUNK
 
     def spread(units: Array, names: tuple[str, ...]) -> Array:
-        low, high = (np.stack([chunk[f"{end}_{name}"] for name in names], axis=1)[of] for end in ("min", "max"))
+        """Map fractions (N, 3) to the ranges of their chunks."""
+        low, high = (np.stack([chunk[f"{end}_{name}"] for name in names], axis=1)[chunk_of] for end in ("min", "max"))
         return low * (1 - units) + high * units
 
     colors = _unpack(vertex["packed_color"] >> 8, BITS_COLOR)
@@ -163,7 +158,7 @@ def _load(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArray[np
     if "sh" in tables:
         names = [f"f_rest_{i}" for i in range(len(tables["sh"].dtype.names or ()))]
         rest = np.stack([tables["sh"][name] for name in names], axis=1).reshape(len(sh), 3, -1).transpose(0, 2, 1)
-        # The outermost bytes stand for the ends, the others for the middle of their step.
+        # The bytes 0 and 255 stand for the ends of the range, the others for the middle of their step.
         values = (np.arange(256) + 0.5) / SH_STEPS - 4
         values[[0, 255]] = -4, 4
         sh = np.concatenate([sh, values.astype(np.float32)[rest]], axis=1)
@@ -174,18 +169,12 @@ def _load(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArray[np
         logits_of(vertex["packed_color"] & 255),
         sh,
     )
-    return check_finite(path, gaussians.astype(np.float32)), *read_comments(comments)
+    return check_finite(path, gaussians.astype(np.float32)), *read_comments(header.comments)
 
 
-def _read(
-    path: str | Path,
-    file: BinaryIO,
-    elements: dict[str, "PlyElement"],
-    counts: list[int],
-    place: tuple[str, int, int],
-) -> dict[str, Array]:
-    """The elements as structured arrays, once it is sure that they are those of a compressed PLY and are there."""
-    order, at, size = place
+def _read_tables(path: str | Path, file: BinaryIO, header: PlyHeader) -> dict[str, Array]:
+    """Read the elements as structured arrays, after checking that they are those of a compressed PLY and complete."""
+    elements, rows, order = header.elements, header.rows, header.order
     names = {name: {prop.name for prop in element.properties} for name, element in elements.items()}
     colored = not names.get("chunk", set()).isdisjoint(RANGES[12:])
     required = {"chunk": set(RANGES if colored else RANGES[:12]), "vertex": set(PACKED)}
@@ -196,7 +185,6 @@ def _read(
             f"{', '.join(names) or 'none'}{' as text' if order == '=' else ''}"
             + (f", which lack {', '.join(missing)}" if missing else "")
         )
-    rows = dict(zip(elements, counts, strict=True))
     n = rows["vertex"]
     rest = len(names.get("sh", ()))
     if n == 0:
@@ -216,27 +204,23 @@ def _read(
     for name, dtype in dtypes.items():
         if {dtype[i].str[1:] for i in range(len(dtype))} != {kinds[name]}:
             raise InputError(f"{path}: expected properties of {name} to be {kinds[name]}, found {dtype.descr}")
-    needed = at + sum(rows[name] * dtype.itemsize for name, dtype in dtypes.items())
-    if size < needed:
-        raise InputError(
-            f"{path}: expected at least {needed} bytes for the {n} Gaussians its header declares, found {size}; "
-            "the file is truncated or damaged"
-        )
-    file.seek(at)
+    needed = header.length + sum(rows[name] * dtype.itemsize for name, dtype in dtypes.items())
+    check_length(path, needed, n, header.file_size)
+    file.seek(header.length)
     return {name: np.fromfile(file, dtype, rows[name]) for name, dtype in dtypes.items()}
 
 
 def _to_chunks(x: Array) -> tuple[Array, Array, Array]:
-    """Values (N, 3) -> minima and maxima of the chunks (C, 3), and the values as fractions of their chunk's range."""
+    """Compute minima and maxima of the chunks (C, 3), and values (N, 3) as fractions of the range of their chunk."""
     starts = np.arange(0, len(x), CHUNK)
     low, high = np.minimum.reduceat(x, starts), np.maximum.reduceat(x, starts)
-    of = np.arange(len(x)) // CHUNK
+    chunk_of = np.arange(len(x)) // CHUNK
     extent = high.astype(np.float64) - low
-    return low, high, (x - low[of].astype(np.float64)) / np.where(extent == 0, 1, extent)[of]
+    return low, high, (x - low[chunk_of].astype(np.float64)) / np.where(extent == 0, 1, extent)[chunk_of]
 
 
 def _pack(fractions: Array, bits: tuple[int, ...]) -> Array:
-    """Fractions (N, 3) -> uint32, the first component in the highest bits."""
+    """Pack fractions (N, 3) to uint32 (N,), the first component in the highest bits."""
     word = np.zeros(len(fractions), np.uint32)
     for column, width in enumerate(bits):
         word = word << width | np.rint(fractions[:, column] * (2**width - 1)).astype(np.uint32)
@@ -244,13 +228,14 @@ def _pack(fractions: Array, bits: tuple[int, ...]) -> Array:
 
 
 def _unpack(words: Array, bits: tuple[int, ...]) -> Array:
-    """Inverse of `_pack`, (N, 3); bits above are ignored."""
+    """Unpack fractions (N, 3): the inverse of `_pack`; higher bits are ignored."""
     shifts = [sum(bits[column + 1 :]) for column in range(3)]
     fields = [(words >> shift & (2**width - 1)) / (2**width - 1) for shift, width in zip(shifts, bits, strict=True)]
     return np.stack(fields, axis=1)
 
 
 def _element(table: Array, names: tuple[str, ...], element: str) -> "PlyElement":
+    """Make an element of a PLY from a table (rows, columns)."""
     from plyfile import PlyElement
 
     table = np.ascontiguousarray(table)

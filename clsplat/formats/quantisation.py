@@ -1,5 +1,5 @@
-"""What the compact formats share: the check before writing, rounding that tells what it cut off, quaternions by their
-three smallest components, an order in which neighbours follow each other, and a bound on what a file unfolds to."""
+"""Quantisation, as the compact formats share it: checks before writing, rounding with a warning for clamped values,
+quaternions by their three smallest components, the Z-order of positions, and a limit on the size of unpacked data."""
 
 import math
 import os
@@ -12,39 +12,48 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsplat.config import Mode
 from clsplat.errors import InputError
-from clsplat.formats.ply import LOG_SCALE_MIN, LOGIT_MAX, checked_offset, normalised
+from clsplat.formats.validity import (
+    LOG_SCALE_MIN,
+    LOGIT_MAX,
+    check_finite,
+    check_storable,
+    checked_offset,
+    normalised,
+)
 from clsplat.gaussians import Gaussians, logit
 
 Array = NDArray[Any]
 
 EXPANSION_MAX = 100
+"""Largest ratio of the declared unpacked size to the size of a file. Larger ones are refused as decompression bombs.
+Ratios of trained scenes: docs/formats.md."""
+
 EXPANSION_FREE = 1 << 26
-"""A file that declares to unfold to more bytes than both this multiple of its size and this many is refused as a
-bomb. Trained scenes unfold to 1.2 to 10 times; 64 MiB harm nobody."""
+"""Unpacked size, in bytes, up to which any ratio is accepted, since it cannot exhaust the memory."""
 
 SQRT1_2 = math.sqrt(0.5)
 """Largest magnitude of any but the largest component of a unit quaternion."""
 
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Components of a quaternion but the one named by the row."""
+"""Indices of the components of a quaternion other than the one whose index is the row."""
 
 MORTON_BITS = 21
-"""Per axis: three of them fit into 64 bits."""
+"""Bits per axis of a Morton code: three axes fit into 64 bits."""
 
 
 def checked(path: str | Path, gaussians: Gaussians) -> Gaussians:
-    """Gaussians fit for writing: float32, unit quaternions; those without orientation, which no renderer draws,
-    become transparent, since the formats cannot hold a zero quaternion.
+    """Check Gaussians and prepare them for writing: float32, unit quaternions.
+
+    The compact formats cannot hold a zero quaternion. Gaussians without orientation, which no renderer draws, become
+    transparent instead.
 
     Raises
     ------
     InputError
-        If there is none, shapes do not fit, or a value is not finite as float32.
+        If there is no Gaussian, shapes do not agree, or a value is not finite as float32.
     """
-    gaussians.validate()
-    if len(gaussians) == 0:
-        raise InputError(f"{path}: expected at least one Gaussian to write, found none")
-    with np.errstate(over="ignore"):  # what overflows float32 is found below
+    check_storable(path, gaussians)
+    with np.errstate(over="ignore"):  # values that overflow float32 are rejected below
         out = check_finite(path, gaussians.astype(np.float32))
     out.quats = normalised(out.quats).astype(np.float32)
     nowhere = ~out.quats.any(axis=1)
@@ -53,36 +62,22 @@ def checked(path: str | Path, gaussians: Gaussians) -> Gaussians:
     return out
 
 
-def check_finite(path: str | Path, gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians, or raise InputError naming the first field with a value that is not finite."""
-    n = len(gaussians)
-    for name, array in gaussians.arrays().items():
-        finite = np.isfinite(array.reshape(n, -1)).all(axis=1)
-        if not finite.all():
-            row = int(np.argmin(finite))
-            raise InputError(
-                f"{path}: expected finite values, found {name} = {array[row].tolist()} in Gaussian {row} "
-                f"({n - int(finite.sum())} of {n} Gaussians are affected)"
-            )
-    return gaussians
-
-
 def check_expansion(path: str | Path, needed: int, size: int) -> None:
-    """Raise InputError if `size` bytes of a file declare to unfold to `needed` bytes, more than a scene does."""
+    """Raise an InputError if a file of `size` bytes declares to unpack to `needed` bytes, more than a scene does."""
     if needed > max(EXPANSION_FREE, EXPANSION_MAX * size):
         raise InputError(
-            f"{path}: expected a file of a scene, which unfolds to at most {EXPANSION_MAX} times its {size} bytes, "
-            f"found that it declares {needed} bytes; it is damaged or made to exhaust memory"
+            f"{path}: expected a scene, which unpacks to at most {EXPANSION_MAX} times the {size} bytes of its file, "
+            f"found {needed} declared bytes; the file is damaged or made to exhaust memory"
         )
 
 
 def file_size(path: str | Path) -> int:
-    """Bytes of a file; OSError if there is none."""
+    """Return the size of a file in bytes; raise an OSError if it does not exist."""
     return os.stat(path).st_size
 
 
 def clamped(path: str | Path, name: str, x: Array, low: float, high: float) -> Array:
-    """Values within `low` and `high`; warns of the number of Gaussians (rows) that have others."""
+    """Clamp values to [`low`, `high`], and warn with the number of Gaussians (rows) affected."""
     outside = ((x < low) | (x > high)).reshape(len(x), -1).any(axis=1).sum()
     if outside:
         warnings.warn(
@@ -93,50 +88,50 @@ def clamped(path: str | Path, name: str, x: Array, low: float, high: float) -> A
 
 
 def rounded(path: str | Path, name: str, x: Array, top: int) -> Array:
-    """Nearest whole numbers 0 to `top`, as the smallest unsigned type.
+    """Round to integers 0 to `top`, of the smallest unsigned type.
 
-    What lies up to a step outside, as the 1 of a unit quaternion in many formats, is rounded to the end;
-    what lies further is `clamped`.
+    Values up to one step outside are rounded to the end of the range, without a warning: the 1 of a unit quaternion
+    is such a value in many formats. Values farther outside are `clamped`.
     """
     return np.clip(np.rint(clamped(path, name, x, -1, top + 1)), 0, top).astype(np.min_scalar_type(top))
 
 
 def warn_lost(path: str | Path, mode: Mode = "classic", offset: ArrayLike | None = None) -> None:
-    """Warn of what is given but has no place in the format."""
+    """Warn if the rendering mode or the offset is lost, because the format cannot store it."""
     if mode != "classic":
-        warnings.warn(f"{path}: the format cannot say that the scene was trained {mode}", stacklevel=3)
+        warnings.warn(f"{path}: the format cannot store the rendering mode of the scene, {mode}", stacklevel=3)
     shift = checked_offset(offset)
     if shift.any():
         warnings.warn(
-            f"{path}: the format has no place for the world's offset {shift.tolist()}; "
-            "coordinates are written without it",
+            f"{path}: the format has no place for the world offset {shift.tolist()}; coordinates are written "
+            "without it",
             stacklevel=3,
         )
 
 
 def opacity_bytes(gaussians: Gaussians) -> Array:
-    """Opacities as bytes: 255 times, rounded."""
+    """Convert opacities to bytes: 255 times the opacity, rounded."""
     return np.rint(255 * gaussians.opacities).astype(np.uint8)
 
 
 def logits_of(opacities: Array) -> Array:
-    """Logits of opacities stored as bytes, float32; ±LOGIT_MAX for 0 and 255."""
+    """Convert opacities stored as bytes to logits, float32; 0 and 255 become -LOGIT_MAX and LOGIT_MAX."""
     with np.errstate(divide="ignore"):
         table = np.clip(logit(np.arange(256) / 255), -LOGIT_MAX, LOGIT_MAX)
     return table.astype(np.float32)[opacities]
 
 
 def logs_of(scales: Array) -> Array:
-    """Natural logarithms of scales; LOG_SCALE_MIN for 0, NaN for what is no scale."""
+    """Convert scales to their natural logarithms; 0 becomes LOG_SCALE_MIN, invalid scales become NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(scales)
     return np.where(scales == 0, np.float32(LOG_SCALE_MIN), logs)
 
 
 def smallest_three(quats: Array) -> tuple[Array, Array]:
-    """Index of the component of largest magnitude (N,), and the other three (N, 3) in their order.
+    """Encode quaternions: index of the component of largest magnitude (N,), and the other three in order (N, 3).
 
-    The sign is such that the component left out is positive, which is the same rotation; the others are within
+    The sign is chosen so that the omitted component is positive, which is the same rotation. The others are within
     ±SQRT1_2.
     """
     largest = np.argmax(np.abs(quats), axis=1)[:, None]
@@ -145,7 +140,7 @@ def smallest_three(quats: Array) -> tuple[Array, Array]:
 
 
 def from_smallest_three(largest: Array, others: Array) -> Array:
-    """Unit quaternions, (N, 4) float32: inverse of `smallest_three`."""
+    """Decode unit quaternions, (N, 4) float32: the inverse of `smallest_three`."""
     quats = np.empty((len(others), 4))
     rest = 1 - np.einsum("ni,ni->n", others, others)
     np.put_along_axis(quats, OTHERS[largest], others, axis=1)
@@ -154,11 +149,11 @@ def from_smallest_three(largest: Array, others: Array) -> Array:
 
 
 def morton_order(means: Array) -> Array:
-    """Permutation that sorts points (N, 3) along a Z-order curve: near ones follow each other."""
+    """Compute the permutation that sorts points (N, 3) along a Z-order curve, so that neighbours are adjacent."""
     low = means.min(axis=0).astype(np.float64)
     extent = np.maximum(means.max(axis=0) - low, np.finfo(np.float32).tiny)
     cells = ((means - low) / extent * (2**MORTON_BITS - 1)).astype(np.uint64)
-    # Each step halves the runs of neighbouring bits and moves them apart, until two zeros follow every bit.
+    # Each step halves the runs of adjacent bits and moves the halves apart, until two zeros follow every bit.
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),

@@ -1,8 +1,8 @@
-"""The .splat of antimatter15's viewer: 32 bytes for each Gaussian and nothing else.
+"""The .splat of antimatter15's viewer: 32 bytes per Gaussian and nothing else.
 
-Three float32 positions, three float32 scales (not their logarithm), RGBA as bytes, quaternion wxyz as bytes
-128 q + 128. Largest and most opaque Gaussians come first, so that a viewer can show what has arrived. There are
-no spherical harmonics, no rendering mode and no offset.
+A row holds three float32 positions, three float32 scales (not their logarithms), RGBA as bytes, and the quaternion
+wxyz as bytes 128 q + 128. The largest and most opaque Gaussians come first, so that a viewer can show them while it
+downloads the rest. The format has no spherical harmonics above band 0, no rendering mode and no offset.
 """
 
 import warnings
@@ -15,20 +15,12 @@ from clsplat.atomic import replacing
 from clsplat.config import Mode
 from clsplat.constants import SH_C0
 from clsplat.errors import InputError
-from clsplat.formats.ply import normalised
-from clsplat.formats.quantisation import (
-    check_finite,
-    checked,
-    file_size,
-    logits_of,
-    logs_of,
-    opacity_bytes,
-    rounded,
-    warn_lost,
-)
+from clsplat.formats.quantisation import checked, file_size, logits_of, logs_of, opacity_bytes, rounded, warn_lost
+from clsplat.formats.validity import check_finite, normalised, reading
 from clsplat.gaussians import Gaussians
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgb", "u1", 3), ("opacity", "u1"), ("quats", "u1", 4)])
+"""Layout of a Gaussian."""
 
 
 def load_splat(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
@@ -36,19 +28,16 @@ def load_splat(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
 
     Returns
     -------
-    gaussians : Gaussians
-        float32, SH degree 0.
-    mode : {"classic", "antialiased"}
-        Always classic: the format does not say.
-    offset : (3,) float64
-        Zeros.
+    gaussians, mode, offset
+        As in `clsplat.formats.load_gaussians`: SH degree 0; the format stores neither mode nor offset.
 
     Raises
     ------
     InputError
-        If the file cannot be read, has no whole number of rows, holds no Gaussian, or values that are not finite.
+        If the file cannot be read, its size is not a multiple of a row, or it holds no Gaussian or values that are
+        not finite.
     """
-    try:
+    with reading(path):
         size = file_size(path)
         if size == 0 or size % ROW.itemsize:
             raise InputError(
@@ -56,8 +45,6 @@ def load_splat(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
                 "it is truncated or of another format"
             )
         rows = np.fromfile(path, ROW)
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable .splat file, found: {error.strerror or error}") from error
     sh0 = (rows["rgb"] / np.float32(255) - np.float32(0.5)) / np.float32(SH_C0)
     gaussians = Gaussians(
         rows["means"],
@@ -74,19 +61,14 @@ def save_splat(
 ) -> None:
     """Write Gaussians as a .splat file, sorted by volume times opacity, largest first.
 
-    Positions and scales keep float32; colour, opacity and quaternion are rounded to 1/255 and 1/128. Warns
-    of what is lost: bands of the spherical harmonics, the mode, the offset, colours beyond 0..1.
+    Positions and scales stay float32. Colours and opacities are rounded to multiples of 1/255, quaternions to
+    multiples of 1/128. A warning tells what is lost: bands of the spherical harmonics above 0, the mode, the offset,
+    colours beyond 0 to 1.
 
     Parameters
     ----------
-    path : str or Path
-        The file; its folder must exist.
-    gaussians : Gaussians
-        At least one, finite.
-    mode : {"classic", "antialiased"}
-        The rendering mode the scene was trained for.
-    offset : (3,) array_like, optional
-        What was subtracted from the world's coordinates.
+    path, gaussians, mode, offset
+        As in `clsplat.formats.save_gaussians`.
 
     Raises
     ------
@@ -97,7 +79,7 @@ def save_splat(
     warn_lost(path, mode, offset)
     if g.sh_degree:
         warnings.warn(
-            f"{path}: the format holds no spherical harmonics; degree {g.sh_degree} is cut to 0", stacklevel=2
+            f"{path}: the format cannot store spherical harmonics; degree {g.sh_degree} is cut to 0", stacklevel=2
         )
     order = np.argsort(-(g.log_scales.sum(axis=1) + np.log(np.maximum(g.opacities, 1e-9))), kind="stable")
     g = g.take(order)

@@ -1,11 +1,18 @@
 """The .spz of Niantic: planes of 8-bit and 24-bit numbers, compressed.
 
-Written is version 3, gzip, which all readers know; versions 2 and 4 (Zstandard) are read, too. After the header
-follow, each for all Gaussians: positions (3 signed 24-bit fixed-point numbers), opacities (255 times), colours
-(38.25 sh + 127.5), log scales (16 times, +160), quaternions (4 bytes: the index of the largest of xyzw and sign
-and 9-bit magnitude of the others; 3 bytes xyz in version 2), spherical harmonics (128 times, +128; coefficient by
-coefficient, RGB inside). The file's axes are right, up, back, those of a PLY right, down, forward.
-Source: the format's description beside its implementation, https://github.com/nianticlabs/spz.
+Version 3 (gzip) is written, which all readers support; versions 2 and 4 (Zstandard) are read as well. The header is
+followed by these planes, each for all Gaussians:
+
+* positions: 3 signed 24-bit fixed-point numbers;
+* opacities: 255 times the opacity;
+* colours: 38.25 sh + 127.5;
+* log scales: 16 times the log scale, + 160;
+* quaternions: 4 bytes with the index of the largest component of xyzw, and sign and 9-bit magnitude of the others; in
+  version 2, 3 bytes xyz;
+* spherical harmonics above band 0: 128 times the coefficient, + 128; coefficient by coefficient, RGB within each.
+
+The axes of the file are right, up, back; those of a PLY are right, down, forward.
+Source: the description next to the implementation, https://github.com/nianticlabs/spz.
 """
 
 import gzip
@@ -23,7 +30,6 @@ from clsplat.atomic import replacing
 from clsplat.config import Mode
 from clsplat.constants import SH_DEGREE_MAX
 from clsplat.errors import InputError
-from clsplat.formats.ply import normalised
 from clsplat.formats.quantisation import (
     SQRT1_2,
     check_expansion,
@@ -37,36 +43,41 @@ from clsplat.formats.quantisation import (
     smallest_three,
     warn_lost,
 )
+from clsplat.formats.validity import normalised, reading
 from clsplat.gaussians import Gaussians
 
 Array = NDArray[Any]
 
 MAGIC = 0x5053474E
 HEADER = struct.Struct("<IIIBBBB")
-"""Magic, version, number of Gaussians, SH degree, fractional bits, flags, 0 (in version 4 the number of streams)."""
+"""Layout of the header: magic, version, number of Gaussians, SH degree, fractional bits, flags, 0 (in version 4 the
+number of streams)."""
+
 ANTIALIASED = 1
+"""Flag of scenes trained in the antialiased mode."""
+
 EXTENDED = 2
-"""Flags; the second one tells of records of single vendors."""
+"""Flag of files with vendor-specific records."""
 
 GZIP_LEVEL = 6
-"""Level 9 takes three times as long for 0.5 % less."""
+"""Compression level of gzip, 1 to 9. Measurement: docs/formats.md."""
 
 SIGMA_STEPS = 5
-"""Steps of the positions in the median Gaussian's smallest standard deviation: twice as many gain about
-0.01 dB for 2 % more bytes."""
+"""Smallest number of steps of the positions per standard deviation of the median Gaussian along its shortest axis.
+Measurement: docs/formats.md."""
 
 COLOR = (0.15 * 255, 127.5)
 LOG_SCALE = (16.0, 160.0)
 SH = (128.0, 128.0)
-"""Factor and summand of the bytes."""
+"""Factor and summand that convert a value to a byte."""
 
 SH_STEP = 4
-"""Bytes of the bands above 0 differ from 128 by multiples of this, so that they compress. Others take 8 in band 1 and
-16 above, which is coarser than the coefficients of most scenes: see docs/formats.md for what it costs."""
+"""Step of the bytes of the bands above 0, counted from 128; a coarser step compresses better. Other writers use 8 in
+band 1 and 16 above, which is coarser than the coefficients of most scenes. Measurement: docs/formats.md."""
 
 SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""Parity of the basis functions in y and z, which change sign: y, z, x; xy, yz, zz, xz, xx;
-y, xyz, y, z, x, zxx, x."""
+"""Signs by which the coefficients change when y and z change sign: the parity of the basis functions in y and z,
+which are y, z, x; xy, yz, zz, xz, xx; y, xyz, y, z, x, zxx, x."""
 
 
 def load_spz(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
@@ -74,62 +85,51 @@ def load_spz(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
 
     Returns
     -------
-    gaussians : Gaussians
-        float32, in the axes of a PLY: y and z have the opposite sign of the file's.
-    mode : {"classic", "antialiased"}
-        What the file says.
-    offset : (3,) float64
-        Zeros: the format does not say.
+    gaussians, mode, offset
+        As in `clsplat.formats.load_gaussians`. The Gaussians are in the axes of a PLY, so that y and z have the
+        opposite sign of those in the file. The format does not store the offset.
 
     Raises
     ------
     InputError
-        If the file cannot be read, is of another format or version, is truncated, holds no Gaussian, or declares
-        more than a file of its size holds.
+        If the file cannot be read, is of another format or version, is truncated, holds no Gaussian, or declares more
+        than a file of its size can hold.
     """
-    try:
-        with open(path, "rb") as file:
-            head = file.read(4)
-            file.seek(0)
+    with reading(path), open(path, "rb") as file:
+        head = file.read(4)
+        file.seek(0)
+        try:
             if head[:2] == b"\x1f\x8b":
                 return _load_gzip(path, file)
             if head == struct.pack("<I", MAGIC):
                 return _load_zstd(path, file)
-            raise InputError(f"{path}: expected an .spz file, which begins as gzip or with NGSP, found {head!r}")
-    except (EOFError, zlib.error) as error:
-        raise InputError(f"{path}: expected a whole .spz file, found: {error}; is it truncated?") from error
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable .spz file, found: {error.strerror or error}") from error
+        except (EOFError, zlib.error) as error:
+            raise InputError(f"cannot read {path}: {error}; is the file truncated?") from error
+    raise InputError(f"{path}: expected an .spz file, which begins as gzip or with NGSP, found {head!r}")
 
 
 def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", offset: ArrayLike | None = None) -> None:
     """Write Gaussians as an .spz file of version 3.
 
-    The Gaussians are sorted along a Z-order curve. Rounded are positions to half of 2^-b units (b: see
-    `fractional_bits`), opacities to 1/510, colours' sh to 1/76.5, log scales to 1/32, quaternions to 1/1445 for each
-    component but the largest, spherical harmonics to 1/64. Held are sh of colours within ±3.33, log scales from -10
-    to 5.9375, spherical harmonics within ±1; what lies outside is clamped with a warning. The offset is lost with a
-    warning.
+    The Gaussians are sorted along a Z-order curve, which compresses better. Largest rounding errors: positions half
+    of 2^-b units (b: see `fractional_bits`), opacities 1/510, sh of band 0 1/76.5, log scales 1/32, quaternions
+    1/1445 for each component other than the largest, spherical harmonics above band 0 1/64. Ranges: sh of band 0
+    within ±3.33, log scales from -10 to 5.9375, spherical harmonics above band 0 within ±1; values outside are
+    clamped with a warning. The offset is lost with a warning.
 
     Parameters
     ----------
-    path : str or Path
-        The file; its folder must exist.
-    gaussians : Gaussians
-        At least one, finite.
-    mode : {"classic", "antialiased"}
-        The rendering mode the scene was trained for.
-    offset : (3,) array_like, optional
-        What was subtracted from the world's coordinates.
+    path, gaussians, mode, offset
+        As in `clsplat.formats.save_gaussians`.
 
     Raises
     ------
     InputError
-        If there is no Gaussian, a value is not finite as float32, a position is too far for any number of
-        fractional bits, or the file cannot be written.
+        If there is no Gaussian, a value is not finite as float32, a position is too large for 24 bits, or the file
+        cannot be written.
     """
     g = _turned(checked(path, gaussians))
-    g = g.take(morton_order(g.means))  # neighbours compress better: 5 %
+    g = g.take(morton_order(g.means))
     warn_lost(path, offset=offset)
     n = len(g)
     bits = fractional_bits(path, g)
@@ -150,18 +150,20 @@ def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
 
 
 def fractional_bits(path: str | Path, gaussians: Gaussians) -> int:
-    """Bits behind the binary point of the positions: as many as the Gaussians' size calls for (SIGMA_STEPS), fewer
-    where the scene would not fit.
+    """Choose the number of fractional bits of the positions, 0 to 23.
+
+    The number follows from the size of the Gaussians (SIGMA_STEPS), and is smaller if the scene would not fit into 24
+    bits.
 
     Raises
     ------
     InputError
-        If a coordinate exceeds what 24 bits hold without any fractional bit.
+        If a coordinate does not fit into 24 bits even without fractional bits.
     """
     finest = float(np.median(gaussians.log_scales.min(axis=1)))
     wanted = math.ceil(math.log2(SIGMA_STEPS) - finest / math.log(2))
     largest = float(np.abs(gaussians.means).max())
-    room = 23 - math.frexp(largest * (1 + 2.0**-22))[1]  # rounding must not reach 2^23
+    room = 23 - math.frexp(largest * (1 + 2.0**-22))[1]  # a rounded coordinate must stay below 2^23
     if room < 0:
         raise InputError(
             f"{path}: expected coordinates within ±{2**23} units, found {largest:g}; move the scene's origin nearer"
@@ -178,8 +180,8 @@ def _load_gzip(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArr
         check_expansion(path, sum(sizes), size)
         planes = [packed.read(count) for count in sizes]
         if [len(plane) for plane in planes] != sizes:
-            raise EOFError(f"{sum(map(len, planes))} bytes for {n} Gaussians, which take {sum(sizes)}")
-        if not flags & EXTENDED and packed.read(1):  # reaching the end checks the sum, too
+            raise EOFError(f"expected {sum(sizes)} bytes for {n} Gaussians, found {sum(map(len, planes))}")
+        if not flags & EXTENDED and packed.read(1):  # reading to the end also verifies the checksum
             raise InputError(
                 f"{path}: expected {n} Gaussians as the header declares, found more bytes than they take"
             )
@@ -187,7 +189,7 @@ def _load_gzip(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArr
 
 
 def _load_zstd(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
-    """Version 4: header of 32 bytes, records of vendors, a table of compressed and plain sizes, the planes."""
+    """Read version 4: header of 32 bytes, vendor-specific records, table of compressed and plain sizes, planes."""
     import zstandard
 
     data = file.read()
@@ -198,7 +200,7 @@ def _load_zstd(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArr
         (start,) = struct.unpack_from("<I", data, HEADER.size)
         table = [struct.unpack_from("<QQ", data, start + 16 * i) for i in range(streams)]
     except struct.error as error:
-        raise EOFError("no table of streams") from error
+        raise EOFError("the table of streams is missing") from error
     if [plain for _, plain in table] != sizes:
         raise InputError(
             f"{path}: expected streams of {sizes} bytes for {n} Gaussians of degree {degree}, "
@@ -208,23 +210,24 @@ def _load_zstd(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArr
     for length, plain in table:
         packed = data[at : at + length]
         try:
-            # What a frame declares is allocated, whatever max_output_size is; -1 declares nothing.
+            # zstandard allocates the size that a frame declares, whatever max_output_size is; -1 means no
+            # declaration.
             if zstandard.frame_content_size(packed) not in (-1, plain):
-                raise EOFError("a stream that declares another size than the table of streams")
+                raise EOFError("a stream declares another size than the table of streams")
             plane = zstandard.ZstdDecompressor().decompress(packed, max_output_size=plain)
         except zstandard.ZstdError as error:
             raise EOFError(str(error)) from error
         if len(plane) != plain:
-            raise EOFError(f"a stream of {len(plane)} bytes instead of {plain}")
+            raise EOFError(f"a stream has {len(plane)} bytes instead of {plain}")
         planes.append(plane)
         at += length
     return _decode(path, [*planes, b""][:6], (version, n, degree, bits, flags))
 
 
 def _parse_header(path: str | Path, header: bytes, versions: tuple[int, ...]) -> tuple[int, int, int, int, int, int]:
-    """Version, number of Gaussians, SH degree, fractional bits, flags, last byte."""
+    """Read version, number of Gaussians, SH degree, fractional bits, flags and last byte from the header."""
     if len(header) < HEADER.size:
-        raise EOFError(f"a header of {len(header)} bytes")
+        raise EOFError(f"the header has only {len(header)} bytes")
     magic, version, n, degree, bits, flags, last = HEADER.unpack_from(header)
     if magic != MAGIC:
         raise InputError(f"{path}: expected an .spz file, whose header begins with NGSP, found {header[:4]!r}")
@@ -236,13 +239,13 @@ def _parse_header(path: str | Path, header: bytes, versions: tuple[int, ...]) ->
         raise InputError(f"{path}: expected SH degree 0 to 4 and 0 to 23 fractional bits, found {degree} and {bits}")
     if flags & EXTENDED:
         warnings.warn(
-            f"{path}: records of single vendors are passed over; axes are taken as right, up, back", stacklevel=2
+            f"{path}: vendor-specific records are ignored; axes are assumed to be right, up, back", stacklevel=2
         )
     return version, n, degree, bits, flags, last
 
 
 def plane_sizes(n: int, degree: int, version: int) -> list[int]:
-    """Bytes of positions, opacities, colours, log scales, quaternions and spherical harmonics, before compression."""
+    """Compute the bytes of each plane before compression, in the order of the file."""
     rest = 3 * ((degree + 1) ** 2 - 1)
     return [n * width for width in (9, 1, 3, 3, 3 if version == 2 else 4, rest)]
 
@@ -256,7 +259,7 @@ def _decode(
         for plane, size in zip(planes, plane_sizes(n, degree, version), strict=True)
     )
     fixed = np.zeros((n, 3, 4), np.uint8)
-    fixed[:, :, 1:] = positions.reshape(n, 3, 3)  # the sign in the highest bit; a division by 256 moves it down
+    fixed[:, :, 1:] = positions.reshape(n, 3, 3)  # fills the upper 24 bits; the division by 256 below keeps the sign
     sh0 = (colors.astype(np.float32) - COLOR[1]) / COLOR[0]
     sh = np.concatenate([sh0, (rest.astype(np.float32) - SH[1]) / SH[0]], axis=1).reshape(n, -1, 3)
     if degree > SH_DEGREE_MAX:
@@ -273,13 +276,13 @@ def _decode(
 
 
 def _sh_bytes(path: str | Path, sh: Array) -> Array:
-    """Coefficients (N, K, 3) as bytes 128 and multiples of SH_STEP from it, which keeps 0 exact; (N, 3 K)."""
+    """Convert coefficients (N, K, 3) to bytes (N, 3 K): 128 plus a multiple of SH_STEP, which keeps 0 exact."""
     steps = np.rint(SH[0] / SH_STEP * sh) * SH_STEP
     return rounded(path, "sh above band 0", steps + SH[1], 255).reshape(len(sh), -1)
 
 
 def _pack(quats: Array) -> Array:
-    """wxyz (N, 4) -> bytes (N, 4): from the highest bit the index of the largest of xyzw, then the others."""
+    """Pack quaternions wxyz (N, 4) to bytes (N, 4): index of the largest of xyzw in the highest bits, the others."""
     largest, others = smallest_three(np.roll(quats, -1, axis=1))
     fields = (others < 0).astype(np.uint32) << 9 | np.rint(np.abs(others) / SQRT1_2 * 511).astype(np.uint32)
     words = largest.astype(np.uint32) << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
@@ -287,6 +290,7 @@ def _pack(quats: Array) -> Array:
 
 
 def _unpack(packed: Array) -> Array:
+    """Unpack quaternions wxyz (N, 4): the inverse of `_pack`."""
     words = np.ascontiguousarray(packed).view("<u4")
     fields = words >> np.array([20, 10, 0], np.uint32)
     others = np.where(fields & 512, -1, 1) * (fields & 511) * (SQRT1_2 / 511)
@@ -294,14 +298,14 @@ def _unpack(packed: Array) -> Array:
 
 
 def _unpack_xyz(packed: Array) -> Array:
-    """Version 2: xyz as bytes 127.5 q + 127.5, w positive."""
+    """Unpack quaternions wxyz (N, 4) of version 2: xyz as bytes 127.5 q + 127.5, w positive."""
     xyz = packed / 127.5 - 1
     w = np.sqrt(np.maximum(1 - np.einsum("ni,ni->n", xyz, xyz), 0))
     return normalised(np.concatenate([w[:, None], xyz], axis=1))
 
 
 def _turned(gaussians: Gaussians) -> Gaussians:
-    """Turned by 180 degrees about x: from right, down, forward to right, up, back, and the other way round."""
+    """Turn a scene by 180 degrees about x: from the axes right, down, forward to right, up, back, or back again."""
     signs = np.array([1.0, -1.0, -1.0], np.float32)
     return Gaussians(
         gaussians.means * signs,

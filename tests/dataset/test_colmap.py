@@ -1,4 +1,4 @@
-"""COLMAP models: our parser against pycolmap's on real models, and against damage of every kind."""
+"""COLMAP models: our parser agrees with pycolmap's on real models and rejects damage of every kind."""
 
 import struct
 
@@ -166,7 +166,7 @@ def test_bad_values_are_refused_with_file_and_photo(tmp_path, ending, change, me
 
 
 def test_quaternions_of_any_length_are_directions(tmp_path, ending):
-    """The squares of 1e200 overflow: the rotation had silently become none."""
+    """The squares of 1e200 overflow, which once silently turned the rotation into NaN."""
     WRITERS[ending](tmp_path / "plain")
     WRITERS[ending](tmp_path / "long", images=changed(IMAGES, 1, (1e200, 0.0, 1e200, 0.0), IMAGES[1][3]))
     plain, long = (read_model(tmp_path / name)[1][1][2] for name in ("plain", "long"))
@@ -271,7 +271,7 @@ def test_our_parser_agrees_with_colmaps(shared, tmp_path, name, ending):
     for image_name, camera_id, viewmat in images:
         assert camera_id == poses[image_name][0]
         np.testing.assert_allclose(viewmat[:3], poses[image_name][1], atol=1e-12)
-    # In no particular order, and some points coincide: compared as sorted rows of position and colour.
+    # The order is arbitrary and some points coincide: compare sorted rows of position and colour.
     ours = sorted(np.hstack([points, colors]).tolist())
     rows = sorted([*point.xyz.tolist(), *point.color.tolist()] for point in theirs.points3D.values())
     np.testing.assert_allclose(ours, rows, rtol=1e-14)
@@ -288,7 +288,7 @@ def sampled(image, pixels):
 @pytest.mark.shared
 @pytest.mark.parametrize(("name", "downscale"), [("fox", 2), ("fox", 4), ("sceaux", 1)])
 def test_points_land_on_their_colours(shared, name, downscale):
-    """The points that COLMAP saw in a photo have, where they project in our view of it, their keypoints' colours."""
+    """Points project to places of our view that have the colours of their keypoints in the photo."""
     import pycolmap
 
     folder = shared / "data" / name
@@ -313,7 +313,7 @@ def test_points_land_on_their_colours(shared, name, downscale):
         colors = sampled(photo, keypoints[inside])
         there.append(np.abs(sampled(view.image, pixels[inside]) - colors))
         shifted.append(np.abs(sampled(view.image, pixels[inside] + (2, 0)) - colors))
-    # Reprojection errors of half a pixel leave a few levels at keypoints, which sit on edges; 2 pixels beside
-    # them it is several times that.
+    # At keypoints, which lie on edges, reprojection errors of half a pixel change colours by a few levels; an offset
+    # of 2 pixels changes them by several times that.
     there, shifted = np.median(np.concatenate(there)), np.median(np.concatenate(shifted))
     assert there < 4 and shifted > 2.5 * there

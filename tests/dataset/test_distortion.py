@@ -1,4 +1,4 @@
-"""Photos of lenses become views: distortion is undone, fisheyes stay, and what cannot become a pinhole is refused."""
+"""Lenses: distortion is undone, fisheyes are kept, and cameras that cannot become a pinhole are refused."""
 
 import numpy as np
 import pytest
@@ -19,12 +19,12 @@ DISTORTED = {
 
 
 def pattern(x, y):
-    """Colour of the ray (x, y, 1): it changes by up to 10 levels per pixel at a focal length of 120."""
+    """Colour of the ray (x, y, 1), which changes by up to 10 levels per pixel at a focal length of 120 px."""
     return 127.5 + 100 * np.stack([np.sin(12 * x), np.cos(11 * y), np.sin(8 * (x + y))], axis=-1)
 
 
 def distorted_photo(intrinsics, width, height):
-    """What a camera sees of `pattern`, through COLMAP's inverse of the functions that undistortion uses."""
+    """Render `pattern` with a camera, through COLMAP's inverse of the functions that undistortion uses."""
     import pycolmap
 
     camera = pycolmap.Camera.create_from_model_name(1, intrinsics.model, 1.0, intrinsics.width, intrinsics.height)
@@ -47,11 +47,12 @@ def test_distortion_is_undone(tmp_path, model, size):
     (view,) = load(posed(save(tmp_path / "a.png", distorted_photo(intrinsics, *size)), intrinsics))
     camera = view.camera
     assert view.image.shape == (camera.height, camera.width, 3)
-    # No black border and not much lost: blank_pixels = 0 keeps nearly all of these mild distortions.
+    # No black border and little loss: blank_pixels = 0 keeps nearly all of these mildly distorted photos.
     assert 0.75 * size[0] < camera.width < 1.25 * size[0]
     error = np.abs(view.image.astype(float) - pattern(*ray_grid(camera)))
-    # Two roundings to 8 bits are 1; bilinear interpolation of 100 sin(12 x) in steps h is 100 * 12^2/8 * h^2, with
-    # h = 1/120 (1/60 at half size), and up to 3 times that where a fisheye shrinks. Half a pixel off gives 5 (10).
+    # Two roundings to 8 bits cost 1 level. Bilinear interpolation of 100 sin(12 x) in steps h costs 100 * 12^2/8 *
+    # h^2, with h = 1/120 (1/60 at half size), and up to 3 times that where a fisheye shrinks the image. An offset of
+    # half a pixel would cost 5 (10).
     assert error.max() < 1.5 + 3 * 1800 * (160 / size[0] / 120) ** 2
 
 
@@ -69,7 +70,7 @@ def test_undistortion_agrees_with_colmaps(tmp_path, model):
     ours = view.camera
     assert (ours.width, ours.height) == (pinhole.width, pinhole.height)
     np.testing.assert_allclose((ours.fx, ours.fy, ours.cx, ours.cy), pinhole.params, rtol=1e-12)
-    inner = np.s_[1:-1, 1:-1]  # at the border COLMAP paints black what lies half a pixel outside
+    inner = np.s_[1:-1, 1:-1]  # COLMAP paints pixels half a pixel outside black
     # Both are bilinear and rounded once.
     np.testing.assert_allclose(view.image[inner].astype(int), theirs.to_array()[inner], atol=1)
 
@@ -129,14 +130,14 @@ FISHEYES = {
 
 @pytest.mark.parametrize("model", FISHEYES)
 def test_fisheyes_stay_as_they_are(tmp_path, model):
-    """Not a pixel is resampled, and the camera is COLMAP's: its directions appear where COLMAP says."""
+    """No pixel is resampled, and the camera projects directions as COLMAP's does."""
     intrinsics, pixels = Intrinsics(model, FISHEYES[model], 160, 120), noise(160, 120)
     (view,) = load(posed(save(tmp_path / "a.png", pixels), intrinsics))
     np.testing.assert_array_equal(view.image, pixels)
     assert view.camera.model == "fisheye"
     u, v = np.meshgrid(np.linspace(5, 155, 16), np.linspace(5, 115, 12))
     rays = view.camera.rays(u, v)
-    front = rays[..., 2] > 0.1  # COLMAP's function has no points behind
+    front = rays[..., 2] > 0.1  # COLMAP projects no points behind the camera
     assert front.mean() > 0.6
     np.testing.assert_allclose(project(intrinsics, rays[front]), np.stack([u, v], axis=-1)[front], atol=1e-9)
 
@@ -149,7 +150,7 @@ def test_a_smaller_fisheye_keeps_its_coefficients(tmp_path):
 
 
 def test_beyond_a_fisheyes_image_nothing_counts(tmp_path):
-    """theta - 0.1 theta^3 is largest at a radius of 1.217, 24.3 px; a mask of the user's counts too."""
+    """theta - 0.1 theta^3 has its maximum at a radius of 1.217, 24.3 px; a mask of the user applies as well."""
     intrinsics = Intrinsics("SIMPLE_RADIAL_FISHEYE", (20.0, 32.0, 32.0, -0.1), 64, 64)
     user = np.full((64, 64), 255, np.uint8)
     user[30:34, 30:34] = 0

@@ -1,4 +1,4 @@
-"""Folders become scenes: which reader is taken, how photos are split, where the origin lies."""
+"""Loading folders as scenes: choice of the reader, split of the photos, origin, near plane."""
 
 import dataclasses
 import json
@@ -54,8 +54,8 @@ def test_every_nth_photo_by_name_is_held_out(tmp_path, every, test):
 
 
 def test_nothing_is_drawn_long_before_the_nearest_points(tmp_path):
-    """By hand: 100 points at 3 to 3.99 in front of the first photos, one wrong point at 0.5; others see none of them.
-    Held-out photos draw as the others do."""
+    """By hand: 100 points at 3 to 3.99 in front of the first photos and one outlier at 0.5; other photos see none.
+    Held-out photos have the same near plane."""
     write_colmap(tmp_path)
     rows = [f"{k} 0.3 0 {3 + k / 100} 0 0 0 0\n" for k in range(100)]
     (tmp_path / "sparse" / "0" / "points3D.txt").write_text("".join([*rows, "100 0.3 0 0.5 0 0 0 0\n"]))
@@ -95,9 +95,9 @@ def test_scenes_far_from_the_origin_are_moved_to_it(tmp_path, centre):
     write_colmap(tmp_path / "far", centre=centre)
     write_colmap(tmp_path / "near")
     far, near = (load_scene(tmp_path / name, DataConfig()) for name in ("far", "near"))
-    middle = np.array([4.0, 0.0, 0.0])  # of the cameras beside `centre`
+    middle = np.array([4.0, 0.0, 0.0])  # mean position of the cameras, relative to `centre`
     np.testing.assert_allclose(far.offset, centre + middle, rtol=1e-15)
-    # Up to the translation, the same scene to float64's resolution at 5e6, 1e-9.
+    # Apart from the translation, the same scene within the resolution of float64 at 5e6, 1e-9.
     np.testing.assert_allclose(far.points + middle, near.points, atol=4e-9)
     for one, other in zip(far.train + far.test, near.train + near.test, strict=True):
         np.testing.assert_allclose(one.camera.position + middle, other.camera.position, atol=4e-9)
@@ -106,7 +106,7 @@ def test_scenes_far_from_the_origin_are_moved_to_it(tmp_path, centre):
 
 
 def test_scenes_near_the_origin_stay(tmp_path):
-    write_colmap(tmp_path, centre=(3000.0, 0.0, 0.0))  # extent 4.4: below 1000 of them
+    write_colmap(tmp_path, centre=(3000.0, 0.0, 0.0))  # extent 4.4: less than 1000 extents
     scene = load_scene(tmp_path, DataConfig())
     np.testing.assert_array_equal(scene.offset, 0)
     np.testing.assert_array_equal(scene.points[0], [3000, 0, 5])

@@ -1,4 +1,4 @@
-"""Matching in processes: what it finds depends neither on how many there are, nor on what else is going on."""
+"""Matching in processes: the result depends neither on their number nor on other readers of the database."""
 
 import shutil
 import subprocess
@@ -10,7 +10,7 @@ from PIL import Image
 from test_reconstruction import take_photos
 
 from clsplat.dataset.sfm import matching as features
-from clsplat.dataset.sfm.matching import DEPENDENT, FOLLOWER, extract, match
+from clsplat.dataset.sfm.matching import COUNT_ROWS, EXIT_WITH_PARENT, extract, match
 from clsplat.errors import ClsplatError
 
 READER = """
@@ -24,7 +24,7 @@ time.sleep(600)
 
 @pytest.fixture(scope="module")
 def extracted(tmp_path_factory):
-    """Database with the features of four photos, and the pairs of them; not to be changed."""
+    """Database with the features of four photos, and all pairs of them; tests must not change it."""
     folder = tmp_path_factory.mktemp("extracted")
     names = [f"photo {k}.png" for k in range(4)]
     for name, photo in zip(names, take_photos(0), strict=True):
@@ -40,12 +40,12 @@ def extracted(tmp_path_factory):
 
 @pytest.fixture
 def database(extracted, tmp_path):
-    """A copy of the database, to be changed."""
+    """Copy of the database that a test may change."""
     return shutil.copyfile(extracted[0], tmp_path / "database.db")
 
 
 def contents(database):
-    """Pairs, their matches and what is left of these after verification."""
+    """Pairs, their matches, and the matches that remain after verification."""
     with pycolmap.Database.open(database) as opened:
         numbers, matches = opened.read_all_matches()
         verified, geometries = opened.read_two_view_geometries()
@@ -71,7 +71,7 @@ def test_the_number_of_processes_changes_nothing(extracted, tmp_path, monkeypatc
 
 
 def test_features_count_that_are_still_in_the_log(extracted, tmp_path):
-    """Who looks on while features are written, keeps SQLite from putting them into the file, and may be killed."""
+    """A process that reads while features are written prevents SQLite from merging its log into the file."""
     database = tmp_path / "database.db"
     pycolmap.Database.open(database).close()
     uri = f"{database.as_uri()}?mode=ro"
@@ -95,17 +95,24 @@ def test_a_process_that_fails_is_an_error_and_ends_the_others(extracted, databas
     monkeypatch.setattr(features, "PAIRS_MIN", 3)
     monkeypatch.setattr(features.os, "cpu_count", lambda: 2)
     fails_first = "import signal, sys\nif not sys.argv[2].endswith('0.db'): signal.pause()\nsys.exit(7)"
-    monkeypatch.setattr(features, "WORKER", fails_first)
+    monkeypatch.setattr(features, "MATCH_SHARE", fails_first)
     with pytest.raises(ClsplatError, match="status 7"):
         match(database, extracted[1])
     assert contents(database)[1] == {} and sorted(path.name for path in database.parent.iterdir()) == ["database.db"]
 
 
-@pytest.mark.parametrize("program", [FOLLOWER, "print(flush=True)\nsignal.pause()"], ids=["follower", "other"])
+@pytest.mark.parametrize("program", [COUNT_ROWS, "print(flush=True)\nsignal.pause()"], ids=["count rows", "other"])
 def test_a_process_ends_with_the_one_that_started_it(program, tmp_path):
-    """Whose end closes the pipe, however it came; the follower's database may be gone by then."""
+    """The end of the parent closes the pipe, whatever ended it; the database may be gone by then."""
     (tmp_path / "a.db").touch()
-    command = [sys.executable, "-I", "-c", DEPENDENT + program, "images", f"{(tmp_path / 'a.db').as_uri()}?mode=ro"]
+    command = [
+        sys.executable,
+        "-I",
+        "-c",
+        EXIT_WITH_PARENT + program,
+        "images",
+        f"{(tmp_path / 'a.db').as_uri()}?mode=ro",
+    ]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as child:
         child.stdin.close()
         assert child.wait(timeout=300) == 1

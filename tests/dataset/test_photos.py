@@ -1,4 +1,4 @@
-"""One file of each kind: read right, or refused with its name."""
+"""Photo files of each kind are read correctly, or refused with their name."""
 
 import subprocess
 import sys
@@ -63,7 +63,7 @@ def test_palette_and_cmyk(tmp_path):
     np.testing.assert_array_equal(read(tmp_path / "palette.png"), np.asarray(image.convert("RGB")))
     flat = np.full((16, 16, 3), (200, 100, 50), np.uint8)
     Image.fromarray(flat).convert("CMYK").save(tmp_path / "cmyk.jpg", quality=100)
-    # JPEG of one colour: rounding of its transforms only
+    # A JPEG of a single colour: only its transforms round
     np.testing.assert_allclose(read(tmp_path / "cmyk.jpg").astype(int), flat, atol=2)
 
 
@@ -73,7 +73,7 @@ def test_transparency_shows_the_background(tmp_path, background):
     Image.fromarray(np.dstack([RGB, alpha])).save(tmp_path / "a.png")
     weight = alpha[..., None] / 255
     expected = RGB * weight + 255 * np.array(background) * (1 - weight)
-    # Half a level of rounding; float32 may round the other way at .5 exactly.
+    # Rounding costs half a level; float32 may round exact halves the other way.
     np.testing.assert_allclose(read(tmp_path / "a.png", background), expected, atol=0.5 + 1e-4)
 
 
@@ -194,7 +194,7 @@ def test_pillow_still_writes_once_pycolmap_is_loaded(tmp_path):
 
 
 def test_chunks_take_no_more_memory_than_the_file_has(tmp_path):
-    """Found by fuzzing: decoders made room for the 256 MiB that a flipped bit announces."""
+    """Found by fuzzing: decoders allocated the 256 MiB that a flipped bit declared."""
     path = tmp_path / "photo.png"
     Image.fromarray(RGB).save(path)
     content = bytearray(path.read_bytes())

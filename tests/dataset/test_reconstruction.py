@@ -1,4 +1,4 @@
-"""Structure from motion on rendered photos whose cameras are known, and what becomes of its model on disk."""
+"""Structure from motion on rendered photos with known cameras, and its model on disk."""
 
 import json
 import os
@@ -25,7 +25,7 @@ FILES = ["cameras.bin", "images.bin", "points3D.bin"]
 
 
 def cameras():
-    """Four cameras in front of a corner, some 11 degrees apart."""
+    """Four cameras in front of a corner, about 11 degrees apart."""
     eyes = [(3.2 * np.cos(a), 3.2 * np.sin(a), 1.6 + 0.3 * (k % 2)) for k, a in enumerate(np.linspace(0.5, 1.1, 4))]
     return [Camera.look_at(eye, (0.4, 0.4, 0.4), (0, 0, 1), 300, 320, 240) for eye in eyes]
 
@@ -46,7 +46,7 @@ def corner(camera, textures):
 
 
 def take_photos(seed, seen_by=None):
-    """What the four cameras, or others, see of a corner with textures of its own."""
+    """Render a corner with textures of its own from the four cameras, or from others."""
     rng = np.random.default_rng(seed)
     textures = []
     for _ in range(3):
@@ -57,13 +57,13 @@ def take_photos(seed, seen_by=None):
 
 @pytest.fixture(scope="session")
 def photos():
-    """What the four cameras see, as arrays."""
+    """The photos of the four cameras, as arrays."""
     return take_photos(0)
 
 
 @pytest.fixture(scope="session")
 def solved(photos, tmp_path_factory):
-    """Folder of the photos with their model; not to be changed."""
+    """Folder of the photos with their model; tests must not change it."""
     folder = tmp_path_factory.mktemp("solved")
     for k, photo in enumerate(photos):
         Image.fromarray(photo).save(folder / f"photo {k}.png")
@@ -73,13 +73,13 @@ def solved(photos, tmp_path_factory):
 
 @pytest.fixture
 def copy(solved, tmp_path):
-    """A copy of `solved`, to be changed."""
+    """Copy of `solved` that a test may change."""
     return shutil.copytree(solved, tmp_path / "copy")
 
 
 @pytest.fixture
 def runs(solved, monkeypatch):
-    """Replaces the minutes of work by the model of `solved`; counts how often it was asked for."""
+    """Replace the mapping by the model of `solved`, and count the calls."""
     import pycolmap
 
     asked = []
@@ -100,7 +100,7 @@ def test_known_cameras_are_recovered(solved):
     u, s, vt = np.linalg.svd(true.T @ found)  # Umeyama 1991
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     rotation, scale = u @ sign @ vt, np.trace(np.diag(s) @ sign) / (found**2).sum()
-    # Seen: 0.06 %. A pixel at this focal length is 0.3 % of the distance.
+    # Measured: 0.06 %. A pixel at this focal length is 0.3 % of the distance.
     assert (
         np.linalg.norm(scale * found @ rotation.T - true, axis=1).max() < 0.003 * np.linalg.norm(true, axis=1).max()
     )
@@ -128,8 +128,8 @@ def test_nothing_but_model_and_record_stays(solved):
 
 
 def test_unlike_photos_are_turned_first_and_give_the_same_model(solved, photos, tmp_path, capfd):
-    """EXIF orientation and transparency: structure from motion sees the pixels that training sees."""
-    folder = tmp_path / "images"  # one level up counts as the dataset
+    """EXIF orientation and transparency: structure from motion reads the same pixels as training."""
+    folder = tmp_path / "images"  # the dataset is the folder above
     folder.mkdir()
     for k, (photo, tag) in enumerate(zip(photos, (6, 3, 1, 1), strict=True)):
         stored = {6: photo[:, ::-1].swapaxes(0, 1), 3: photo[::-1, ::-1], 1: photo}[tag]
@@ -139,7 +139,7 @@ def test_unlike_photos_are_turned_first_and_give_the_same_model(solved, photos, 
         exif[0x0112] = tag
         Image.fromarray(stored).save(folder / f"photo {k}.png", exif=exif)
     model = reconstruct(tmp_path, CONFIG)
-    # The same pixels and the same seed: on one machine the same bytes.
+    # The same pixels and the same seed give the same bytes on one machine.
     for name in FILES:
         assert (model / name).read_bytes() == (solved / "sparse" / "0" / name).read_bytes()
     scene = load_scene(tmp_path, DataConfig(test_every=0))
@@ -209,15 +209,15 @@ def test_too_few_poses_are_refused_and_leave_nothing(tmp_path):
     rng = np.random.default_rng(1)
     for k in range(3):
         Image.fromarray(rng.integers(0, 256, (96, 128, 3)).astype(np.uint8)).save(tmp_path / f"{k}.png")
-    with pytest.raises(InputError, match=r"at least 3 photos, found those of 0 of 3.*overlap"):
+    with pytest.raises(InputError, match=r"poses of 0 of 3 photos, expected at least 3.*overlap"):
         reconstruct(tmp_path, CONFIG)
     assert sorted(os.listdir(tmp_path)) == ["0.png", "1.png", "2.png"]
 
 
 def test_a_cached_model_must_have_enough_poses_too(copy, runs):
     shutil.copy(copy / "photo 3.png", copy / "photo 4.png")
-    reconstruct(copy, CONFIG)  # by `runs`, a model of 4 photos
-    with pytest.raises(InputError, match="at least 5 photos, found those of 4 of 5"):
+    reconstruct(copy, CONFIG)  # `runs` yields a model of 4 photos
+    with pytest.raises(InputError, match="poses of 4 of 5 photos, expected at least 5"):
         reconstruct(copy, SfmConfig(camera_model="SIMPLE_RADIAL", min_registered=5))
     assert len(runs) == 1
 
@@ -246,9 +246,9 @@ def test_bad_options_are_refused(solved, options, message):
 
 
 def test_a_photo_of_one_row_is_refused(copy):
-    """COLMAP reduces it to none, and dies."""
+    """COLMAP reduces it to zero rows and crashes."""
     Image.fromarray(np.zeros((1, 4000, 3), np.uint8)).save(copy / "row.png")
-    with pytest.raises(InputError, match=r"row\.png: expected a photo at most .* found 4000x1"):
+    with pytest.raises(InputError, match=r"row\.png: expected an aspect ratio of at most .* found 4000x1"):
         reconstruct(copy, CONFIG)
 
 
@@ -263,7 +263,7 @@ def test_folders_that_cannot_be_used_are_refused(solved, tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
-    with monkeypatch.context() as patch:  # the tests may run as root, who may write anywhere
+    with monkeypatch.context() as patch:  # the tests may run as root, who can write anywhere
         patch.setattr(tempfile, "mkdtemp", refuse)
         with pytest.raises(InputError, match=r"Permission denied.*copy the photos.*-o DIR"):
             reconstruct(tmp_path, CONFIG)
@@ -272,7 +272,7 @@ def test_folders_that_cannot_be_used_are_refused(solved, tmp_path, monkeypatch):
         reconstruct(tmp_path, CONFIG)
     assert len(os.listdir(tmp_path)) == 4
     (tmp_path / "sparse").mkdir()
-    with pytest.raises(InputError, match="one of others"):
+    with pytest.raises(InputError, match="found another model"):
         reconstruct(tmp_path, CONFIG)
 
 
@@ -287,7 +287,7 @@ def test_damaged_records_are_refused_by_name(tmp_path, text):
 
 
 def test_portrait_and_landscape_are_two_cameras(tmp_path, photos):
-    """COLMAP's one camera has one size and would drop the other photos without a word."""
+    """A single COLMAP camera has one size; COLMAP silently drops photos of another size."""
     for k, photo in enumerate(photos):
         Image.fromarray(photo[:, 40:280] if k in (1, 2) else photo).save(tmp_path / f"{k}.png")
     cameras, images, _, _ = read_model(reconstruct(tmp_path, CONFIG))
@@ -312,7 +312,7 @@ def test_lenses_without_distortion_keep_their_size():
 @pytest.mark.slow
 @pytest.mark.shared
 def test_a_real_facade_is_recovered(shared, tmp_path):
-    """All of sceaux's photos get a pose, which agrees with the poses that come with the scene."""
+    """All photos of sceaux get a pose, which agrees with the poses of the scene."""
     for file in (shared / "data" / "sceaux" / "images").iterdir():
         with Image.open(file) as image:
             image.resize((480, 355), Image.Resampling.BOX).save(tmp_path / file.name, quality=95)

@@ -1,4 +1,4 @@
-"""What is told about structure from motion: figures from the model, warnings from thresholds, a picture."""
+"""Summary of structure from motion: figures of the model, warnings at thresholds, a picture."""
 
 import json
 import re
@@ -13,8 +13,8 @@ from clsplat.camera import Camera
 from clsplat.commands.console import say_cameras
 from clsplat.config import SfmConfig
 from clsplat.dataset.photos import photo_sharpness
-from clsplat.dataset.sfm.reconstruction import RECORD, SparseModel, read_sparse
-from clsplat.dataset.sfm.summary import Preview, draw_cameras, preview
+from clsplat.dataset.sfm.reconstruction import RECORD
+from clsplat.dataset.sfm.summary import Preview, SparseModel, draw_cameras, preview, read_sparse
 from clsplat.errors import InputError
 
 NAMES = ["a.png", "b.png", "c.png"]
@@ -48,9 +48,9 @@ def test_a_good_model_has_no_warning(model):
         (
             {"points_seen": np.array([300, 49, 50])},
             1.0,
-            "poses are doubtful, by fewer than 50 points, of 1 of 3 photos: b.png$",
+            "poses are doubtful, from fewer than 50 points: 1 of 3 photos: b.png$",
         ),
-        ({}, 0.29, "blurred beside the others are 1 of 3 photos: c.png;"),
+        ({}, 0.29, "blurred compared with the others: 1 of 3 photos: c.png;"),
     ],
 )
 def test_each_fault_has_its_warning(model, change, sharpness, words):
@@ -69,7 +69,7 @@ def test_photos_without_a_pose_are_named(model):
 
 @pytest.fixture
 def dataset(tmp_path):
-    """Photos, one of them blurred and one without a pose, with a model that COLMAP's classes write."""
+    """Photos, one of them blurred and one without a pose, with a model written by pycolmap."""
     import pycolmap
 
     record = {"photos": ".", "registered": 3, "options": vars(SfmConfig()), "hashes": {}}
@@ -100,7 +100,7 @@ def test_the_model_is_read(dataset):
     )
     assert model.points_seen.tolist() == [1, 1, 1]
     np.testing.assert_array_equal(model.colors, [[10, 20, 30]])
-    with pytest.raises(InputError, match="expected a COLMAP model"):
+    with pytest.raises(InputError, match=r"cannot read .* as a COLMAP model"):
         read_sparse(dataset)
 
 
@@ -110,7 +110,7 @@ def test_what_was_found_is_said_and_drawn(dataset, tmp_path, capsys):
     say_cameras(dataset, tmp_path / "cameras.png")
     error = capsys.readouterr().err
     assert "cameras: 3 of 4 photos have a pose; 1 points" in error
-    assert "no pose was found for 1 of 4 photos: d.png;" in error and "blurred beside the others" in error
+    assert "no pose was found for 1 of 4 photos: d.png;" in error and "blurred compared with the others" in error
     assert "cameras.png shows them" in error
     with Image.open(tmp_path / "cameras.png") as image:
         assert image.width > 800

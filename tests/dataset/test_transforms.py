@@ -1,4 +1,4 @@
-"""transforms.json in its dialects: known cameras come back, and what cannot be right is refused."""
+"""transforms.json in its dialects: known cameras are read, and impossible values are refused."""
 
 import json
 
@@ -294,7 +294,7 @@ def test_lego_brings_its_split(shared):
 @pytest.mark.shared
 @pytest.mark.parametrize("downscale", [2, 4])
 def test_fox_agrees_with_its_colmap_model(shared, tmp_path, downscale):
-    """Two reconstructions of the same photos: the same cameras up to a similarity."""
+    """Two reconstructions of the same photos have the same cameras up to a similarity."""
     fox = shared / "data" / "fox"
     for name in ("images_2", "images_4", "transforms.json"):
         (tmp_path / name).symlink_to(fox / name)
@@ -309,7 +309,7 @@ def test_fox_agrees_with_its_colmap_model(shared, tmp_path, downscale):
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     rotation, scale = u @ sign @ vt, np.trace(np.diag(s) @ sign) / (source**2).sum()
     error = np.linalg.norm(scale * source @ rotation.T - target, axis=1)
-    # The data's README: 0.14 % of the extent and 0.76 degrees at most, from different principal points.
+    # README of the data: 0.14 % of the extent and 0.76 degrees at most, from different principal points.
     assert np.sqrt(np.mean(error**2)) < 0.002 * np.linalg.norm(target, axis=1).max()
     for one, other in zip(ours, theirs, strict=True):
         relative = one.camera.viewmat[:3, :3] @ rotation.T @ other.camera.viewmat[:3, :3].T
@@ -351,7 +351,7 @@ def test_points_declared_but_not_there_take_no_memory(root, kind):
     ids=["mask", "focal length", "size", "pose", "product of a pose"],
 )
 def test_values_that_broke_the_reader(root, change):
-    """Found by fuzzing: TypeError, OverflowError, a warning of NumPy's, and lists of 1e300 pixels."""
+    """Found by fuzzing: TypeError, OverflowError, a NumPy warning, and lists of 1e300 pixels."""
     first, *others = frames()
     (root / "transforms.json").write_text(
         json.dumps({"frames": [first | {"fl_x": 50} | change, *others], "fl_x": 50})

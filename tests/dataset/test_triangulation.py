@@ -1,4 +1,4 @@
-"""Points triangulated from rendered photos whose cameras are known: they must lie where the photos' planes are."""
+"""Points triangulated from rendered photos with known cameras must lie on the planes that the photos show."""
 
 import json
 from dataclasses import replace
@@ -12,13 +12,13 @@ from clsplat.camera import Camera
 from clsplat.cli import main
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene, with_points
-from clsplat.dataset.sfm.triangulation import FEWEST, NEIGHBOURS, START, filled, pairs, triangulate
+from clsplat.dataset.sfm.triangulation import NEIGHBOURS, POINTS_TARGET, TRIANGULATED_MIN, filled, pairs, triangulate
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
 from clsplat.scene import View
 
 PIXEL = 3.2 / 300
-"""Of the four photos, where the corner is, in world units."""
+"""Size of a pixel of the four photos at the corner, in world units."""
 
 
 def views(photos, seen_by):
@@ -37,7 +37,7 @@ def posed():
 
 
 def write_transforms(folder, views, **more):
-    """A dataset of poses without points; photos of another size than their cameras' are smaller copies."""
+    """Write a dataset with poses but no points. Photos smaller than their cameras count as smaller copies."""
     frames = []
     for view in views:
         Image.fromarray(view.image).save(folder / view.name)
@@ -53,8 +53,9 @@ def write_transforms(folder, views, **more):
 def test_points_lie_on_the_planes_and_have_their_colours(posed):
     points, colors = triangulate(posed)
     assert points.dtype == np.float64 and colors.dtype == np.uint8 and points.shape == colors.shape
-    assert len(points) > 3 * FEWEST
-    # Features are found to a fraction of a pixel, which 11 degrees between two photos make 5 times as long in depth.
+    assert len(points) > 3 * TRIANGULATED_MIN
+    # Features are located to a fraction of a pixel; 11 degrees between two photos make the error in depth 5 times
+    # larger.
     assert np.median(off_the_corner(points)) < 0.3 * PIXEL
     assert np.quantile(off_the_corner(points), 0.95) < 5 * PIXEL
     camera, photo = posed[0].camera, posed[0].image
@@ -63,7 +64,7 @@ def test_points_lie_on_the_planes_and_have_their_colours(posed):
     v = (camera.fy * at[:, 1] / at[:, 2] + camera.cy).astype(int)
     inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     shown = photo[v[inside], u[inside]].astype(float)
-    # Means over photos and within a pixel: less than between any two places of the texture, which differ by some 60.
+    # Colours are means over photos and within a pixel. Two arbitrary places of the texture differ by about 60.
     assert np.median(np.abs(shown - colors[inside])) < 15
 
 
@@ -82,16 +83,16 @@ def test_masked_pixels_make_no_points(posed):
         masked.append(replace(view, mask=reach.argmin(axis=-1) != 2))  # not the floor
     points, _ = triangulate(masked)
     on_floor, unmasked = (np.mean(p[:, 2] < 4 * PIXEL) for p in (points, triangulate(posed)[0]))
-    # A feature is as wide as some pixels: of those beside the edge the middle may lie beyond it.
-    assert len(points) > FEWEST and on_floor < 0.05 < unmasked
-    # Photos without a mask beside those with one count whole.
+    # A feature covers several pixels, so that its centre can lie beyond the edge of the mask.
+    assert len(points) > TRIANGULATED_MIN and on_floor < 0.05 < unmasked
+    # Photos without a mask are used completely, even if others have one.
     assert len(triangulate([*masked[:2], *posed[2:]])[0]) > len(points)
 
 
 def test_fisheyes_are_projected_as_such():
     fisheyes = [replace(c, model="fisheye", distortion=(0.1, -0.05, 0.02, 0.0)) for c in cameras()]
     points, _ = triangulate(views(take_photos(0, fisheyes), fisheyes))
-    assert len(points) > 3 * FEWEST and np.median(off_the_corner(points)) < 0.3 * PIXEL
+    assert len(points) > 3 * TRIANGULATED_MIN and np.median(off_the_corner(points)) < 0.3 * PIXEL
 
 
 def test_photos_that_show_nothing_make_no_points(posed):
@@ -119,7 +120,7 @@ def test_cameras_at_one_place_or_out_of_the_world_make_no_points(posed, factor):
 
 
 def test_photos_of_one_row_are_left_out(posed):
-    """COLMAP reduces them to none, and dies."""
+    """COLMAP reduces them to zero rows and crashes."""
     row = replace(posed[0], image=posed[0].image[:1].repeat(13, axis=1))
     row = replace(row, camera=replace(row.camera, width=row.image.shape[1], height=1))
     np.testing.assert_array_equal(triangulate([row, *posed])[0], triangulate(posed)[0])
@@ -139,7 +140,7 @@ def test_photos_are_matched_with_the_nearest_that_look_the_same_way():
     assert all(j - i <= NEIGHBOURS for i, j in pairs(row)) and (0, NEIGHBOURS) in pairs(row)
     assert pairs(row) == sorted(set(pairs(row))) and len(pairs(row)) > 2 * len(row)
     assert pairs([at(0, (0, 0, 9)), at(1, (1, 0, -9)), at(2, (2, 0, 9))]) == [(0, 2)]
-    # A panorama's faces stand at one place; so does a camera on a tripod.
+    # The faces of a panorama have one position, as has a camera on a tripod.
     assert pairs([at(0, (0, 0, 9)), at(0, (1, 0, 9))]) == []
     assert pairs([]) == []
 
@@ -151,7 +152,7 @@ def test_a_dataset_of_poses_gets_points_from_photos_of_full_size(posed, tmp_path
     assert not len(scene.points) and scene.train[0].image.shape == (60, 80, 3)
     found = with_points(scene, path, config)
     points, colors = triangulate(load_scene(path, DataConfig(test_every=0)).train)
-    assert len(points) < START == len(found.points) == len(found.colors)
+    assert len(points) < POINTS_TARGET == len(found.points) == len(found.colors)
     np.testing.assert_array_equal(found.points[: len(points)], points)
     np.testing.assert_array_equal(found.colors[: len(points)], colors)
     assert found.train == scene.train
@@ -164,16 +165,16 @@ def test_only_photos_that_train_make_points(posed, tmp_path):
     scene = load_scene(path, config)
     assert [view.name for view in scene.train] == ["1.png", "2.png", "3.png"]
     points, _ = triangulate(scene.train)
-    assert len(points) >= FEWEST
+    assert len(points) >= TRIANGULATED_MIN
     np.testing.assert_array_equal(with_points(scene, path, config).points[: len(points)], points)
 
 
 def test_points_are_filled_up_between_neighbours(posed):
     points, colors = triangulate(posed)
     more, blended = filled(points, colors)
-    assert more.shape == blended.shape == (START, 3) and blended.dtype == np.uint8
+    assert more.shape == blended.shape == (POINTS_TARGET, 3) and blended.dtype == np.uint8
     np.testing.assert_array_equal(more[: len(points)], points)
-    # Neighbours mostly lie on one plane of the corner, and what is between them then lies on it as well.
+    # Neighbours mostly lie on one plane of the corner; points between them then lie on it as well.
     assert np.median(off_the_corner(more[len(points) :])) < PIXEL
     assert (more.min(axis=0) == points.min(axis=0)).all() and (more.max(axis=0) == points.max(axis=0)).all()
     np.testing.assert_allclose(blended.mean(axis=0), colors.mean(axis=0), atol=5)
@@ -189,7 +190,7 @@ def test_points_of_a_scene_far_away_are_where_its_cameras_are(posed, tmp_path):
     scene = load_scene(path, config)
     assert scene.offset.any()
     points = with_points(scene, path, config).points
-    assert len(points) > 3 * FEWEST
+    assert len(points) > 3 * TRIANGULATED_MIN
     assert np.median(off_the_corner(points + scene.offset - far)) < 0.3 * PIXEL
 
 
@@ -198,7 +199,7 @@ def test_a_training_starts_from_them_unless_told_not_to(posed, tmp_path, capsys)
     options = ["train", str(path), "--iterations", "2", "--size", "fixed", "--eval-every", "0"]
     options += ["--max-gaussians", "500"]
     main([*options, "-o", str(tmp_path / "a")])
-    assert f"start: {START} points, from photos and poses" in capsys.readouterr().err
+    assert f"start: {POINTS_TARGET} points, from photos and poses" in capsys.readouterr().err
     main([*options, "-o", str(tmp_path / "b"), "--init.no-triangulate"])
     assert "start:" not in capsys.readouterr().err
     near, far = (off_the_corner(load_gaussians(tmp_path / run / "scene.ply")[0].means) for run in "ab")

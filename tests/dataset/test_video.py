@@ -1,4 +1,4 @@
-"""Videos become photos: the sharpest frame of each interval, upright, once; and HEIC photos are read."""
+"""Photos from videos: the sharpest frame of each interval, upright, extracted once; and HEIC photos."""
 
 import json
 import struct
@@ -26,7 +26,7 @@ from clsplat.dataset.video import extract_frames
 from clsplat.errors import InputError
 
 SHARP = (3, 8)
-"""Which of the two times six frames are sharp."""
+"""Indices of the sharp frames, one of each six."""
 
 NUMBERS = np.random.default_rng(0)
 TEXTURE = NUMBERS.uniform(0, 255, (64, 96))
@@ -41,7 +41,7 @@ def frames():
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory):
-    """Twelve frames at 6 a second."""
+    """A video of twelve frames at 6 per second."""
     av = pytest.importorskip("av")
     path = tmp_path_factory.mktemp("video") / "clip.mp4"
     with av.open(str(path), "w") as container:
@@ -104,7 +104,7 @@ def test_the_command(video, tmp_path, capsys):
     main(["frames", str(video), "-o", str(tmp_path / "out"), "--fps", "1"])
     assert "2 frames of clip.mp4; next: clsplat train" in capsys.readouterr().err
     assert json.loads((tmp_path / "out" / FRAMES).read_text())["fps"] == 1
-    # train takes the video itself, and two seconds of it are too little for structure from motion.
+    # train extracts frames itself; two seconds of this video are too short for structure from motion.
     with pytest.raises(SystemExit):
         main(["train", str(video), "-o", str(tmp_path / "scene"), "--sfm.min-registered", "9"])
     error = capsys.readouterr().err
@@ -114,7 +114,7 @@ def test_the_command(video, tmp_path, capsys):
 
 def test_what_is_no_video_is_refused(tmp_path, monkeypatch, video):
     (tmp_path / "a.mp4").write_bytes(b"no video" * 100)
-    with pytest.raises(InputError, match=r"a\.mp4: expected a video that can be decoded"):
+    with pytest.raises(InputError, match=r"cannot read .*a\.mp4 as a video"):
         extract_frames(tmp_path / "a.mp4", tmp_path / "out")
     with pytest.raises(InputError, match="found nothing"):
         extract_frames(tmp_path / "none.mp4", tmp_path / "out")
@@ -145,7 +145,7 @@ def test_heic_photos_are_read_and_come_upright(tmp_path):
     image.save(tmp_path / "b.heif", format="HEIF", quality=-1, chroma=444, exif=exif.tobytes())
     assert list_photos(tmp_path) == ["a.HEIC", "b.heif"]
     np.testing.assert_allclose(read_photo(tmp_path / "a.HEIC", (0, 0, 0), True), pixels, atol=3)
-    # HEIF turns by a property of its own, written here from the tag, which its readers apply.
+    # HEIF has its own property for the orientation, which readers apply; it is written here from the tag.
     upright = np.rot90(pixels, -1)
     assert photo_size(tmp_path / "b.heif") == upright.shape[1::-1] and orientation(tmp_path / "b.heif") == 1
     np.testing.assert_allclose(read_photo(tmp_path / "b.heif", (0, 0, 0), False), upright, atol=3)
@@ -156,5 +156,8 @@ def test_heic_photos_are_read_and_come_upright(tmp_path):
 def test_heic_without_its_package_says_how_to_get_it(tmp_path, monkeypatch):
     (tmp_path / "a.heic").touch()
     monkeypatch.setattr(photos, "heif_is_read", lambda: False)
-    with pytest.raises(InputError, match=r"a\.heic: expected the package pillow-heif.*pip install 'clsplat\[heic\]'"):
+    with pytest.raises(
+        InputError,
+        match=r"cannot read .*a\.heic: .* pillow-heif is not installed; pip install 'clsplat\[heic\]'",
+    ):
         read_photo(tmp_path / "a.heic", (0, 0, 0), True)

@@ -1,4 +1,4 @@
-"""Gaussians for the tests of file formats, and the quantisation that each format states."""
+"""Gaussians for the tests of file formats, and the stated quantisation of each format."""
 
 import warnings
 
@@ -24,9 +24,9 @@ def extent(x):
     return np.ptp(x, axis=0)
 
 
-# What each module states: largest error of means, log_scales, opacities, quats but for the largest component, sh of
-# band 0, sh above. All is stored as integers, so that the bound is half a step; where a unit quaternion's 1 has no
-# byte of its own, a whole one.
+# Largest errors that each module states: of means, log_scales, opacities, quats (other than the largest component),
+# sh of band 0, sh above. Values are stored as integers, so that the bound is half a step; a whole step where no byte
+# stands for the 1 of a unit quaternion.
 BOUNDS = {
     ".ply": lambda g: (0, 0, 0, 0, 0, 0),
     ".compressed.ply": lambda g: (
@@ -49,11 +49,11 @@ BOUNDS = {
     ),
 }
 SLACK = 1 + 1e-4
-"""Of the bounds, and added 1e-6: the arithmetic is float32."""
+"""Factor on the bounds, in addition to 1e-6, since the arithmetic is float32."""
 
 
 def matched(found, expected):
-    """The rows of `found` in the order of `expected`, by position: most formats sort."""
+    """Sort the rows of `found` as those of `expected`, by position, since most formats sort."""
     distance, rows = cKDTree(found.means).query(expected.means)
     assert sorted(rows) == list(range(len(expected))), f"rows lost or doubled, at most {distance.max()} away"
     return found.take(rows)
@@ -69,7 +69,8 @@ def assert_within(found, expected, bounds):
     assert (np.abs(found.sh[:, 0] - expected.sh[:, 0]) <= sh0).all()
     assert found.sh.shape == expected.sh.shape
     assert (np.abs(found.sh[:, 1:] - expected.sh[:, 1:]) <= sh).all()
-    # q and -q are one rotation. The largest component follows from the others: up to three times their error.
+    # q and -q are the same rotation. The largest component is computed from the others: up to three times their
+    # error.
     sign = np.sign(np.einsum("ni,ni->n", found.quats, expected.quats))[:, None]
     error = np.sort(np.abs(found.quats * sign - expected.quats), axis=1)
     np.testing.assert_allclose(np.linalg.norm(found.quats, axis=1), 1, rtol=1e-6)
@@ -77,7 +78,7 @@ def assert_within(found, expected, bounds):
 
 
 def save(path, gaussians, *rest):
-    """Save; what the format warns of."""
+    """Save; return the warnings of the format."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         save_gaussians(path, gaussians, *rest)

@@ -1,6 +1,6 @@
-"""What each format of `FORMATS` costs: bytes per Gaussian, seconds, and PSNR lost on the held-out photos.
+"""Measure the cost of each format of `FORMATS`: bytes per Gaussian, seconds, and PSNR lost on the held-out photos.
 
-``make formats SCENE=scene.ply DATA=dataset``, where the dataset and further options in OPTIONS are as given to
+Run ``make formats SCENE=scene.ply DATA=dataset``. The dataset, and further options in OPTIONS, are as for
 ``clsplat train``.
 """
 
@@ -29,7 +29,7 @@ class Arguments:
     scene: tyro.conf.Positional[Path]
     """File of Gaussians."""
     dataset: tyro.conf.Positional[Path]
-    """Dataset, as given to `train`."""
+    """Dataset, as for `train`."""
     data: tyro.conf.OmitArgPrefixes[DataConfig] = field(default_factory=DataConfig)
 
 

@@ -1,4 +1,4 @@
-"""Codebooks and palettes: the promised bound, exactness where it costs nothing, and the weights."""
+"""Codebooks and palettes: the stated bound, exactness for few values, and the weights."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def test_no_value_is_further_than_promised(kind):
     assert (error <= np.abs(book - values[:, None]).min(axis=1) + 1e-6).all() if kind == "normal" else True
     extent = float(np.ptp(values))
     assert error.max() <= extent / 256 * (1 + 1e-3)
-    # Evenly spaced entries would leave extent/256/sqrt(12) on the mean.
+    # Evenly spaced entries would have a root mean squared error of extent/256/sqrt(12).
     even = extent / CODES / 12**0.5
     assert np.sqrt((error**2).mean()) < {"uniform": 1.02, "normal": 0.7}.get(kind, 0.02) * even
 

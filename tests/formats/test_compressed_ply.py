@@ -1,4 +1,4 @@
-"""The compressed PLY: bits written out by hand, whatever order of elements, and damaged headers."""
+"""The compressed PLY: bits written by hand, elements in any order, and damaged headers."""
 
 import struct
 
@@ -42,7 +42,7 @@ def ply(colors=True, rest=(), count=1, chunks=1, order="<", text="binary_little_
 def expect(gaussians, colors):
     np.testing.assert_allclose(gaussians.means, [[1, 0, 2 + 2 * 1023 / 2047]], rtol=1e-6)
     np.testing.assert_allclose(gaussians.log_scales, [[-6, -1, -4]])
-    # 873 and 150 of 1023, less a half, times the root of 2: the nearest to ±0.5.
+    # 873/1023 and 150/1023, minus 0.5, times sqrt(2): nearest to ±0.5.
     np.testing.assert_allclose(gaussians.quats, [[0.5, -0.5, 0.5, 0.5]], atol=1e-3)
     np.testing.assert_allclose(gaussians.opacities, [0.2], rtol=1e-6)
     np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0], [colors], atol=1e-6)
@@ -82,7 +82,7 @@ def test_what_is_written(tmp_path):
     assert lines[21:26] == [f"element vertex {CHUNK + 1}", *(f"property uint {n}" for n in PACKED)]
     assert lines[26:] == [f"element sh {CHUNK + 1}", *(f"property uchar f_rest_{i}" for i in range(9))]
     assert len(body) == 2 * 72 + (CHUNK + 1) * (16 + 9)
-    # The last chunk has one Gaussian: its range is a point, as which the corner of the box comes last.
+    # The last chunk has one Gaussian, so that its range is a point: the last one of the Z-order.
     last = np.frombuffer(body, "<f4", 18, 72).reshape(3, 2, 3)
     assert (last[:, 0] == last[:, 1]).all() and last[0, 0] in gaussians.means
 

@@ -1,4 +1,4 @@
-"""Files of other programs: trained scenes beside the project, and splat-transform in both directions."""
+"""Files of other programs: trained scenes next to the project, and splat-transform in both directions."""
 
 import shutil
 import subprocess
@@ -11,7 +11,7 @@ from clsplat.formats import FORMATS, load_gaussians
 
 COMPACT = [suffix for suffix in FORMATS if suffix != ".ply"]
 
-# As data/README.md counts them, and the SH degree.
+# Number of Gaussians according to data/README.md, and SH degree.
 SCENES = {
     "truck.splat": (116_544, 0),
     "biker.spz": (152_746, 0),
@@ -29,7 +29,7 @@ def test_scenes_of_others_are_read(shared, name):
     assert (len(gaussians), gaussians.sh_degree) == SCENES[name]
     assert all(np.isfinite(array).all() for array in gaussians.arrays().values())
     assert mode == "classic" and not offset.any()
-    # A trained scene, not noise: most scales lie far below the scene's extent, and colours within what is displayed.
+    # A trained scene, not noise: most scales are far below the extent of the scene, and colours can be displayed.
     extent = np.ptp(np.quantile(gaussians.means, [0.05, 0.95], axis=0), axis=0).max()
     assert np.median(gaussians.scales.max(axis=1)) < 0.05 * extent
     assert np.quantile(np.abs(gaussians.sh[:, 0]), 0.9) < 3
@@ -37,15 +37,16 @@ def test_scenes_of_others_are_read(shared, name):
 
 @pytest.mark.shared
 def test_two_files_of_one_scene_agree(shared):
-    """The same Gaussians as .spz and .compressed.ply: axes, rotations, scales and colours must come out the same."""
+    """The same Gaussians as .spz and .compressed.ply must have the same axes, rotations, scales and colours."""
     folder = shared / "data" / "splats"
     spz = load_gaussians(folder / "biker.spz")[0]
     ply = load_gaussians(folder / "biker.compressed.ply")[0]
-    # Both are in the same order, but for Gaussians that nearly coincide.
+    # Both have the same order, except for Gaussians that nearly coincide.
     same = np.abs(spz.means - ply.means).max(axis=1) < 2e-3
     assert same.mean() > 0.99
     spz, ply = spz.take(same), ply.take(same)
-    # Half steps of both: 1/32 and, in chunks of 256, a range of some units by 2046; 1/76.5 and a range by 510.
+    # Half a step of both formats: 1/32, and a chunk's range of a few units divided by 2046; 1/76.5, and a range
+    # divided by 510.
     assert np.quantile(np.abs(spz.log_scales - ply.log_scales)[ply.log_scales.min(axis=1) > -10], 0.999) < 0.04
     assert np.abs(spz.sh - ply.sh).max() < 1 / 76.5 + 3.6 / 510 / 0.28
     assert np.abs(spz.opacities - ply.opacities).max() <= 1 / 255 + 1e-6
@@ -55,7 +56,7 @@ def test_two_files_of_one_scene_agree(shared):
 
 @pytest.fixture(scope="session")
 def splat_transform():
-    """Run PlayCanvas' converter, which is of npm: directly, or by npx where it is installed there."""
+    """Run PlayCanvas' converter from npm: directly, or by npx if it is installed there."""
     for command in (["splat-transform"], ["npx", "--no-install", "splat-transform"]):
         if shutil.which(command[0]) and subprocess.run([*command, "--version"], capture_output=True).returncode == 0:
             return lambda *arguments: subprocess.run(
@@ -70,7 +71,7 @@ def splat_transform():
 
 
 def assert_same(found, expected, quats=1e-5):
-    """Two readers of one file: equal but for float32."""
+    """Check that two readers of one file agree within float32."""
     np.testing.assert_allclose(found.means, expected.means, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(found.log_scales, expected.log_scales, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(found.opacities, expected.opacities, atol=2e-6)
@@ -85,7 +86,7 @@ def test_splat_transform_reads_what_we_write(splat_transform, tmp_path, suffix):
     path = tmp_path / f"ours{suffix}"
     save(path, gaussians)
     splat_transform(path, tmp_path / "theirs.ply")
-    # It takes bytes of a .splat's quaternion for 127.5 q + 127.5, half a step beside the format's inventor.
+    # It decodes the quaternions of a .splat as 127.5 q + 127.5, half a step off the original viewer.
     assert_same(
         load_gaussians(tmp_path / "theirs.ply")[0], load_gaussians(path)[0], 0.01 if suffix == ".splat" else 1e-5
     )
@@ -97,14 +98,16 @@ def test_splat_transform_reads_what_we_write(splat_transform, tmp_path, suffix):
 )
 def test_we_read_what_splat_transform_writes(splat_transform, tmp_path, suffix, options):
     gaussians = random_gaussians(1500, degree=3)
-    np.maximum(gaussians.logit_opacities, -4, out=gaussians.logit_opacities)  # its SOG drops colours at opacity 0
+    np.maximum(
+        gaussians.logit_opacities, -4, out=gaussians.logit_opacities
+    )  # its SOG writer drops colours at opacity 0
     save(tmp_path / "ours.ply", gaussians)
     path = tmp_path / f"theirs{suffix}"
     splat_transform(*options, tmp_path / "ours.ply", path)
     found = load_gaussians(path)[0]
     splat_transform(path, tmp_path / "again.ply")
     assert_same(found, load_gaussians(tmp_path / "again.ply")[0])
-    # It rounds down where we round, spz's positions to 1/4096; its codebooks and palette state no bound.
+    # It rounds down where we round to nearest, positions of .spz to 1/4096; its codebooks and palette have no bound.
     means, log_scales, opacities, quats, sh0, _ = BOUNDS[suffix](gaussians)
     means = np.maximum(2 * means, 1 / 8192) if suffix == ".spz" else 2 * means
     sh = {".spz": 8.5 / 128, ".sog": 2.0}.get(suffix, 1 / 32)

@@ -1,4 +1,4 @@
-"""PLY in and out: the original's layout byte by byte, whatever others write, and damaged files."""
+"""PLY: the original layout byte by byte, files of other programs, and damaged files."""
 
 import errno
 import re
@@ -9,7 +9,8 @@ import pytest
 
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
-from clsplat.formats.ply import LOG_SCALE_MIN, LOGIT_MAX, REQUIRED, load_ply, save_ply
+from clsplat.formats.ply import REQUIRED, load_ply, save_ply
+from clsplat.formats.validity import LOG_SCALE_MIN, LOGIT_MAX
 from clsplat.gaussians import Gaussians
 
 TYPES = {"f4": "float", "f8": "double"}
@@ -24,7 +25,7 @@ def random_gaussians(n=7, degree=3, seed=0):
 
 
 def columns_of(gaussians):
-    """Property name -> values, written out by hand from FORMATS.md's table."""
+    """Values by property name, written by hand from the table of properties."""
     k = gaussians.sh.shape[1]
     columns = {axis: gaussians.means[:, i] for i, axis in enumerate("xyz")}
     columns |= {f"f_dc_{c}": gaussians.sh[:, 0, c] for c in range(3)}
@@ -174,10 +175,10 @@ def broken_files():
         "short row": (ply_bytes(good, "ascii")[:-30], "expected rows of 59 numbers"),
         "word": (ply_bytes(good, "ascii")[:-4] + b"abc\n", "expected rows of 59 numbers"),
         "negative": (ply_bytes(good, count=-1), "negative"),
-        "no number": (ply_bytes(good, count="many"), "well-formed"),
-        "type": (binary.replace(b"property float x", b"property real x"), "well-formed"),
-        "twice": (binary.replace(b"property float y", b"property float x"), "well-formed"),
-        "encoding": (binary.replace(b"binary_little_endian", b"binary"), "well-formed"),
+        "no number": (ply_bytes(good, count="many"), "malformed"),
+        "type": (binary.replace(b"property float x", b"property real x"), "malformed"),
+        "twice": (binary.replace(b"property float y", b"property float x"), "malformed"),
+        "encoding": (binary.replace(b"binary_little_endian", b"binary"), "malformed"),
         "lists": (ply_bytes(good, extra=listed), "list property"),
         "no vertex": (binary.replace(b"element vertex", b"element point"), "'vertex', found point"),
         "none": (ply_bytes({k: v[:0] for k, v in good.items()}), "at least one Gaussian"),
@@ -200,13 +201,13 @@ def test_a_broken_file_is_one_sentence(path, case):
     with pytest.raises(InputError, match=message) as caught:
         load_ply(path)
     text = str(caught.value)
-    assert text.startswith(f"{path}: ") and len(text.splitlines()) == 1
+    assert text.startswith((f"{path}: ", f"cannot read {path}: ")) and len(text.splitlines()) == 1
 
 
 def test_every_truncation_is_an_input_error(path):
     for encoding in ("binary_little_endian", "ascii"):
         content = ply_bytes(columns_of(random_gaussians(n=2, degree=0)), encoding)
-        # An ASCII file cut within its last number reads as another number: nothing tells.
+        # An ASCII file cut within its last number is a valid file with another number.
         for size in range(content.rindex(b" ") if encoding == "ascii" else len(content)):
             path.write_bytes(content[:size])
             with pytest.raises(InputError, match=re.escape(str(path))):
@@ -215,7 +216,7 @@ def test_every_truncation_is_an_input_error(path):
 
 def test_files_that_cannot_be_read(tmp_path):
     for path in (tmp_path / "missing.ply", tmp_path):
-        with pytest.raises(InputError, match=re.escape(f"{path}: expected")):
+        with pytest.raises(InputError, match=re.escape(f"cannot read {path}: ")):
             load_ply(path)
     with pytest.raises(InputError, match=r"\*\.ply, .* found suffix '\.txt'"):
         load_gaussians(tmp_path / "a.txt")

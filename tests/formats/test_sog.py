@@ -1,4 +1,4 @@
-"""SOG: pictures and meta.json made by hand, versions 1 and 2, packed and unpacked, and what they may claim."""
+"""SOG: images and meta.json made by hand, versions 1 and 2, packed and unpacked, and false declarations."""
 
 import io
 import json
@@ -10,7 +10,7 @@ from bounds import random_gaussians
 from PIL import Image
 
 from clsplat.errors import InputError
-from clsplat.formats import compact, load_gaussians, save_gaussians
+from clsplat.formats import load_gaussians, quantisation, save_gaussians
 from clsplat.formats.sog import load_sog, save_sog
 
 N = 2
@@ -127,7 +127,7 @@ def test_what_is_written(tmp_path):
 
 
 def test_colours_of_the_transparent_survive(tmp_path):
-    """WebP drops them by default, since there 0 is a colour that nobody sees."""
+    """By default, WebP drops colours where alpha is 0, since they are invisible in an image."""
     gaussians = random_gaussians(64, degree=0)
     gaussians.logit_opacities[:] = -30
     save_gaussians(tmp_path / "a.sog", gaussians)
@@ -136,13 +136,13 @@ def test_colours_of_the_transparent_survive(tmp_path):
 
 
 def test_a_palette_stands_for_more_than_its_size(tmp_path):
-    """20 000 Gaussians of 300 kinds: each finds its kind, though only a third could have an entry of its own."""
+    """20 000 Gaussians of 300 kinds: each gets its kind, although the palette has entries for a third of them."""
     gaussians = random_gaussians(20_000, degree=1)
     kinds = random_gaussians(300, degree=1).sh[:, 1:]
     gaussians.sh[:, 1:] = kinds[np.arange(20_000) % 300]
     save_sog(tmp_path / "a.sog", gaussians)
     found = load_sog(tmp_path / "a.sog")[0]
-    rows = compact.morton_order(gaussians.means)
+    rows = quantisation.morton_order(gaussians.means)
     error = np.abs(found.sh[:, 1:] - gaussians.sh[rows, 1:])
     assert error.max() <= 1.8 / 256
 
@@ -150,36 +150,40 @@ def test_a_palette_stands_for_more_than_its_size(tmp_path):
 def broken_files():
     white = picture([], 4, 4)
     return {
-        "no meta": ({"a": b""}, None, "found 0; it is no SOG"),
-        "no json": (PICTURES, "{", "lacking"),
+        "no meta": ({"a": b""}, None, "found 0; it is not a SOG"),
+        "no json": (PICTURES, "{", "incomplete"),
         "a list": (PICTURES, "[]", "found version None"),
         "version": (PICTURES, meta2(version=3), "found version 3"),
         "none": (PICTURES, meta2(count=0), "at least one Gaussian, found 0"),
         "half": (PICTURES, meta2(count=1.5), "found 1.5"),
         "huge": (PICTURES, meta2(count=10**12), "found 16 pixels of means"),
-        "no sh0": (PICTURES, meta2(sh0=None), "lacking: KeyError"),
+        "no sh0": (PICTURES, meta2(sh0=None), "incomplete: KeyError"),
         "codebook": (PICTURES, meta2(scales={"codebook": BOOK[:255], "files": ["scales.webp"]}), "256 numbers"),
-        "words": (PICTURES, meta2(scales={"codebook": ["a"] * 256, "files": ["scales.webp"]}), "lacking: ValueError"),
+        "words": (
+            PICTURES,
+            meta2(scales={"codebook": ["a"] * 256, "files": ["scales.webp"]}),
+            "incomplete: ValueError",
+        ),
         "nan": (PICTURES, meta2(scales={"codebook": [np.nan] * 256, "files": ["scales.webp"]}), "found log_scales"),
         "range": (PICTURES, meta2(means=meta2()["means"] | {"maxs": [1e9, 1, 1]}), "found means"),
         "beyond floats": (
             PICTURES,
             meta2(means=meta2()["means"] | {"maxs": [10**400, 1, 1]}),
-            "lacking: OverflowErr",
+            "incomplete: OverflowErr",
         ),
         "one range": (
             PICTURES,
             meta2(means=meta2()["means"] | {"mins": [0], "maxs": [1]}),
             r"means of shape \(2, 3\)",
         ),
-        "picture": (PICTURES | {"quats.webp": b"RIFF"}, meta2(), "quats.webp to be a picture"),
-        "cut": (PICTURES | {"quats.webp": PICTURES["quats.webp"][:-9]}, meta2(), "expected"),
-        "no picture": ({k: v for k, v in PICTURES.items() if k != "quats.webp"}, meta2(), "lacking: KeyError"),
+        "picture": (PICTURES | {"quats.webp": b"RIFF"}, meta2(), "quats.webp is not a WebP image"),
+        "cut": (PICTURES | {"quats.webp": PICTURES["quats.webp"][:-9]}, meta2(), "cannot read"),
+        "no picture": ({k: v for k, v in PICTURES.items() if k != "quats.webp"}, meta2(), "incomplete: KeyError"),
         "tag": (PICTURES | {"quats.webp": white}, meta2(), "tagged 252 to 255, found 0"),
         "label": (PICTURES | {"labels.webp": picture([[128, 0, 0, 0]])}, meta2(), "palette's 128, found 128"),
         "palette": (PICTURES | {"centroids.webp": white}, meta2(), "pixels width, found 4"),
-        "outside": (PICTURES, meta2(quats={"files": ["../quats.webp"]}), "pictures beside meta.json"),
-        "offset": (PICTURES, meta2(extras={"clsplat": {"offset": [1]}}), "lacking: ValueError.*offset"),
+        "outside": (PICTURES, meta2(quats={"files": ["../quats.webp"]}), "images next to meta.json"),
+        "offset": (PICTURES, meta2(extras={"clsplat": {"offset": [1]}}), "incomplete: ValueError.*offset"),
     }
 
 
@@ -194,15 +198,16 @@ def test_a_broken_file_is_one_sentence(tmp_path, case):
         bundle(path, meta, pictures)
     with pytest.raises(InputError, match=message) as caught:
         load_sog(path)
-    assert str(caught.value).startswith(f"{path}: ") and len(str(caught.value).splitlines()) == 1
+    text = str(caught.value)
+    assert text.startswith((f"{path}: ", f"cannot read {path}")) and len(text.splitlines()) == 1
 
 
 def test_bombs_are_refused_before_they_unfold(tmp_path, monkeypatch):
     path = tmp_path / "a.sog"
     large = picture([], 1024, 1024)
     bundle(path, meta2(), PICTURES | {"means_l.webp": large})
-    assert len(load_sog(path)[0]) == N  # small enough to harm nobody
-    monkeypatch.setattr(compact, "EXPANSION_FREE", 1 << 16)
+    assert len(load_sog(path)[0]) == N  # too small to exhaust memory
+    monkeypatch.setattr(quantisation, "EXPANSION_FREE", 1 << 16)
     with pytest.raises(InputError, match="exhaust memory"):
         load_sog(path)
     bundle(path, meta2(), PICTURES | {"zeros": bytes(1 << 22)})

@@ -1,4 +1,4 @@
-"""The .splat: bytes written out by hand."""
+"""The .splat format, on bytes written by hand."""
 
 import struct
 
@@ -7,8 +7,8 @@ import pytest
 
 from clsplat.constants import SH_C0
 from clsplat.errors import InputError
-from clsplat.formats.ply import LOG_SCALE_MIN
 from clsplat.formats.splat import load_splat, save_splat
+from clsplat.formats.validity import LOG_SCALE_MIN
 from clsplat.gaussians import Gaussians
 
 # Quaternions wxyz as 128 q + 128: (0.5, -0.5, 0.5, -0.5) and (0, 0, -1, 0).

@@ -1,4 +1,4 @@
-"""SPZ: bytes written out by hand from the format's description, versions 2 to 4, and what a header may claim."""
+"""SPZ: bytes written by hand from the description of the format, versions 2 to 4, and false declarations."""
 
 import gzip
 import struct
@@ -9,7 +9,7 @@ import pytest
 import zstandard
 
 from clsplat.errors import InputError
-from clsplat.formats import compact
+from clsplat.formats import quantisation
 from clsplat.formats.spz import fractional_bits, load_spz, save_spz
 from clsplat.gaussians import Gaussians
 
@@ -41,7 +41,7 @@ def version4(streams, n=1, degree=1, flags=0, extension=b"", table=None, sized=T
 
 
 def expect(gaussians):
-    """The Gaussian above, in the axes of a PLY: y and z turned round."""
+    """Check the Gaussian above, in the axes of a PLY: y and z with the opposite sign."""
     np.testing.assert_allclose(gaussians.means, [[1.5, 2, -0.25]])
     np.testing.assert_allclose(gaussians.log_scales, [[-5, 0, 5.9375]])
     np.testing.assert_allclose(gaussians.opacities, [0.2], rtol=1e-6)
@@ -79,7 +79,7 @@ def test_version_4_by_hand(tmp_path):
     path.write_bytes(version4(streams[:5], degree=0))
     assert load_spz(path)[0].sh.shape == (1, 1, 3)
     path.write_bytes(version4(streams, flags=2, extension=bytes(12)))
-    with pytest.warns(UserWarning, match="vendors"):
+    with pytest.warns(UserWarning, match="vendor-specific"):
         expect(load_spz(path)[0])
     path.write_bytes(version4([*streams[:5], bytes(range(72))], degree=4))
     with pytest.warns(UserWarning, match="degree 4 are cut to 3"):
@@ -103,7 +103,7 @@ def test_what_is_written(tmp_path):
 
 
 def test_turning_the_axes_turns_the_picture(tmp_path):
-    """Colour seen along a direction d of the file's axes is that of the scene along the turned direction."""
+    """The colour along a direction in the axes of the file equals that of the scene along the turned direction."""
     from clsplat.reference.sh import sh_basis
 
     rng = np.random.default_rng(0)
@@ -178,7 +178,7 @@ def broken_files():
         "more than declared": (gzip.compress(header() + BODY + b"x"), "more bytes than they take"),
         "no sum": (whole[:-4], "truncated"),
         "wrong sum": (bytes(wrong_sum), "CRC"),
-        "deflate": (whole[:12] + b"\xff\xff" + whole[14:], "expected a "),
+        "deflate": (whole[:12] + b"\xff\xff" + whole[14:], "cannot read"),
         "table": (version4(streams, table=[*sizes[:5], (5, 10)]), "expected streams of"),
         "five streams": (version4(streams[:5]), "expected streams of"),
         "table beyond the end": (header(4, last=6) + struct.pack("<I", 10**9) + bytes(12), "table of streams"),
@@ -195,15 +195,16 @@ def test_a_broken_file_is_one_sentence(tmp_path, case):
     path.write_bytes(content)
     with pytest.raises(InputError, match=message) as caught:
         load_spz(path)
-    assert str(caught.value).startswith(f"{path}: ") and len(str(caught.value).splitlines()) == 1
+    text = str(caught.value)
+    assert text.startswith((f"{path}: ", f"cannot read {path}: ")) and len(text.splitlines()) == 1
 
 
 def test_a_bomb_is_refused_before_it_unfolds(tmp_path, monkeypatch):
     path = tmp_path / "a.spz"
     n = 1 << 16
     path.write_bytes(gzip.compress(header(n=n, degree=0) + bytes(20 * n)))
-    assert path.stat().st_size * compact.EXPANSION_MAX < 20 * n
-    assert len(load_spz(path)[0]) == n  # small enough to harm nobody
-    monkeypatch.setattr(compact, "EXPANSION_FREE", 1 << 10)
+    assert path.stat().st_size * quantisation.EXPANSION_MAX < 20 * n
+    assert len(load_spz(path)[0]) == n  # too small to exhaust memory
+    monkeypatch.setattr(quantisation, "EXPANSION_FREE", 1 << 10)
     with pytest.raises(InputError, match="exhaust memory"):
         load_spz(path)

@@ -1,4 +1,4 @@
-"""Features of photos and those that pairs of photos share, found by COLMAP through pycolmap.
+"""Features of photos and matches between pairs of photos, computed by COLMAP through pycolmap.
 
 SIFT on the CPU, approximate nearest neighbours, two-view geometry by RANSAC: Schoenberger and Frahm 2016,
 doi:10.1109/CVPR.2016.445.
@@ -20,24 +20,24 @@ import numpy as np
 from clsplat.errors import ClsplatError
 
 SEED = 0
-"""Of RANSAC and of the mapper. The same photos then give the same bytes on one machine, provided that matching and
-mapper run on one thread and photos enter the database in their order."""
+"""Seed of RANSAC and of COLMAP's mapper. With it, the same photos give the same bytes on one machine, provided that
+matching and mapper run on one thread each and photos enter the database in order."""
 
 WORKERS_MAX = 8
-"""Processes that match. Each has a copy of all features: some MB for each photo."""
+"""Largest number of matching processes. Each holds a copy of all features: some MB per photo."""
 
 PAIRS_MIN = 16
-"""Pairs of photos that are worth a process of their own: they take about as long as it does to start."""
+"""Smallest number of pairs of photos per process. Matching them takes about as long as starting a process."""
 
-DEPENDENT = """
+EXIT_WITH_PARENT = """
 import os, signal, sys, threading
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 threading.Thread(target=lambda: (sys.stdin.read(), os._exit(1)), daemon=True).start()
 """
-"""How the programs below begin: they end when the process that started them does, however it does; Ctrl+C is left to
-that process."""
+"""First lines of the programs below. The program exits when the process that started it ends for any reason, and
+leaves Ctrl+C to that process."""
 
-FOLLOWER = """
+COUNT_ROWS = """
 import sqlite3, time
 while True:
     time.sleep(0.5)
@@ -51,23 +51,24 @@ while True:
     except sqlite3.Error:
         pass
 """
-"""Program that prints how many rows a table of some databases has, again and again. In a process of its own: locks on
-files belong to processes, so that within one Python's SQLite and pycolmap's do not see each other's, and the memory
-that they share was cut short under COLMAP (two of six runs on a busy machine ended with a bus error). Between
-processes, and with the database in WAL mode, COLMAP never waits for this."""
+"""Program that repeatedly prints the number of rows of a table, summed over databases.
 
-WORKER = """
+It must run in a process of its own. File locks belong to processes: within one process, Python's SQLite and
+pycolmap's do not see each other's locks, and the memory that they share can be truncated while COLMAP uses it, which
+ends in a bus error. In another process, and with the database in WAL mode, it never makes COLMAP wait."""
+
+MATCH_SHARE = """
 import json
 sys.path[:] = json.loads(sys.argv[1])
 from clsplat.dataset.sfm.matching import match_share
 match_share(sys.argv[2], sys.argv[3], sys.argv[4] == "verbose")
 """
-"""Program that runs `match_share` with the packages of the process that starts it."""
+"""Program that runs `match_share` with the module search path of the process that started it."""
 
 
 @contextmanager
 def quiet(verbose: bool) -> Iterator[None]:
-    """Without COLMAP's messages, unless `verbose`."""
+    """Suppress COLMAP's messages, unless `verbose`."""
     from pycolmap import logging
 
     before = logging.minloglevel
@@ -79,25 +80,28 @@ def quiet(verbose: bool) -> Iterator[None]:
 
 
 def is_sliver(width: int, height: int, edge_max: int) -> bool:
-    """Whether nothing is left of a photo whose longer edge is reduced to `edge_max`: COLMAP dies of it."""
+    """Whether a photo is so elongated that its shorter edge vanishes when its longer edge is reduced to `edge_max`.
+
+    COLMAP crashes on such photos.
+    """
     return min(width, height) * edge_max < max(width, height)
 
 
 def extract(database: Path, photos: Path, names: list[str], edge_max: int, masks: Path | None = None) -> None:
-    """Put the features of photos into a database that has their cameras.
+    """Detect the features of photos and add them to a COLMAP database that holds the cameras.
 
     Parameters
     ----------
     database : Path
-        COLMAP's.
+        COLMAP database.
     photos : Path
         Folder of the photos.
     names : list of str
-        Their names there and in the database.
+        Names of the photos in that folder and in the database.
     edge_max : int
-        Longer edge, in pixels, that larger photos are reduced to.
+        Longer edge, in pixels, to which larger photos are reduced.
     masks : Path, optional
-        Folder with a mask ``NAME.png`` for each photo; features lie where it is not black.
+        Folder with a mask ``NAME.png`` for each photo. No features are detected where it is black.
     """
     import pycolmap
 
@@ -117,21 +121,20 @@ def extract(database: Path, photos: Path, names: list[str], edge_max: int, masks
 
 
 def match(database: Path, pairs: list[tuple[int, int]], verbose: bool = False) -> None:
-    """Put what pairs of photos share into the database that has their features.
+    """Match the features of pairs of photos and add the matches to the COLMAP database that holds the features.
 
-    COLMAP's own threads would spoil it: with pycolmap 4.2.1, of 500 matchings of the same six pairs on two threads 20
-    found other matches than the rest, once 67 in the place of 1776, and of 100 on one thread none. So each of several
-    processes matches a share on one thread, in a database of its own. How many there are changes nothing in what they
-    find.
+    With several threads, COLMAP's matches differ from run to run (pycolmap 4.2.1; docs/howto/photos.md). Therefore
+    several processes share the pairs; each matches on one thread in a database of its own. The result does not depend
+    on the number of processes.
 
     Parameters
     ----------
     database : Path
-        COLMAP's. Nobody else may have it open.
+        COLMAP database. It must not be open elsewhere.
     pairs : list of (int, int)
-        The images' numbers there.
+        Numbers of the images in the database.
     verbose : bool
-        Show COLMAP's own messages.
+        Whether to show COLMAP's own messages.
 
     Raises
     ------
@@ -142,27 +145,27 @@ def match(database: Path, pairs: list[tuple[int, int]], verbose: bool = False) -
 
     if not pairs:
         return
-    pycolmap.Database.open(database).close()  # its log enters the file, whoever had it open when it was written
+    pycolmap.Database.open(database).close()  # merges the write-ahead log into the file, which is copied below
     count = min(os.cpu_count() or 1, WORKERS_MAX, -(-len(pairs) // PAIRS_MIN))
     with TemporaryDirectory(prefix="matches_", dir=database.parent) as folder, ExitStack() as running:
         copies = [Path(folder) / f"{k}.db" for k in range(count)]
         for copy, share in zip(copies, np.array_split(np.array(pairs), count), strict=True):
             shutil.copyfile(database, copy)
-            # By numbers: names in a list of pairs are separated by spaces.
+            # Numbers instead of names: the list of pairs separates names by spaces.
             copy.with_suffix(".txt").write_text("".join(f"{i} {j}\n" for i, j in share.tolist()), encoding="utf-8")
         with _progress(copies, "two_view_geometries", len(pairs), "matches", "pair"):
-            said = "verbose" if verbose else "quiet"
+            loudness = "verbose" if verbose else "quiet"
             workers = [
                 running.enter_context(
-                    _child(WORKER, json.dumps(sys.path), str(copy), str(copy.with_suffix(".txt")), said)
+                    _child(MATCH_SHARE, json.dumps(sys.path), str(copy), str(copy.with_suffix(".txt")), loudness)
                 )
                 for copy in copies
             ]
             for worker in workers:
                 if worker.wait() != 0:
                     raise ClsplatError(
-                        "matches of photos: expected COLMAP to find them, found that its process ended with status "
-                        f"{worker.returncode}; what it wrote is above, and -9 means that the memory did not suffice"
+                        f"cannot match photos: the process of COLMAP ended with status {worker.returncode}; its "
+                        "output is above, and -9 means that there was not enough memory"
                     )
         with pycolmap.Database.open(database) as found:
             for copy in copies:
@@ -174,16 +177,16 @@ def match(database: Path, pairs: list[tuple[int, int]], verbose: bool = False) -
 
 
 def match_share(database: str, listed: str, verbose: bool) -> None:
-    """What a process of `match` does: match pairs on one thread.
+    """Match a list of pairs on one thread; run by each process of `match`.
 
     Parameters
     ----------
     database : str
-        File with the features. Its photos are renamed to their numbers.
+        Database with the features. Its photos are renamed to their numbers.
     listed : str
-        File with a line ``NUMBER NUMBER`` for each pair.
+        Text file with a line ``NUMBER NUMBER`` for each pair.
     verbose : bool
-        Show COLMAP's own messages.
+        Whether to show COLMAP's own messages.
     """
     import pycolmap
 
@@ -208,8 +211,8 @@ def match_share(database: str, listed: str, verbose: bool) -> None:
 def _child(
     program: str, *arguments: str, stdout: int | None = None, stderr: int | None = None
 ) -> Iterator[subprocess.Popen[str]]:
-    """A process that runs one of the programs above; it does not outlive the context."""
-    command = [sys.executable, "-I", "-c", DEPENDENT + program, *arguments]
+    """Run one of the programs above in a process that does not outlive the context."""
+    command = [sys.executable, "-I", "-c", EXIT_WITH_PARENT + program, *arguments]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, text=True) as child:
         try:
             yield child
@@ -219,17 +222,17 @@ def _child(
 
 @contextmanager
 def _progress(databases: list[Path], table: str, total: int, label: str, unit: str) -> Iterator[None]:
-    """Progress bar that counts the rows of a table of COLMAP's databases while COLMAP fills it and says nothing."""
+    """Show a progress bar with the number of rows in a table of COLMAP databases; COLMAP reports no progress."""
     from tqdm import tqdm
 
     uris = [f"{database.resolve().as_uri()}?mode=ro" for database in databases]
     with (
         tqdm(total=total, desc=label, unit=unit, dynamic_ncols=True) as bar,
-        _child(FOLLOWER, table, *uris, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as follower,
+        _child(COUNT_ROWS, table, *uris, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as counter,
     ):
 
         def follow() -> None:
-            for line in follower.stdout or ():
+            for line in counter.stdout or ():
                 bar.n = int(line)
                 bar.refresh()
 
@@ -238,6 +241,6 @@ def _progress(databases: list[Path], table: str, total: int, label: str, unit: s
         try:
             yield
         finally:
-            follower.kill()
+            counter.kill()
             thread.join()
         bar.n = total

@@ -1,6 +1,6 @@
-"""Cameras from photos, by COLMAP through pycolmap.
+"""Recover cameras and sparse points from photos, by COLMAP through pycolmap.
 
-Structure from motion is SIFT on the CPU, matching, incremental mapping: Schoenberger and Frahm 2016,
+Structure from motion consists of SIFT on the CPU, matching and incremental mapping: Schoenberger and Frahm 2016,
 doi:10.1109/CVPR.2016.445.
 """
 
@@ -12,18 +12,17 @@ import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.config import SfmConfig
 from clsplat.dataset.lenses import camera_models
 
-# Not only for these names: a Pillow that is loaded after pycolmap 4.2.1 takes over some of the zlib inside it and
-# crashes when it writes a PNG. Loaded first, it keeps its own.
+# This also imports Pillow before pycolmap. Loaded after pycolmap 4.2.1, Pillow uses parts of the zlib inside pycolmap
+# and crashes when it writes a PNG.
 from clsplat.dataset.photos import (
     FRAMES,
     is_plain,
@@ -37,17 +36,19 @@ from clsplat.dataset.sfm.matching import SEED, extract, is_sliver, match, quiet
 from clsplat.errors import InputError
 
 RECORD = "clsplat_sfm.json"
-"""File beside the model's folder ``0``: of which photos and with which options the model was made."""
+"""Name of the file next to the model's folder ``0`` that records the photos and options from which the model was
+made."""
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
-    """What `reconstruct` noted about the model in `folder`.
+    """Read the record that `reconstruct` wrote about the model in `folder`.
 
     Returns
     -------
     dict or None
-        ``photos``: their folder, relative to `folder` or absolute; ``hashes``: BLAKE2 of each photo by name;
-        ``options``: fields of the `SfmConfig`; ``registered``: number of poses. None: `folder` has no model of ours.
+        ``photos``: folder of the photos, relative to `folder` or absolute; ``hashes``: BLAKE2 of each photo by name;
+        ``options``: fields of the `SfmConfig`; ``registered``: number of poses. None if `folder` has no model made by
+        `reconstruct`.
 
     Raises
     ------
@@ -65,95 +66,37 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         return {**record, "photos": str(record["photos"])}
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"{path}: expected our record of a structure from motion, found {error!r}; delete its folder to redo it"
+            f"cannot read {path}, the record of a structure from motion: {error!r}; delete its folder to recover the "
+            "cameras again"
         ) from error
 
 
-@dataclass(frozen=True, eq=False)
-class SparseModel:
-    """A model as it is looked at.
-
-    Parameters
-    ----------
-    names : list of str
-        Photos with a pose, sorted; V of them.
-    positions, directions : (V, 3) float64
-        Of their cameras, in world units, and the way they look, of length 1.
-    points_seen : (V,) int
-        Points of the model in each photo.
-    points : (P, 3) float64
-    colors : (P, 3) uint8
-    error : float
-        Mean reprojection error, in pixels of the photos that were matched.
-    track_length : float
-        Photos that a point is seen in, on average.
-    """
-
-    names: list[str]
-    positions: NDArray[np.float64]
-    directions: NDArray[np.float64]
-    points_seen: NDArray[np.int64]
-    points: NDArray[np.float64]
-    colors: NDArray[np.uint8]
-    error: float
-    track_length: float
-
-
-def read_sparse(model: Path) -> SparseModel:
-    """Read a COLMAP model in its binary or text format.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
-    import pycolmap
-
-    try:
-        found = pycolmap.Reconstruction(model)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"{model}: expected a COLMAP model, found: {error}") from error
-    images = sorted((i for i in found.images.values() if i.has_pose), key=lambda image: image.name)
-    poses = [image.cam_from_world() for image in images]
-    points = list(found.points3D.values())
-    return SparseModel(
-        [image.name for image in images],
-        np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3),
-        np.array([pose.rotation.matrix()[2] for pose in poses]).reshape(-1, 3),
-        np.array([image.num_points3D for image in images]),
-        np.array([point.xyz for point in points]).reshape(-1, 3),
-        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        float(found.compute_mean_reprojection_error()),
-        float(found.compute_mean_track_length()),
-    )
-
-
 def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, verbose: bool = False) -> Path:
-    """Recover cameras and sparse points from photos; reuse the model where photos and options are unchanged.
+    """Recover cameras and sparse points from photos; reuse the model if photos and options are unchanged.
 
     Parameters
     ----------
     photos : Path
-        Folder with photos, or whose folder ``images`` has them (with sub-folders). At least 3 that overlap.
+        Folder with at least 3 overlapping photos, in itself or in its folder ``images`` (with sub-folders).
     config : SfmConfig
         Options.
     output : Path, optional
-        Folder in which the model is put; it then refers to `photos`, and `clsplat.dataset.load_scene` loads it.
-        Default: `photos`.
+        Folder for the model; default: `photos`. The model records where the photos are, so that
+        `clsplat.dataset.load_scene` can load this folder.
     verbose : bool
-        Show COLMAP's own messages.
+        Whether to show COLMAP's own messages.
 
     Returns
     -------
     Path
-        ``sparse/0`` in `output`: the largest model, in COLMAP's binary format. It describes the photos upright, as
-        their EXIF orientation says.
+        ``sparse/0`` in `output`: the largest model, in COLMAP's binary format. It describes the photos turned upright
+        by their EXIF orientation.
 
     Raises
     ------
     InputError
-        If there are no photos, one is damaged, too few can be registered, the folder cannot be written or holds a
-        model that is not ours.
+        If there are too few photos, one is damaged, too few can be registered, or the output folder cannot be written
+        or holds a model from elsewhere.
     """
     photos = Path(photos)
     output = photos if output is None else Path(output)
@@ -164,18 +107,11 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
         raise InputError(f"{folder}: expected at least {max(config.min_registered, 2)} photos, found {len(names)}")
     _check_options(config)
     hashes = {name: hashlib.blake2b((folder / name).read_bytes(), digest_size=16).hexdigest() for name in names}
-    model, record = output / "sparse" / "0", read_record(output)
-    if record is None and (output / "sparse").exists():
-        raise InputError(
-            f"{output / 'sparse'}: expected no such folder or a model of ours, found one of others; remove it, or "
-            "choose another folder with -o"
-        )
-    if record is not None and record["hashes"] == hashes and (model / "images.bin").is_file():
-        # How many photos must be registered changes nothing in the model: it is checked against it.
-        made_with = replace(SfmConfig(**record["options"]), min_registered=config.min_registered)
-        if made_with == config:
-            _check_registered(record["registered"], len(names), photos, config)
-            return model
+    model = output / "sparse" / "0"
+    registered = _registered_before(output, hashes, config)
+    if registered is not None:
+        _check_registered(registered, len(names), photos, config)
+        return model
 
     with _workspace(output) as work, quiet(verbose):
         readable = _readable(folder, names, work, config.max_image_size)
@@ -194,6 +130,27 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
     return model
 
 
+def _registered_before(output: Path, hashes: dict[str, str], config: SfmConfig) -> int | None:
+    """Number of poses of the model in `output`, if it was made from the same photos with the same options.
+
+    Raises
+    ------
+    InputError
+        If `output` holds a model from elsewhere.
+    """
+    record = read_record(output)
+    if record is None and (output / "sparse").exists():
+        raise InputError(
+            f"{output / 'sparse'}: expected no such folder, or a model made by clsplat, found another model; remove "
+            "it, or choose another folder with -o"
+        )
+    if record is None or record["hashes"] != hashes or not (output / "sparse" / "0" / "images.bin").is_file():
+        return None
+    # min_registered does not change the model; the caller checks the model against it.
+    made_with = replace(SfmConfig(**record["options"]), min_registered=config.min_registered)
+    return int(record["registered"]) if made_with == config else None
+
+
 def _check_options(config: SfmConfig) -> None:
     if config.matching not in ("auto", "exhaustive", "sequential"):
         raise InputError(f"matching: expected auto, exhaustive or sequential, found {config.matching!r}")
@@ -204,7 +161,7 @@ def _check_options(config: SfmConfig) -> None:
 
 
 def _matched(config: SfmConfig, folder: Path) -> SfmConfig:
-    """The options with what `matching` means for the photos in `folder`."""
+    """Resolve `matching` "auto" for the photos in `folder`."""
     if config.matching != "auto":
         return config
     return replace(config, matching="sequential" if (folder / FRAMES).is_file() else "exhaustive")
@@ -213,23 +170,23 @@ def _matched(config: SfmConfig, folder: Path) -> SfmConfig:
 def _check_registered(registered: int, count: int, photos: Path, config: SfmConfig) -> None:
     if registered < max(config.min_registered, 2):
         raise InputError(
-            f"{photos}: expected structure from motion to find the poses of at least {max(config.min_registered, 2)} "
-            f"photos, found those of {registered} of {count}; take more photos that overlap by two thirds, sharp, of "
-            "a scene with texture, from places that differ"
+            f"cannot recover the cameras of {photos}: found the poses of {registered} of {count} photos, expected at "
+            f"least {max(config.min_registered, 2)}; take more photos: sharp, overlapping by two thirds, from "
+            "different positions, of a scene with texture"
         )
 
 
 @contextmanager
 def _workspace(output: Path) -> Iterator[Path]:
-    """Temporary folder inside `output`, so that what is made in it can be renamed to its place."""
+    """Create a temporary folder inside `output`, so that its content can be moved to `output` by renaming."""
     try:
         output.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=".clsplat_sfm_", dir=output))
     except OSError as error:
         raise InputError(
-            f"{output}: expected a folder in which the cameras found can be kept, found: {error.strerror}; copy the "
-            "photos to a folder that can be written, or put the cameras elsewhere by `clsplat sfm PHOTOS -o DIR` and "
-            "give DIR instead of the photos"
+            f"cannot write the recovered cameras to {output}: {error.strerror}; copy the photos to a writable "
+            "folder, or write the cameras elsewhere with `clsplat sfm PHOTOS -o DIR` and then use DIR instead of the "
+            "photos"
         ) from error
     try:
         yield work
@@ -238,10 +195,10 @@ def _workspace(output: Path) -> Iterator[Path]:
 
 
 def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path:
-    """Folder in which COLMAP reads the pixels that training reads: `folder`, or a copy of it where it would not.
+    """Provide a folder in which COLMAP reads the same pixels as training: `folder`, or a copy with converted photos.
 
-    COLMAP ignores the EXIF orientation, and skips files that it cannot decode without an error; hence every photo is
-    decoded here first.
+    COLMAP ignores the EXIF orientation, and silently skips files that it cannot decode. Hence every photo is decoded
+    here first.
     """
     from tqdm import tqdm
 
@@ -249,8 +206,7 @@ def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path
         height, width, _ = read_photo(folder / name, (0.0, 0.0, 0.0), upright=False).shape
         if is_sliver(width, height, edge_max):
             raise InputError(
-                f"{folder / name}: expected a photo at most {edge_max} times as long as it is wide, found "
-                f"{width}x{height} pixels"
+                f"{folder / name}: expected an aspect ratio of at most {edge_max}, found {width}x{height} pixels"
             )
         return is_plain(folder / name)
 
@@ -269,7 +225,7 @@ def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path
 
 
 def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig, verbose: bool) -> Any:
-    """Run the three stages; None where no two photos make a start."""
+    """Detect features, match them and run the mapper; None if no pair of photos can start a model."""
     import pycolmap
     from tqdm import tqdm
 
@@ -296,8 +252,8 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
     )
     (work / "models").mkdir()
     with tqdm(total=len(names), desc="poses", unit="photo", dynamic_ncols=True) as bar:
-
-        def start() -> None:  # of a model: COLMAP begins anew where photos are left that do not fit the first
+        # Called for each model: COLMAP starts another one with photos that do not fit the first.
+        def start() -> None:
             bar.n = 2
             bar.refresh()
 
@@ -316,12 +272,14 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
 
 
 def _turn_upright(model: Any) -> None:
-    """Rotate a model's world so that its y axis points down as the photos do on average: viewers take -y as up, and
-    COLMAP's world is that of the first photo, however it was tilted."""
+    """Rotate the world of a model so that its y axis is the mean downward direction of the photos.
+
+    Viewers take -y as up. COLMAP's world has the axes of the first photo, which may be tilted.
+    """
     import pycolmap
     from scipy.spatial.transform import Rotation
 
     down = np.mean([image.cam_from_world().rotation.matrix()[1] for image in model.images.values()], axis=0)
-    if np.linalg.norm(down) > 0.1:  # photos upside down cancel those that are not: then there is no common direction
+    if np.linalg.norm(down) > 0.1:  # otherwise upright and upside-down photos cancel: no common direction
         rotation, _ = Rotation.align_vectors([[0.0, 1.0, 0.0]], [down / np.linalg.norm(down)])
         model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation.as_matrix()), np.zeros(3)))

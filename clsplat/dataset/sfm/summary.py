@@ -1,4 +1,4 @@
-"""What structure from motion found, before a scene is trained on it: figures, warnings in words, and a picture."""
+"""Summary of a structure from motion before training: figures, warnings, and a picture of the cameras."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -9,32 +9,95 @@ from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
 from clsplat.dataset.photos import list_photos, photo_folder, photo_sharpness
-from clsplat.dataset.sfm import reconstruction as sfm
+from clsplat.dataset.sfm.reconstruction import read_record
+from clsplat.errors import InputError
 
 ERROR_MAX = 1.5
-"""Pixels of the mean reprojection error above which we warn: the real scenes we test with have 0.4 to 1."""
+"""Mean reprojection error above which a warning is given, px. Values of real scenes: docs/howto/photos.md."""
 
 TRACK_MIN = 2.5
-"""Photos that a point is seen in, on average, below which we warn: 2 is the least there is, and means that no third
-photo confirms it. The real scenes we test with have 3.0 to 6.7."""
+"""Mean number of photos per point below which a warning is given. The smallest possible value is 2: no third photo
+confirms the points. Values of real scenes: docs/howto/photos.md."""
 
 POINTS_MIN = 50
-"""Points in a photo below which its pose is called doubtful: COLMAP registers a photo by 30 of them
-(abs_pose_min_num_inliers)."""
+"""Number of points in a photo below which its pose is reported as doubtful. COLMAP registers a photo from 30 points
+on (abs_pose_min_num_inliers)."""
 
 BLUR_MAX = 0.3
-"""Part of the photos' median sharpness below which one is called blurred: in five real scenes the least has 0.56."""
+"""Sharpness, as a fraction of the median of all photos, below which a photo is reported as blurred. Values of real
+scenes: docs/howto/photos.md."""
 
 NAMED = 10
-"""Photos that a warning names; the others are counted."""
+"""Largest number of photos that a warning names; further ones are counted."""
 
 PICTURE_POINTS = 20_000
-"""Points that are drawn."""
+"""Approximate number of points in the picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class SparseModel:
+    """Poses and points of a COLMAP model, for summaries and pictures.
+
+    Parameters
+    ----------
+    names : list of str
+        Names of the V photos with a pose, sorted.
+    positions, directions : (V, 3) float64
+        Positions of the cameras in world units, and their viewing directions as unit vectors.
+    points_seen : (V,) int
+        Number of points of the model in each photo.
+    points : (P, 3) float64
+        Sparse points in world units.
+    colors : (P, 3) uint8
+        RGB of the points.
+    error : float
+        Mean reprojection error, in pixels of the matched photos.
+    track_length : float
+        Mean number of photos per point.
+    """
+
+    names: list[str]
+    positions: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    points_seen: NDArray[np.int64]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    error: float
+    track_length: float
+
+
+def read_sparse(model: Path) -> SparseModel:
+    """Read a COLMAP model in its binary or text format.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    import pycolmap
+
+    try:
+        found = pycolmap.Reconstruction(model)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"cannot read {model} as a COLMAP model: {error}") from error
+    images = sorted((i for i in found.images.values() if i.has_pose), key=lambda image: image.name)
+    poses = [image.cam_from_world() for image in images]
+    points = list(found.points3D.values())
+    return SparseModel(
+        [image.name for image in images],
+        np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3),
+        np.array([pose.rotation.matrix()[2] for pose in poses]).reshape(-1, 3),
+        np.array([image.num_points3D for image in images]),
+        np.array([point.xyz for point in points]).reshape(-1, 3),
+        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        float(found.compute_mean_reprojection_error()),
+        float(found.compute_mean_track_length()),
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """What structure from motion found.
+    """The result of structure from motion.
 
     Parameters
     ----------
@@ -43,15 +106,15 @@ class Preview:
     model : SparseModel
         Poses and points.
     sharpness : (len(photos),) float
-        Of each photo, as `clsplat.dataset.photos.sharpness` measures it.
+        Sharpness of each photo, measured by `clsplat.dataset.photos.photo_sharpness`.
     """
 
     photos: list[str]
-    model: sfm.SparseModel
+    model: SparseModel
     sharpness: NDArray[np.float64]
 
     def summary(self) -> str:
-        """One line of figures."""
+        """Describe the model in one line."""
         m = self.model
         return (
             f"{len(m.names)} of {len(self.photos)} photos have a pose; {len(m.points):,} points, each seen in "
@@ -59,13 +122,13 @@ class Preview:
         )
 
     def warnings(self) -> list[str]:
-        """What is wrong with photos or poses, and what to do; empty where nothing is."""
+        """List problems of photos and poses, each with a remedy; empty if there are none."""
         m, found = self.model, []
         missing = [name for name in self.photos if name not in set(m.names)]
         if missing:
             found.append(
                 f"no pose was found for {self._share(missing)}; they are not trained on. They overlap too little "
-                "with the others, are blurred, or show what has no texture; take photos in between"
+                "with the others, are blurred, or lack texture; take photos in between"
             )
         blurred = [
             name
@@ -73,14 +136,14 @@ class Preview:
             if value < BLUR_MAX * np.median(self.sharpness)
         ]
         if blurred:
-            found.append(f"blurred beside the others are {self._share(blurred)}; leave them out")
+            found.append(f"blurred compared with the others: {self._share(blurred)}; leave them out")
         weak = [name for name, count in zip(m.names, m.points_seen, strict=True) if count < POINTS_MIN]
         if weak:
-            found.append(f"poses are doubtful, by fewer than {POINTS_MIN} points, of {self._share(weak)}")
+            found.append(f"poses are doubtful, from fewer than {POINTS_MIN} points: {self._share(weak)}")
         if m.track_length < TRACK_MIN:
             found.append(
-                f"points are seen in {m.track_length:.1f} photos on average: photos overlap too little; neighbours "
-                "should share two thirds of what they show"
+                f"points are seen in {m.track_length:.1f} photos on average: photos overlap too little; neighbouring "
+                "photos should overlap by two thirds"
             )
         if m.error > ERROR_MAX:
             found.append(
@@ -96,36 +159,37 @@ class Preview:
 
 
 def preview(dataset: Path) -> Preview | None:
-    """Read the model that `reconstruct` made for `dataset`, and look at its photos.
+    """Read the model that `reconstruct` made for `dataset`, and measure the sharpness of the photos.
 
     Returns
     -------
     Preview or None
-        None where the dataset's cameras come from elsewhere.
+        None if the cameras of the dataset were not recovered by `reconstruct`.
 
     Raises
     ------
     InputError
         If the record, the model or a photo is damaged.
     """
-    record = sfm.read_record(dataset)
+    record = read_record(dataset)
     if record is None:
         return None
     photos = dataset / record["photos"]
     names = list_photos(photos)
     with ThreadPoolExecutor() as pool:
         values = list(pool.map(lambda name: photo_sharpness(photo_folder(photos) / name), names))
-    return Preview(names, sfm.read_sparse(dataset / "sparse" / "0"), np.array(values))
+    return Preview(names, read_sparse(dataset / "sparse" / "0"), np.array(values))
 
 
-def draw_cameras(path: Path, model: sfm.SparseModel) -> None:
-    """Write a picture of cameras and points, from above and from the side, as a PNG.
+def draw_cameras(path: Path, model: SparseModel) -> None:
+    """Write a PNG with the cameras and points of a model, from above and from the side.
 
     Parameters
     ----------
     path : Path
+        The file to write.
     model : SparseModel
-        Its y axis points down.
+        Model whose y axis points down.
 
     Raises
     ------
@@ -146,9 +210,9 @@ def draw_cameras(path: Path, model: sfm.SparseModel) -> None:
     ):
         points = model.points[chosen][:, [across, up]] * signs
         axes.scatter(*points.T, c=model.colors[chosen] / 255, s=1.5, linewidths=0)
-        eyes, looks = (x[:, [across, up]] * signs for x in (model.positions, model.directions))
+        eyes, gazes = (x[:, [across, up]] * signs for x in (model.positions, model.directions))
         style = {"color": "#d55e00", "angles": "xy", "scale_units": "xy", "width": 0.004, "zorder": 3}
-        axes.quiver(*eyes.T, *looks.T, scale=1 / (0.12 * reach), **style)
+        axes.quiver(*eyes.T, *gazes.T, scale=1 / (0.12 * reach), **style)
         axes.plot(*eyes.T, "o", color="#d55e00", markersize=4, zorder=4)
         centre = middle[[across, up]] * signs
         axes.set_xlim(centre[0] - reach, centre[0] + reach)
@@ -157,6 +221,6 @@ def draw_cameras(path: Path, model: sfm.SparseModel) -> None:
         axes.set_title(title, fontsize="medium")
         axes.tick_params(labelsize="small")
         axes.spines[["top", "right"]].set_visible(False)
-    figure.suptitle(f"{len(model.names)} cameras (orange, with the way they look), {len(model.points):,} points")
+    figure.suptitle(f"{len(model.names)} cameras (orange, arrow: viewing direction), {len(model.points):,} points")
     with replacing(path) as file:
         figure.savefig(file, format="png", metadata={"Software": None})

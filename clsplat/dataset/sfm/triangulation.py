@@ -1,7 +1,7 @@
-"""Points for datasets that bring poses alone, triangulated from their photos by COLMAP through pycolmap.
+"""Triangulate points for datasets that have poses but no points, by COLMAP through pycolmap.
 
-Features and matches are those of `clsplat.dataset.sfm.matching`; the poses are taken as they are (Schoenberger and
-Frahm 2016, section 4.2, doi:10.1109/CVPR.2016.445).
+Features and matches are those of `clsplat.dataset.sfm.matching`; the poses are not changed (Schoenberger and Frahm
+2016, section 4.2, doi:10.1109/CVPR.2016.445).
 """
 
 from collections.abc import Iterable
@@ -19,30 +19,31 @@ from clsplat.randomness import stream
 from clsplat.scene import View
 
 NEIGHBOURS = 10
-"""Photos that each is matched with: as many as COLMAP's sequential matching takes before each frame of a video."""
+"""Number of photos with which each photo is matched. COLMAP's sequential matching has the same default for the frames
+of a video."""
 
 ANGLE_MAX = np.pi / 3
-"""Between the axes of two photos that are matched. SIFT finds points again up to about half of that, and what two
-photos see beside their axes differs less than these."""
+"""Largest angle between the optical axes of two photos that are matched, rad. SIFT recognises points up to about half
+this change of viewing direction. Off the axes, the viewing directions of the two photos can differ less than the axes
+do."""
 
 EDGE_MAX = 1000
-"""Longer edge, in pixels, at which features are sought. With fox_pinhole's photos of 960 pixels training reaches what
-COLMAP's own points give (32.1 dB at 134x240 after 2000 iterations), with 480 pixels 0.7 dB less; the time for matches
-grows with the fourth power."""
+"""Longer edge, in pixels, to which photos are reduced before features are detected. The time for matching grows with
+the fourth power of it. Measurements: docs/howto/datasets.md."""
 
-FEWEST = 100
-"""Points that are taken for a scene; fewer say next to nothing of where it is."""
+TRIANGULATED_MIN = 100
+"""Smallest number of triangulated points that is used; fewer do not show where the scene is."""
 
-START = 20_000
-"""Points that fewer are filled up to. fern's 4564 give 28.9 dB (240x180, 2000 iterations), filled up to 10 000 they
-give 29.2, up to 20 000 29.3; lego's 5579 give 32.0 and filled up 32.7 dB, where a random start gives 30.3."""
+POINTS_TARGET = 20_000
+"""Number of points up to which `filled` adds points. Measurements: docs/howto/datasets.md."""
 
-FILLING = 8
-"""Nearest points of each, towards which others are put."""
+FILL_NEIGHBOURS = 8
+"""Number of nearest points of a point, towards which points are added."""
 
 
 def pairs(cameras: list[Camera]) -> list[tuple[int, int]]:
-    """Photos worth matching: each with the nearest that look the same way from another place.
+    """Choose the pairs of photos to match: each with the nearest ones of similar viewing direction and other
+    position.
 
     Parameters
     ----------
@@ -51,14 +52,14 @@ def pairs(cameras: list[Camera]) -> list[tuple[int, int]]:
     Returns
     -------
     list of (int, int)
-        Indices, the smaller one first, sorted.
+        Indices of the cameras, the smaller one first, sorted.
     """
     positions = np.array([camera.position for camera in cameras]).reshape(-1, 3)
     axes = np.array([camera.viewmat[2, :3] for camera in cameras]).reshape(-1, 3)
     found = set()
     for i, (position, axis) in enumerate(zip(positions, axes, strict=True)):
         distances = np.linalg.norm(positions - position, axis=1)
-        # Faces of a panorama stand at one place but for rounding: nothing can be triangulated from them.
+        # The faces of a panorama have one position, apart from rounding: they cannot triangulate anything.
         apart = distances > 1e-9 * np.abs(positions).max()
         distances = np.where(apart & (axes @ axis > np.cos(ANGLE_MAX)), distances, np.inf)
         nearest = np.argsort(distances, kind="stable")[:NEIGHBOURS]
@@ -67,26 +68,27 @@ def pairs(cameras: list[Camera]) -> list[tuple[int, int]]:
 
 
 def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Points that several photos with known poses see.
+    """Triangulate points from photos with known poses.
 
     Parameters
     ----------
     views : iterable of View
-        With pinhole or fisheye cameras. They are drawn one after another and not kept: photos may be large.
+        Photos with pinhole or fisheye cameras. They are read one after another and not kept, since photos may be
+        large.
     verbose : bool
-        Show COLMAP's own messages.
+        Whether to show COLMAP's own messages.
 
     Returns
     -------
     points : (P, 3) float64
-        In world units; P is 0 where fewer than `FEWEST` were found.
+        Positions in world units; P is 0 if fewer than `TRIANGULATED_MIN` were found.
     colors : (P, 3) uint8
-        Means of the photos'.
+        Mean RGB of the points in the photos.
 
     Raises
     ------
     InputError
-        If a camera is neither.
+        If a camera is neither a pinhole nor a fisheye.
     """
     import pycolmap
 
@@ -113,7 +115,7 @@ def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[n
         (work / "model").mkdir()
         model = pycolmap.triangulate_points(model, database, work, work / "model", options=options)
     points = [point for _, point in sorted(model.points3D.items())]
-    kept = points if len(points) >= FEWEST else []
+    kept = points if len(points) >= TRIANGULATED_MIN else []
     return (
         np.array([point.xyz for point in kept]).reshape(-1, 3),
         np.array([point.color for point in kept], np.uint8).reshape(-1, 3),
@@ -121,28 +123,29 @@ def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[n
 
 
 def filled(points: NDArray[np.float64], colors: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """More points, on the lines between neighbours: features leave gaps where the photos show little texture.
+    """Add points on the lines between neighbouring points, since features leave gaps where photos have little
+    texture.
 
     Parameters
     ----------
     points : (P, 3) float64
-        More than `FILLING`.
+        More than `FILL_NEIGHBOURS` points.
     colors : (P, 3) uint8
 
     Returns
     -------
     points, colors
-        `START` of them, the given ones first; these alone where they are not fewer.
+        `POINTS_TARGET` points and their colours, the given ones first; unchanged if there are already as many.
     """
     from scipy.spatial import cKDTree
 
-    missing = START - len(points)
+    missing = POINTS_TARGET - len(points)
     if missing <= 0:
         return points, colors
     rng = stream(SEED, "points between points")
-    _, neighbours = cKDTree(points).query(points, k=FILLING + 1)
+    _, neighbours = cKDTree(points).query(points, k=FILL_NEIGHBOURS + 1)
     rows = rng.integers(0, len(points), missing)
-    others = neighbours[rows, rng.integers(1, FILLING + 1, missing)]  # the first is the point itself
+    others = neighbours[rows, rng.integers(1, FILL_NEIGHBOURS + 1, missing)]  # the first is the point itself
     share = rng.uniform(size=(missing, 1))
     between = points[rows] + share * (points[others] - points[rows])
     blended = np.rint(colors[rows] + share * (colors[others].astype(float) - colors[rows])).astype(np.uint8)
@@ -150,7 +153,13 @@ def filled(points: NDArray[np.float64], colors: NDArray[np.uint8]) -> tuple[NDAr
 
 
 def _database(views: Iterable[View], database: Path, work: Path) -> dict[str, Camera]:
-    """Photos and masks as files that COLMAP reads, their cameras in its database; cameras by the files' names."""
+    """Write photos and masks as files for COLMAP and add their cameras to its database.
+
+    Returns
+    -------
+    dict of Camera
+        Cameras by the name of the file.
+    """
     import pycolmap
 
     pycolmap.Database.open(database).close()
@@ -162,10 +171,9 @@ def _database(views: Iterable[View], database: Path, work: Path) -> dict[str, Ca
             raise InputError(f"{view.name}: expected a pinhole or fisheye camera, found {camera.model}")
         if is_sliver(camera.width, camera.height, EDGE_MAX):
             continue
-        # Read once, then deleted: speed before size.
-        Image.fromarray(view.image).save(work / name, compress_level=1)
+        Image.fromarray(view.image).save(work / name, compress_level=1)  # a temporary file: fast rather than small
         counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
-        Image.fromarray(counts).save(work / "masks" / f"{name}.png")  # COLMAP skips photos without one
+        Image.fromarray(counts).save(work / "masks" / f"{name}.png")  # COLMAP skips photos without a mask
         lens = ("OPENCV_FISHEYE", camera.distortion) if camera.model == "fisheye" else ("PINHOLE", ())
         params = (camera.fx, camera.fy, camera.cx, camera.cy, *lens[1])
         reader = pycolmap.ImageReaderOptions(camera_model=lens[0], camera_params=",".join(map(repr, params)))
