@@ -21,7 +21,7 @@ def leaves(settings, within=()):
 
 
 def test_the_presets_are_those_that_are_promised():
-    assert set(PRESETS) == {"paper-7k", "paper-30k", "mcmc", "auto", "fast"}
+    assert set(PRESETS) == {"paper-7k", "paper-30k", "mcmc", "fast"}
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -44,8 +44,8 @@ def test_the_papers_presets_are_its_strategy_and_iterations():
     assert load_preset("paper-30k") == replace(paper, iterations=30_000)
 
 
-def test_the_size_is_sought_by_default():
-    assert load_preset("auto") == TrainConfig()
+def test_the_size_is_searched_by_default():
+    assert TrainConfig().size == "auto" and TrainConfig().strategy == "error"
 
 
 def test_what_was_saved_is_read_back(tmp_path):
@@ -122,7 +122,7 @@ def test_files_that_are_no_settings(tmp_path, content, expected):
 def test_missing_files_and_presets(tmp_path: Path):
     with pytest.raises(InputError, match=r"nothing\.json: expected a configuration that can be read"):
         load_config(tmp_path / "nothing.json")
-    with pytest.raises(InputError, match=r"--preset: expected one of auto, .*found 'slow'"):
+    with pytest.raises(InputError, match=r"--preset: expected one of fast, .*found 'slow'"):
         load_preset("slow")
 
 

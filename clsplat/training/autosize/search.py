@@ -55,7 +55,7 @@ def search_size(training: "Training", after: After, after_fork: After) -> None:
             continue
         training.run_until(iteration - 1, after)
         if search.small_side:
-            search = replace(search, validated=[*search.validated, _validate(training, _validation_views(training))])
+            search = replace(search, validated=[*search.validated, _validate(training)])
         if iteration in bounds:
             training.state = _decide(training, search, iteration, after_fork)
         else:
@@ -63,8 +63,7 @@ def search_size(training: "Training", after: After, after_fork: After) -> None:
 
 
 def _decide(training: "Training", search: Search, iteration: int, after_fork: After) -> State:
-    """End the current trial, decide the next phase, and train the smaller side of its trial; the state to go on
-    with."""
+    """End the current trial, decide the next phase, and train the smaller side of its trial. Returns the new state."""
     training.state.move(None)  # one side of a trial at a time is on the device
     state, trials = replace(training.state), search.trials
     if search.small_side:
@@ -99,11 +98,11 @@ def _train_small_side(training: "Training", phase: Decision, iteration: int, aft
         gaussians, views = fetch(state.shown(training.renderer)), state.corrected(training.scene.train)
         rows = costliest_rows(gaussians, left, views, training.renderer)
     side = training.fork(state.fork(state.rows.take(rows)))
-    validation, validated = _validation_views(training), []
+    validated = []
     end = next(bound for bound in trial_bounds(config) if bound > iteration)
     for time in sorted(time for time in validation_times(config) if iteration < time <= end):
         side.run_until(time - 1, after)
-        validated.append(_validate(side, validation))
+        validated.append(_validate(side))
     return SmallSide(side.state.rows.on(None), _candidate(side, end, validated))
 
 
@@ -118,14 +117,15 @@ def _degrees(training: "Training", iteration: int) -> list[Candidate]:
 
 
 def _validation_views(training: "Training") -> list[View]:
+    """Views with their validation blocks alone, corrected by what this training has learned about each photo."""
     return training.state.corrected(split(training.scene.train)[1])
 
 
-def _validate(training: "Training", views: list[View]) -> list[float]:
+def _validate(training: "Training") -> list[float]:
     """PSNR of each validation view, dB."""
-    state = training.state
+    state, renderer = training.state, training.renderer
     degree = state.sh_degree(state.iteration, training.config)
-    return validate(state.shown(training.renderer), views, training.renderer, degree)
+    return validate(state.shown(renderer), _validation_views(training), renderer, degree)
 
 
 def _candidate(training: "Training", iteration: int, validated: list[list[float]]) -> Candidate:
