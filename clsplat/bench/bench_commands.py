@@ -117,41 +117,24 @@ class Knobs:
 
 @dataclass(frozen=True)
 class Stability:
-    """Measure how the method's known failures show without their remedies and with them."""
+    """Measure the known failures of the method without their remedies and with them."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Experiments; default: all."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder for stability.json, in which rows that are not measured now stay as they are, and charts."""
-    data: Path | None = None
-    """Folder with the real scenes that some experiments train on; they do not run without it."""
+    """Folder for stability.json and for charts. Rows of the file that are not measured now stay as they are."""
     device: str | None = None
     """Part of the platform's or device's name."""
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.atomic import replacing
-        from clsplat.bench.stability.run import run_experiments
-        from clsplat.bench.stability.stability_report import chart_file, charts, save_chart, table
+        from clsplat.bench.stability.run import measure_rows
+        from clsplat.bench.stability.stability_report import table
         from clsplat.device import Device, select_device
 
-        for folder in filter(None, (self.out, self.data)):
-            if not folder.is_dir():
-                raise InputError(f"{folder}: expected a folder that exists, found none")
-        results = _read_results(self.out / "stability.json") if self.out is not None else {}
-        device = Device(select_device(self.device))
-        _say(f"device: {device.label}")
-        rows = run_experiments(self.names, device, self.data, lambda name: _say(f"measuring: {name}"))
-        # A row that could not run says less than the same row measured earlier.
-        results |= {name: row for name, row in rows.items() if "not_run" not in row or name not in results}
-        if self.out is not None:
-            with replacing(self.out / "stability.json") as file:
-                file.write((json.dumps(results, indent=1, allow_nan=False) + "\n").encode())
-            for name in charts(rows):
-                save_chart(name, rows[name], self.out / chart_file(name))
-            _say(f"results: {self.out / 'stability.json'}")
+        results, failed = measure_rows(self.names, Device(select_device(self.device)), self.out, _say)
         print(table(results))
-        if failed := [name for name, row in rows.items() if "error" in row]:
+        if failed:
             raise ClsplatError(f"experiments failed, see above: {', '.join(failed)}")
 
 
@@ -243,15 +226,3 @@ def _of_files(
     if scene is None or cameras is None:
         return None
     return from_files(scene, cameras, views, DataConfig(downscale=downscale))
-
-
-def _read_results(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        return {}
-    try:
-        results = json.loads(path.read_bytes())
-        if not isinstance(results, dict):
-            raise ValueError(f"a {type(results).__name__}")
-        return results
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected results of an earlier run, found: {error}") from error

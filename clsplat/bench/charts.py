@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.bench.kernel_report import COLORS
-from clsplat.bench.summary import (
+from clsplat.bench.quality_summary import (
     COSTS,
     MEAN,
     METRICS,

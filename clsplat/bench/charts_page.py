@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from clsplat.atomic import replacing
 from clsplat.bench.charts import published_chart, published_table, quality_chart
+from clsplat.bench.quality_summary import COSTS, METRICS, failures, measured_metrics, origins, runs, table, verdict
 from clsplat.bench.results import Record
-from clsplat.bench.summary import COSTS, METRICS, failures, measured_metrics, origins, runs, table, verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

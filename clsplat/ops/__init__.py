@@ -1,4 +1,8 @@
-"""Launches of the stages: `clsplat.reference`'s functions with a `clsplat.device.Device` as first argument."""
+"""Launches of the kernels: the functions of `clsplat.reference` with a `clsplat.device.Device` as first argument.
+
+Belongs here: one module per stage, which checks shapes, allocates buffers and launches kernels of ``cl/``. Does not
+belong here: the mathematics (``cl/``, `clsplat.reference`), and the order of the stages (`clsplat.render`).
+"""
 
 from clsplat.ops.adam import adam_step
 from clsplat.ops.bin import bin_splats

@@ -1,4 +1,8 @@
-"""The stages in float64 NumPy: readable mathematics, the oracle of the tests, and a renderer without OpenCL."""
+"""The stages in float64 NumPy: readable mathematics, the reference of the tests, and a renderer without OpenCL.
+
+Belongs here: one module per stage that states its equations, and equations that several stages share. Does not belong
+here: anything faster but harder to read than the equation, and imports other than NumPy.
+"""
 
 from clsplat.reference.adam import adam_step
 from clsplat.reference.bin import bin_splats

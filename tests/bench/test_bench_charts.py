@@ -11,7 +11,7 @@ from matplotlib.text import Text
 from clsplat.bench import charts
 from clsplat.bench import charts_page as page
 from clsplat.bench.charts import published_chart, published_table, quality_chart, read_published
-from clsplat.bench.summary import (
+from clsplat.bench.quality_summary import (
     COSTS,
     MEAN,
     METRICS,

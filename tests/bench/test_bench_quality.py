@@ -20,8 +20,8 @@ from clsplat.bench.quality import (
     run_cells,
     sample_iterations,
 )
+from clsplat.bench.quality_summary import COSTS
 from clsplat.bench.results import append_record, read_records, write_records
-from clsplat.bench.summary import COSTS
 from clsplat.config import AdcConfig, DataConfig, InitConfig, TrainConfig
 from clsplat.dataset import load_scene
 from clsplat.errors import InputError

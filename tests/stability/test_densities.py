@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from clsplat.bench.stability.densities import left_by_pruning
+from clsplat.bench.stability.everything_pruned import left_by_pruning
 from clsplat.bench.stability.small import CONFIG, small_scene
 from clsplat.constants import ALPHA_MIN
 from clsplat.gaussians import logit

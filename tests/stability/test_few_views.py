@@ -52,7 +52,7 @@ def test_what_changes_where_photos_are_few(scene):
 
 
 def test_dropout_is_part_of_the_training_and_rises(scene, device, tmp_path, monkeypatch):
-    module = importlib.import_module("clsplat.train")  # the package has a function of this name
+    module = importlib.import_module("clsplat.training.loop")
     rates, forward = [], module.forward
 
     def watched(*args, **options):

@@ -22,10 +22,10 @@ from test_colmap import write_bin, write_photos, write_txt
 from test_loading import write_transforms
 
 from clsplat.config import DataConfig, TrainConfig
-from clsplat.dataset import load_scene
+from clsplat.dataset import colmap, load_scene, transforms
 from clsplat.dataset.photos import orientation, photo_size, read_photo
 from clsplat.errors import InputError
-from clsplat.formats import FORMATS, colmap, load_gaussians, save_gaussians, transforms
+from clsplat.formats import FORMATS, load_gaussians, save_gaussians
 from clsplat.formats.quantisation import EXPANSION_FREE
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene

@@ -3,16 +3,9 @@
 from dataclasses import replace
 
 import pytest
+from random_start import LONGER, points_lost
 
-from clsplat.bench.stability.growth import (
-    LONGER,
-    RESET_CONFIG,
-    around_reset,
-    checkerboard,
-    largest_number,
-    noise,
-    points_lost,
-)
+from clsplat.bench.stability.growth import RESET_CONFIG, around_reset, checkerboard, largest_number, noise
 from clsplat.bench.stability.small import CONFIG, small_scene, with_train
 
 

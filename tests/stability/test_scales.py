@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from other_scales import SCALES, scales
 
-from clsplat.bench.stability.scales import SCALES, _scales
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.render import render
@@ -37,7 +37,7 @@ def test_photos_of_one_scale_make_a_scene_for_others(device, shared):
 
     At the photos' own scale the 3D filter costs 1.0 dB of short trainings, the 2D one 0.3.
     """
-    series = {label: dict(points) for label, points in _scales(device, shared / "data").plot.series.items()}
+    series = {label: dict(points) for label, points in scales(device, shared / "data").plot.series.items()}
     for label, cost in (("2D filter", 0.5), ("2D and 3D filter", 1.2)):
         assert series[label][0.25] > series["classic"][0.25] + 3
         for scale in SCALES:

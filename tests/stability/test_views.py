@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from needles_and_floaters import effective_rank
 
-from clsplat.bench.stability.views import _effective_rank, unseen_side
+from clsplat.bench.stability.sh_extrapolation import unseen_side
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.render import render
@@ -19,7 +20,7 @@ def test_unseen_sides_keep_their_colour(device):
 @pytest.mark.shared
 def test_the_regulariser_leaves_fewer_needles(device, shared):
     """Effective rank, Hyung et al. 2024."""
-    plain, regular, *_ = (figure.value for figure in _effective_rank(device, shared / "data").figures)
+    plain, regular, *_ = (figure.value for figure in effective_rank(device, shared / "data").figures)
     assert plain > 2 * regular
 
 

@@ -1,7 +1,6 @@
 """Experiments on where the world's origin lies."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +16,7 @@ FLOOR = 2.0**-24
 """Shown for images that are the same: half a step of float32 below 1."""
 
 
-def _world_offset(device: Device, data: Path | None) -> Found:
+def _world_offset(device: Device) -> Found:
     gaussians, camera = synthetic_scene(2000, width=160, height=120)
     here = render(gaussians.astype(np.float32), camera, device=device, gradients=False).rgb
     series: dict[str, list[tuple[float, float | None]]] = {"float32 in the world": [], "origin moved in float64": []}

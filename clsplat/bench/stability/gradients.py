@@ -1,7 +1,5 @@
 """Experiments on gradients that do not belong to the image."""
 
-from pathlib import Path
-
 import numpy as np
 
 from clsplat.bench.stability.experiment import Experiment, Figure, Found
@@ -43,7 +41,7 @@ def mismatch(forward: Device, backward: Device) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
-def _constants(device: Device, data: Path | None) -> Found:
+def _constants(device: Device) -> Found:
     ours = Device(device.cl_device, real=np.float64)
     other = Device(device.cl_device, real=np.float64, model={"ALPHA_MAX": OTHER_ALPHA_MAX})
     return Found(

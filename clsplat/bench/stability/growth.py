@@ -8,9 +8,7 @@ import numpy as np
 
 from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
 from clsplat.bench.stability.small import CONFIG, small_scene, with_train
-from clsplat.bench.stability.trained import SHORT, held_out, load, trained
-from clsplat.config import AdcConfig, DataConfig, TrainConfig
-from clsplat.dataset import with_points
+from clsplat.config import AdcConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.evaluate import mean_metrics
 from clsplat.scene import Scene, View
@@ -24,12 +22,6 @@ AFTER = (-1, 0, 5, 10, 20, 40)
 
 CAP = 300
 """Of Gaussians, for photos that nothing explains."""
-
-START_CAP = 6000
-"""Of Gaussians, for starts without points."""
-
-LONGER = replace(SHORT, strategy="error", size="auto", iterations=2000, data=DataConfig(downscale=4))
-"""What users get by default, in a fifteenth of the paper's iterations."""
 
 
 def around_reset(adc: AdcConfig, scene: Scene, device: Device) -> tuple[list[float], float]:
@@ -46,7 +38,7 @@ def around_reset(adc: AdcConfig, scene: Scene, device: Device) -> tuple[list[flo
     return found[:-1], found[-1]
 
 
-def _reset(device: Device, data: Path | None) -> Found:
+def _reset(device: Device) -> Found:
     scene, adc = small_scene(device), RESET_CONFIG.adc
     variants = {
         "reset": adc,
@@ -88,7 +80,7 @@ def largest_number(scene: Scene, config: TrainConfig, device: Device) -> int:
     return most
 
 
-def _blow_up(device: Device, data: Path | None) -> Found:
+def _blow_up(device: Device) -> Found:
     scene, figures = small_scene(device), []
     config = replace(CONFIG, iterations=400, adc=replace(CONFIG.adc, every=25))
     for label, photos in {
@@ -103,54 +95,6 @@ def _blow_up(device: Device, data: Path | None) -> Found:
             )
     # Without the remedy first: what noise makes of no cap.
     return Found([figures[2], *figures[:2], *figures[3:]])
-
-
-def points_lost(
-    data: Path | None, name: str, config: TrainConfig, device: Device, boxes: tuple[int, ...] = (1,)
-) -> dict[str, float]:
-    """What it costs held-out photos, in dB, to start without the points of structure from motion.
-
-    Parameters
-    ----------
-    data : Path
-        Folder of the scene `name`.
-    config : TrainConfig
-    device : Device
-    boxes : tuple of int
-        Of the random points: their edges, in edges of that which `config` asks for.
-
-    Returns
-    -------
-    dict
-        ``triangulated``: from points found by the photos and their poses; ``random``, ``random, box 3x`` and so on:
-        from random points.
-    """
-    scene, _ = load(data, name, config)
-    none = replace(scene, points=scene.points[:0], colors=scene.colors[:0])
-    assert data is not None  # or `load` would have refused
-
-    def reached(start: Scene, config: TrainConfig) -> float:
-        return held_out(trained(start, config, device), scene, config, device)
-
-    best = reached(scene, config)
-    lost = {}
-    for box in boxes:
-        wide = replace(config, init=replace(config.init, random_extent=box * config.init.random_extent))
-        lost["random" if box == 1 else f"random, box {box}x"] = best - reached(none, wide)
-    return lost | {"triangulated": best - reached(with_points(none, data / name, config.data), config)}
-
-
-def _random_start(device: Device, data: Path | None) -> Found:
-    figures = []
-    for name in ("fox_pinhole", "fern"):
-        for start, lost in points_lost(data, name, LONGER, device).items():
-            figures.append(Figure(f"{name}, {start}", lost, "dB"))
-    for strategy in ("adc", "mcmc", "error"):
-        config = replace(SHORT, strategy=strategy, max_gaussians=START_CAP)
-        config = replace(config, init=replace(config.init, random_points=START_CAP // 2))
-        for start, lost in points_lost(data, "fox_pinhole", config, device, boxes=(1, 3)).items():
-            figures.append(Figure(f"{strategy}, {start}", lost, "dB"))
-    return Found(figures)
 
 
 OPACITY_RESET = Experiment(
@@ -169,16 +113,4 @@ BLOW_UP = Experiment(
     test="tests/stability/test_growth.py::test_photos_that_nothing_explains_stay_under_the_cap",
     measure=_blow_up,
     figure="the most Gaussians in any of 400 iterations, from 40 points",
-)
-
-RANDOM_START = Experiment(
-    failure="no points (random start)",
-    source="Kheradmand et al. 2024: 3DGS loses 5 dB, MCMC 0.1 dB",
-    remedy="points triangulated from the photos by their poses (`--init.triangulate`)",
-    test="tests/stability/test_growth.py::test_points_found_by_the_poses_are_as_good_as_given_ones",
-    measure=_random_start,
-    figure=f"what held-out photos lose without the scene's own points; {LONGER.iterations} iterations, size chosen, "
-    f"134x240 and 240x180; by strategy: fox_pinhole at 67x120, {SHORT.iterations} iterations, at most {START_CAP} "
-    "Gaussians",
-    needs_data=True,
 )

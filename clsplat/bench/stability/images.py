@@ -74,7 +74,7 @@ def ours(path: Path) -> Any:
     return read_photo(path, (0.0, 0.0, 0.0), upright=True)
 
 
-def _kinds(device: Device, data: Path | None) -> Found:
+def _kinds(device: Device) -> Found:
     (without, total), (remedied, _) = right_kinds(plain), right_kinds(ours)
     return Found([Figure("Pillow's convert", without, f"of {total}"), Figure("clsplat", remedied, f"of {total}")])
 

@@ -1,7 +1,6 @@
 """Experiments on order: of depths that are equal, and of sums that are rounded."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -26,7 +25,7 @@ def _wall(n: int) -> tuple[Gaussians, Camera]:
     return replace(gaussians, means=flat), replace(camera, viewmat=viewmat)
 
 
-def _equal_depths(device: Device, data: Path | None) -> Found:
+def _equal_depths(device: Device) -> Found:
     gaussians, camera = _wall(2000)
     wall = gaussians.astype(np.float32)
     first = render(wall, camera, device=device, gradients=False).rgb
@@ -44,7 +43,7 @@ def _equal_depths(device: Device, data: Path | None) -> Found:
     )
 
 
-def _repeated_runs(device: Device, data: Path | None) -> Found:
+def _repeated_runs(device: Device) -> Found:
     gaussians, camera = synthetic_scene(2000, width=160, height=120)
     scene = gaussians.astype(np.float32)
 

@@ -1,7 +1,6 @@
 """Experiment on order again: of Gaussians that cross, while the camera moves."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -57,7 +56,7 @@ def frame_differences(
     return np.array(differences)
 
 
-def _popping(device: Device, data: Path | None) -> Found:
+def _popping(device: Device) -> Found:
     gaussians = crossing_discs(60)
     figures: list[Figure] = []
     series: dict[str, list[tuple[float, float | None]]] = {}

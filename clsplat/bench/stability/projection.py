@@ -1,6 +1,5 @@
 """Experiments on projection: parameters that are no numbers, needles, and wide angles."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -78,7 +77,7 @@ def _naive(field: str, value: float) -> bool:
     return not np.isfinite(outputs).all()
 
 
-def _poisoning(device: Device, data: Path | None) -> Found:
+def _poisoning(device: Device) -> Found:
     configs = RenderConfig(), RenderConfig(mode="antialiased"), RenderConfig(sort="pixel")
     harmed = {(f, v) for f, v in poisons() for c in configs if harm(device, f, v, c)}
     return Found(
@@ -89,7 +88,7 @@ def _poisoning(device: Device, data: Path | None) -> Found:
     )
 
 
-def _determinants(device: Device, data: Path | None) -> Found:
+def _determinants(device: Device) -> Found:
     """Covariances of needles from the two vectors that make them, in float32."""
     rng = np.random.default_rng(0)
     lengths = 10.0 ** np.arange(0, 6)
@@ -114,7 +113,7 @@ def _determinants(device: Device, data: Path | None) -> Found:
     return Found(figures, Plot("length of the needle, px", "determinants off by more than 1 %, %", series, "x"))
 
 
-def _jacobian(device: Device, data: Path | None) -> Found:
+def _jacobian(device: Device) -> Found:
     """Extents of a ball of 0.5 just above the near plane, 40 half fields of view beside the image, against those of
     the same ball on the axis."""
     camera = Camera(np.eye(4), 50, 50, 50, 50, 100, 100)
@@ -205,7 +204,7 @@ def _psnr(image: Array, truth: Array) -> float:
     return float(-10 * np.log10(((np.clip(image, 0, 1) - np.clip(truth, 0, 1)) ** 2).mean()))
 
 
-def _wide_angle(device: Device, data: Path | None) -> Found:
+def _wide_angle(device: Device) -> Found:
     scene = shell(600)
     series: dict[str, list[tuple[float, float | None]]] = {"affine": [], "unscented": []}
     for degrees in FIELDS_OF_VIEW:
