@@ -149,7 +149,7 @@ def train_and_report(
     from clsplat.evaluate import evaluate, mean_metrics
     from clsplat.formats import save_gaussians
     from clsplat.pruning.prices import without_invisible
-    from clsplat.show.evaluation_page import training_curve
+    from clsplat.show.training_curve import training_curve
     from clsplat.training.autosize.explanation import size_chart
     from clsplat.training.autosize.rule import can_search, split
     from clsplat.training.loop import train
@@ -228,7 +228,7 @@ class Demo:
         from clsplat.dataset import load_scene
         from clsplat.demo import make_photos
         from clsplat.render import render_views
-        from clsplat.show.evaluation_page import side_by_side
+        from clsplat.show.pictures import side_by_side
 
         if self.out.exists() and any(self.out.iterdir()):
             raise InputError(f"{self.out}: expected an empty or new folder for the demo; choose another with -o")
