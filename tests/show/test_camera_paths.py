@@ -47,7 +47,8 @@ def test_focus_minimises_the_distances_from_the_axes():
 def test_focus_without_an_intersection_in_front():
     parallel = [Camera.look_at([x, 0, 0], [x, 0, 9], UP, 500.0, 640, 480) for x in (-3, 0, 3)]
     np.testing.assert_allclose(focus_point(parallel), [0, 0, 3], atol=1e-12)
-    # Half a degree between the axes does not count as an intersection: at 300 units, with 3 units between the cameras.
+    # Half a degree between the axes does not count as an intersection: at 300 units, with 3 units between the
+    # cameras.
     nearly = [Camera.look_at([x, 0, 0], [0, 0, 300], UP, 500.0, 640, 480) for x in (-3, 0, 3)]
     np.testing.assert_allclose(focus_point(nearly), [0, 0, 3], atol=1e-3)
     outwards = [
