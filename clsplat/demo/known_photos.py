@@ -165,8 +165,7 @@ def known_scene(count: int = 24, width: int = 160, height: int = 120, points: in
 
 
 def _points(view: View, count: int, seed: list[int], solids: list[Solid]) -> tuple[Array, Array]:
-    """Points where random rays of a photo hit a surface, at most `count`, and their colours: (P, 3) and (P, 3)
-    uint8."""
+    """Points (P, 3) where `count` random rays of a photo hit a surface, and their colours (P, 3), uint8."""
     camera, rng = view.camera, np.random.default_rng(seed)
     x, y = rng.uniform(0, [[camera.width], [camera.height]], (2, count))
     rays = camera_rays(camera, x, y)

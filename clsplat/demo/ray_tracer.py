@@ -106,8 +106,7 @@ class Solid:
 
 
 def within_reach(origins: Array, directions: Array, solids: list[Solid]) -> Array:
-    """Indices of the solids that a bundle of rays can hit: those whose bounding spheres meet the cone around the
-    rays."""
+    """Indices of the solids whose bounding spheres meet the cone around a bundle of rays."""
     start, axis = origins.mean(1), directions.mean(1)
     axis /= np.linalg.norm(axis)
     spread = np.arccos(np.clip(axis @ directions, -1, 1).min())

@@ -63,8 +63,7 @@ def edge(x: Array, width: float) -> Array:
 
 
 def cells(u: Array, v: Array, width: float, height: float, shift: float) -> tuple[Array, Array, Array]:
-    """Row, column and distance to the border of the cells of a bond, as of bricks, whose rows are shifted at
-    random."""
+    """Row, column and distance to the border of the cells of a brick bond with randomly shifted rows."""
     row = np.floor(v / height)
     u = u / width + shift * cell_random(row)
     column = np.floor(u)
@@ -247,8 +246,7 @@ def pumpkin(x: float, y: float) -> list[Solid]:
 
 
 def still_life() -> list[Solid]:
-    """Objects on a quilt on the floorboards of a walled courtyard. They are unlit until
-    `clsplat.demo.ray_tracer.bake`."""
+    """Objects on a quilt in a walled courtyard, unlit until `clsplat.demo.ray_tracer.bake`."""
     bowl = Lathe((0, 0), (0.16, 0), (0.17, 0.03), (0.3, 0.08), (0.4, 0.22), (0.385, 0.225), (0.28, 0.1), (0, 0.06))
     vase = Lathe(
         *((0, 0), (0.17, 0), (0.2, 0.06), (0.36, 0.4), (0.3, 0.68), (0.12, 0.8), (0.12, 0.94), (0.19, 1.0)),

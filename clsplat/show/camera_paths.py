@@ -87,8 +87,7 @@ def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[C
 
 
 class Viewpoint(NamedTuple):
-    """The first view of a scene: a camera, the focus (3,) around which the view turns, and the up direction (3,), a
-    unit vector."""
+    """The first view of a scene: camera, focus (3,) around which it turns, and up direction (3,), a unit vector."""
 
     camera: Camera
     focus: Array

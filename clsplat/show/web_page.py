@@ -121,8 +121,7 @@ POST_EFFECTS: dict[str, dict[str, Any]] = {
 
 
 def _viewer_axes(point: Array) -> list[float]:
-    """Convert a point of a scene, y down, to the viewer's world, y up: the viewer turns scenes by 180 degrees about
-    z."""
+    """Convert a point of a scene, y down, to the viewer's world, y up, which is turned by 180 degrees about z."""
     return [-float(point[0]), -float(point[1]), float(point[2])]
 
 
