@@ -1,4 +1,4 @@
-"""The sub-commands of `clsplat bench`: a dataclass each, from which tyro makes flags and help."""
+"""Sub-commands of `clsplat bench`: one dataclass each, from which tyro makes flags and help."""
 
 import json
 import sys
@@ -21,22 +21,23 @@ def _say(text: str) -> None:
 
 @dataclass(frozen=True)
 class Kernels:
-    """Time training's step, its stages and their kernels, beside what the device can do at best."""
+    """Time a training step, its stages and their kernels, and compare them with the limits of the device."""
 
     workloads: tuple[str, ...] = DEFAULT
     """Synthetic scenes: number of Gaussians and image size."""
     scene: Path | None = None
-    """File of Gaussians to time instead; needs --cameras."""
+    """File of Gaussians to time instead; requires --cameras."""
     cameras: Path | None = None
-    """Dataset whose views the scene is timed with, as given to `train`."""
+    """Dataset with the views for --scene, as for `train`."""
     views: int = 1
-    """Views of the dataset, evenly spread, each a workload of its own."""
+    """Number of views of the dataset, evenly spread. Each is a workload."""
     downscale: Literal[1, 2, 4, 8] = 1
-    """Of the dataset's photos, as given to `train`."""
+    """Factor by which the dataset's photos are reduced, as for `train`."""
     scaling: Path | None = None
-    """Also time more numbers of Gaussians and of pixels, and draw the chart in this file (.png, .svg, .pdf)."""
+    """File for a chart of time against the numbers of Gaussians and pixels (.png, .svg, .pdf); its workloads are
+    timed too."""
     repeats: int = 15
-    """Steps of each kind that count: whole, stage by stage, kernel by kernel."""
+    """Number of timed steps of each kind: whole, by stages, by kernels."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """JSON file for all results."""
     device: str | None = None
@@ -73,28 +74,28 @@ class Kernels:
 
 @dataclass(frozen=True)
 class Knobs:
-    """Turn each knob of the renderer, one at a time: what it buys in time, and its error against the float64 twin."""
+    """Change each setting of the renderer, one at a time, and measure its time and error against the float64 twin."""
 
     workload: str = KNOBS_DEFAULT
     """Synthetic scene: number of Gaussians and image size."""
     scene: Path | None = None
-    """File of Gaussians to use instead; needs --cameras."""
+    """File of Gaussians to use instead; requires --cameras."""
     cameras: Path | None = None
-    """Dataset whose views the scene is seen from, as given to `train`."""
+    """Dataset with the views for --scene, as for `train`."""
     views: int = 1
-    """Views of the dataset, evenly spread, each a workload of its own."""
+    """Number of views of the dataset, evenly spread. Each is a workload."""
     downscale: Literal[1, 2, 4, 8] = 1
-    """Of the dataset's photos, as given to `train`."""
+    """Factor by which the dataset's photos are reduced, as for `train`."""
     repeats: int = 7
-    """Runs of each setting that count, in turn with as many of the default."""
+    """Number of timed runs of each setting. They alternate with runs of the default."""
     chart: Path | None = None
-    """Error against time, for the first workload (.png, .svg, .pdf)."""
+    """File for a chart of error against time, for the first workload (.png, .svg, .pdf)."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """JSON file for all results."""
     device: str | None = None
     """Part of the platform's or device's name."""
     render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
-    """What the knobs are turned from."""
+    """The default that single settings are changed from."""
 
     def run(self) -> None:
         """Run the command."""
@@ -140,26 +141,29 @@ class Stability:
 
 @dataclass(frozen=True)
 class Quality:
-    """Train on scenes by several methods, and chart what time, Gaussians, bytes and memory buy in quality."""
+    """Train on scenes by several methods, and chart quality against time, Gaussians, bytes and memory."""
 
     data: tyro.conf.Positional[tuple[str, ...]]
-    """Datasets, as given to `train`; how photos are read follows a colon: lego:background=white, fern:downscale=2."""
+    """Datasets, as for `train`. Options for reading the photos follow a colon: lego:background=white,
+    fern:downscale=2."""
     methods: tuple[str, ...] = ("paper-7k", "fast")
-    """Presets of `train`, or files as its --config takes them."""
+    """Presets of `train`, or configuration files as for its --config."""
     budgets: tuple[str, ...] = ("own",)
-    """Caps on the number of Gaussians: a method's own, a factor of it such as x0.5, or a number such as 40000."""
+    """Caps on the number of Gaussians: "own" for the method's cap, a factor of it such as x0.5, or a number such as
+    40000."""
     iterations: tuple[int, ...] = ()
-    """Optimisation steps; default: each method's own."""
+    """Numbers of iterations; default: that of each method."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("clsplat-quality")
-    """Folder for results.jsonl and the charts. Trainings that it holds are not repeated; failed ones are."""
+    """Folder for results.jsonl and the charts. Finished trainings in it are not repeated; failed ones are."""
     device: str | None = None
     """Part of the platform's or device's name."""
     memory_limit: str | None = None
-    """Device memory that a training may use, such as 4GB."""
+    """Largest device memory of a training, such as 4GB."""
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.bench.quality import make_cells, run_cells
+        from clsplat.bench.cells import make_cells
+        from clsplat.bench.quality import run_cells
         from clsplat.bench.results import FILE
         from clsplat.device import Device, select_device
 
@@ -169,11 +173,11 @@ class Quality:
         try:
             self.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{self.out}: expected a folder that can be made, found: {error.strerror}") from error
+            raise InputError(f"cannot create {self.out}: {error.strerror}") from error
         try:
             run_cells(cells, device, self.out / FILE, _say)
         except KeyboardInterrupt:
-            _say(f"{self.out}: the same command continues after the last training that ended")
+            _say(f"{self.out}: the same command continues after the last finished training")
             raise
         Chart(self.out).run()
 
@@ -183,7 +187,7 @@ class Chart:
     """Draw the charts of `bench quality` from its results."""
 
     out: tyro.conf.Positional[Path]
-    """Folder with results.jsonl, for index.html, and for the charts as PNG and SVG."""
+    """Folder with results.jsonl. index.html and the charts, as PNG and SVG, are written to it."""
 
     def run(self) -> None:
         """Run the command."""
@@ -197,7 +201,7 @@ class Chart:
 
 
 def _check(repeats: int, out: Path | None, chart_option: str, chart: Path | None) -> None:
-    """Refuse now what would fail after minutes of measuring."""
+    """Check arguments that would otherwise fail after minutes of measuring."""
     if repeats < 1:
         raise InputError(f"--repeats: expected 1 or more, found {repeats}")
     if chart is not None and chart.suffix.lower() not in CHART_SUFFIXES:
@@ -208,7 +212,7 @@ def _check(repeats: int, out: Path | None, chart_option: str, chart: Path | None
 
 
 def _write(out: Path | None, results: dict[str, Any]) -> None:
-    """The results as JSON; before anything is printed, since a pipe may end early."""
+    """Write the results as JSON. This happens before anything is printed, because a pipe may be closed early."""
     from clsplat.atomic import replacing
 
     if out is not None:
@@ -220,7 +224,7 @@ def _write(out: Path | None, results: dict[str, Any]) -> None:
 def _of_files(
     scene: Path | None, cameras: Path | None, views: int, downscale: Literal[1, 2, 4, 8]
 ) -> list[Workload] | None:
-    """Workloads of --scene and --cameras; None where neither is given."""
+    """Workloads of --scene and --cameras; None if neither is given."""
     if (scene is None) != (cameras is None):
         raise InputError("--scene and --cameras: expected both or neither, found one of them")
     if scene is None or cameras is None:

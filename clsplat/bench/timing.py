@@ -1,4 +1,4 @@
-"""Clocks, what becomes of their readings, and the training step that is timed."""
+"""Clocks, quartiles of their readings, and the training step that is timed."""
 
 import time
 from collections.abc import Callable
@@ -16,22 +16,23 @@ from clsplat.training.memory import Photos
 from clsplat.training.optimizer import Moments
 
 ITERATION = 3001
-"""Of a default run: all bands of the spherical harmonics are trained, densification watches, and no edit is due."""
+"""Iteration of a default run that is timed: it trains all bands of the spherical harmonics and collects the
+statistics of densification, and no edit is due."""
 
 STILL = OptimConfig(1e-30, 1e-30, 1e-30, 1e-30, 1e-30, 1e-30, 1e-30)
-"""Learning rates that leave every parameter as it is, so that all steps of a measurement do the same work."""
+"""Learning rates that change no parameter, so that all steps of a measurement do the same work."""
 
-# Wall time, CPU time of the process, both in seconds.
+# Wall time and CPU time of the process, s.
 Clock = NDArray[np.float64]
 
 
 def clock() -> Clock:
-    """Now."""
+    """Current readings of both clocks."""
     return np.array([time.perf_counter(), time.process_time()])
 
 
 def quartiles(samples: list[Clock], cores: int | None) -> dict[str, float]:
-    """Median and quartiles of wall times; median CPU time per core where the device's cores are the host's."""
+    """Median and quartiles of wall times, ms. If the device is the host's CPU, also the median CPU time per core."""
     wall, cpu = 1e3 * np.array(samples).T
     q1, median, q3 = np.percentile(wall, [25, 50, 75])
     result = {"median_ms": median, "q1_ms": q1, "q3_ms": q3}
@@ -41,7 +42,7 @@ def quartiles(samples: list[Clock], cores: int | None) -> dict[str, float]:
 
 
 def training_step(workload: Workload, config: TrainConfig, device: Device) -> Callable[[], None]:
-    """A function that runs the same step of training on a workload, whole and to its end, each time it is called."""
+    """Function that runs the same training step on a workload at each call, and waits for its end."""
     photos = Photos(device)
     photos.keep_within(4 * workload.view.image.nbytes)  # the photo and its mask stay on the device
     strategy = STRATEGIES[config.strategy](config, workload.extent, len(workload.gaussians))

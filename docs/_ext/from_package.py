@@ -269,7 +269,7 @@ class BenchQuality(Charts):
         if len(self.arguments) == 1:
             parts = [self.list(quality_summary.origins(records))]
             if failed := quality_summary.failures(records):
-                parts.append(self.table([["failed", "why"], *map(list, failed)]))
+                parts.append(self.table([["failed", "reason"], *map(list, failed)]))
             return self.parse_text_to_nodes("\n\n".join(parts))
         cost, parts = self.arguments[1], []
         metrics = quality_summary.measured_metrics(finished)

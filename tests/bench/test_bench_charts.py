@@ -129,9 +129,9 @@ def test_the_front_in_words(records, cost, expected):
     assert [run.setting for run in best_settings(panels(found)[MEAN], cost, "psnr")] == expected
     sentences = verdict(found, cost, "psnr")
     assert len(sentences) == 3
-    assert sentences[0].startswith("On the mean, ")
+    assert sentences[0].startswith("Mean over scenes, ")
     assert sentences[1].startswith("fox, ")
-    assert all(f": {', '.join(expected)}; beaten: bad · 8 it." in sentence for sentence in sentences)
+    assert all(f": {', '.join(expected)}; dominated: bad · 8 it." in sentence for sentence in sentences)
 
 
 def test_the_table_has_every_figure(records):
@@ -147,7 +147,7 @@ def test_origins(records):
     (line,) = origins(records + later)
     assert line.startswith("here, 2 compute units, driver 3; clsplat 1, commit abc; 2026-11-21 to 2026-11-22, load")
     assert line.endswith(" 2.0")
-    assert "times do not count" in origins([records[0] | {"load": 2.1}])[0]
+    assert "times are not valid" in origins([records[0] | {"load": 2.1}])[0]
     assert len(origins([*records, records[0] | {"commit": "def"}])) == 2
 
 
@@ -226,7 +226,13 @@ def test_the_page_stands_alone(records, tmp_path, empty_charts):
     assert not re.findall(r"(?:src|href)=\"(?!data:|#)", text)
     assert "url(" not in text and "@import" not in text
     assert text.count("data:image/svg+xml;base64,") == 2 * (len(COSTS) + 1)
-    for expected in ("expected 3 photos, found 2", "fast · ≤500 · 8 it", "other hardware", "On the mean", "commit a"):
+    for expected in (
+        "expected 3 photos, found 2",
+        "fast · ≤500 · 8 it",
+        "other hardware",
+        "Mean over scenes",
+        "commit a",
+    ):
         assert expected in text, expected
     kinds = ("time", "processor-time", "gaussians", "bytes", "memory", "speed", "published")
     drawn = {f"{kind}-{metric}" for kind in kinds for metric in ("psnr", "ssim")}

@@ -10,16 +10,8 @@ import pytest
 from test_cli import fails, run, write_dataset
 
 from clsplat.bench import quality
-from clsplat.bench.quality import (
-    differences,
-    make_cells,
-    parse_budget,
-    parse_method,
-    parse_source,
-    run_cell,
-    run_cells,
-    sample_iterations,
-)
+from clsplat.bench.cells import Cell, differences, make_cells, parse_budget, parse_method, parse_source
+from clsplat.bench.quality import run_cell, run_cells, sample_iterations
 from clsplat.bench.quality_summary import COSTS
 from clsplat.bench.results import append_record, read_records, write_records
 from clsplat.config import AdcConfig, DataConfig, InitConfig, TrainConfig
@@ -46,7 +38,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def cells_of(data: Path, *methods: str, scenes: tuple[str, ...] = ("one",)) -> list[quality.Cell]:
+def cells_of(data: Path, *methods: str, scenes: tuple[str, ...] = ("one",)) -> list[Cell]:
     return make_cells([str(data / s) for s in scenes], [str(data / f"{m}.json") for m in methods], ["own"], [])
 
 
@@ -108,9 +100,9 @@ class TestCells:
         for folder in ("a", "b"):
             (tmp_path / folder).mkdir()
             (tmp_path / folder / "m.json").write_text("{}")
-        with pytest.raises(InputError, match="data: expected names that differ, found scene 2 times"):
+        with pytest.raises(InputError, match="data: expected different names, found scene 2 times"):
             make_cells(["a/scene", "b/scene"], ["fast"], ["own"], [])
-        with pytest.raises(InputError, match="--methods: expected names that differ, found m 2 times"):
+        with pytest.raises(InputError, match="--methods: expected different names, found m 2 times"):
             make_cells(["a"], [str(tmp_path / "a" / "m.json"), str(tmp_path / "b" / "m.json")], ["own"], [])
         with pytest.raises(InputError, match="--iterations: expected 1 or more, found 0"):
             make_cells(["a"], ["fast"], ["own"], [0])

@@ -14,8 +14,7 @@ class Figure(NamedTuple):
 
 
 class Plot(NamedTuple):
-    """A chart: axis labels, and the points (x, y) of each series. A y of None leaves a gap; `log` lists the
-    logarithmic axes."""
+    """A chart: axis labels, points (x, y) by series (a y of None leaves a gap), and the logarithmic axes."""
 
     x: str
     y: str
