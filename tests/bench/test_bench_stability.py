@@ -29,7 +29,7 @@ def broken(device):
 
 @pytest.fixture
 def table(monkeypatch):
-    """Experiments that take no time, one for each outcome, in the place of the packaged ones."""
+    """Replace the packaged experiments by quick ones, one for each outcome."""
     table = {
         "good": experiment(found),
         "open": experiment(lambda device: Found([Figure("now", 7.0)]), remedy=None),
@@ -44,7 +44,7 @@ def table(monkeypatch):
 
 @pytest.fixture
 def on_scenes(monkeypatch):
-    """An experiment on real scenes that takes no time, in the place of the others."""
+    """Replace the experiments on real scenes by a quick one."""
 
     def measured(device, data):
         return Found([Figure("scenes in the folder", float(len(list(data.iterdir()))))])

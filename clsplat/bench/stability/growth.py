@@ -1,4 +1,4 @@
-"""Experiments on densification: resets of opacities, photos that nothing explains, starts without points."""
+"""Experiments on densification: resets of opacities, and photos of noise that make the number of Gaussians grow."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,23 +18,24 @@ RESET_CONFIG = replace(
     CONFIG, iterations=400, adc=replace(CONFIG.adc, every=25, reset_every=150, start=50, stop_fraction=0.8)
 )
 AFTER = (-1, 0, 5, 10, 20, 40)
-"""Iterations from a reset at which the held-out photos are looked at; the rounds lie between 0 and 40."""
+"""Iterations, counted from a reset, after which held-out photos are evaluated. Rounds of densification lie between 0
+and 40."""
 
 CAP = 300
-"""Of Gaussians, for photos that nothing explains."""
+"""Maximal number of Gaussians in the experiment on photos of noise."""
 
 
 def around_reset(adc: AdcConfig, scene: Scene, device: Device) -> tuple[list[float], float]:
-    """PSNR of held-out photos at `AFTER` from the second reset, and at the end, dB."""
+    """PSNR of held-out photos at the iterations `AFTER` the second reset, and at the end, dB."""
     config, found = replace(RESET_CONFIG, adc=adc), []
 
-    def look(gaussians: object) -> dict[str, float]:
+    def evaluate(gaussians: object) -> dict[str, float]:
         found.append(mean_metrics(gaussians, scene.test, config.render, device)["psnr"])  # type: ignore[arg-type]
         return {}
 
     marks = [2 * RESET_CONFIG.adc.reset_every + after for after in AFTER]
     with TemporaryDirectory() as out:
-        train(scene, config, device, Path(out), evaluate=look, evaluate_after=[*marks, config.iterations])
+        train(scene, config, device, Path(out), evaluate=evaluate, evaluate_after=[*marks, config.iterations])
     return found[:-1], found[-1]
 
 
@@ -56,19 +57,19 @@ def _reset(device: Device) -> Found:
 
 
 def noise(view: View, rng: np.random.Generator) -> View:
-    """Each pixel another colour, in each photo anew."""
+    """Replace a photo by random colours per pixel."""
     return replace(view, image=rng.integers(0, 256, view.image.shape, dtype=np.uint8))
 
 
 def checkerboard(view: View, rng: np.random.Generator) -> View:
-    """Black and white squares of two pixels, moved in each photo."""
+    """Replace a photo by black and white squares of 2 px, shifted at random."""
     y, x = np.indices(view.image.shape[:2]) + rng.integers(0, 4, 2)[:, None, None]
     white = (x // 2 + y // 2) % 2 == 0
     return replace(view, image=np.where(white[:, :, None], np.uint8(255), np.uint8(0)).repeat(3, axis=2))
 
 
 def largest_number(scene: Scene, config: TrainConfig, device: Device) -> int:
-    """The most Gaussians that there are in any iteration."""
+    """Largest number of Gaussians in any iteration of a training."""
     most = 0
 
     def watch(record: dict[str, object]) -> None:
@@ -93,24 +94,24 @@ def _blow_up(device: Device) -> Found:
             figures.append(
                 Figure(f"{label}, {f'cap {cap}' if cap else 'no cap'}", largest_number(photos, asked, device))
             )
-    # Without the remedy first: what noise makes of no cap.
+    # First without the remedy: noise without a cap.
     return Found([figures[2], *figures[:2], *figures[3:]])
 
 
 OPACITY_RESET = Experiment(
     failure="opacity reset",
     source="gsplat #1011, #1012: dips of 2.7 to 7.6 dB",
-    remedy="a fraction of the opacities taken in each round instead (`--adc.opacity-decay`)",
+    remedy="instead, each round reduces opacities by a fraction (`--adc.opacity-decay`)",
     test="tests/stability/test_growth.py::test_opacities_that_decay_make_no_dip",
     measure=_reset,
-    figure="PSNR of held-out photos before a reset, less the lowest in the 40 iterations after it; 40 balls, 40x32",
+    figure="PSNR of held-out photos before a reset minus the lowest within 40 iterations after it; 40 balls, 40x32",
 )
 
 BLOW_UP = Experiment(
     failure="densification blow-up",
     source="poison-splat, Lu et al. 2024: 1.7 to 4 times the Gaussians",
-    remedy="a hard cap, the largest gradients first (`--max-gaussians`); memory is foretold (`--memory-limit`)",
+    remedy="a hard cap, largest gradients first (`--max-gaussians`); a prediction of the memory (`--memory-limit`)",
     test="tests/stability/test_growth.py::test_photos_that_nothing_explains_stay_under_the_cap",
     measure=_blow_up,
-    figure="the most Gaussians in any of 400 iterations, from 40 points",
+    figure="largest number of Gaussians in 400 iterations, from 40 points",
 )
