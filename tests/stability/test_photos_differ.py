@@ -1,6 +1,6 @@
 """Photos that contradict each other: changing exposure (Rematas et al. 2022), or inaccurate poses (Lin et al. 2021).
 
-If the scene has to explain them, exposure becomes floaters and view dependence, and inaccurate poses become blur.
+If the scene has to explain them, exposure becomes haze and view dependence, and inaccurate poses become blur.
 """
 
 from dataclasses import replace
