@@ -54,9 +54,11 @@ bench-quality:
 bench-knobs:
 	$(PYTHON) -m clsplat bench knobs $(if $(WORKLOAD),--workload $(WORKLOAD)) -o docs/results/knobs.json --chart docs/results/knobs.svg
 
-# The figures of docs/stability.md, measured anew: make bench-stability DATA=folder of real scenes.
+# The figures of docs/stability.md: make bench-stability DATA=folder of real scenes. Without DATA, only the experiments
+# that need no scenes are measured. NAMES and SCENE_NAMES choose experiments of the two kinds.
 bench-stability:
-	$(PYTHON) -m clsplat bench stability $(NAMES) -o docs/results --data $(DATA)
+	$(PYTHON) -m clsplat bench stability $(NAMES) -o docs/results
+	$(if $(DATA),$(PYTHON) tests/stability/scenes/measure_scenes.py $(SCENE_NAMES) --data $(DATA) -o docs/results)
 
 # The figures of docs/formats.md: make formats SCENE=scene.ply DATA=dataset OPTIONS="--downscale 2".
 formats:

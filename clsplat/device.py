@@ -1,4 +1,4 @@
-"""OpenCL context, program cache and buffers: with `clsplat.ops` the only code that imports pyopencl."""
+"""OpenCL context, program cache and buffers. Only this module and `clsplat.ops` import pyopencl."""
 
 import os
 import re
@@ -19,7 +19,7 @@ from clsplat.errors import DeviceError, InputError
 
 POCL_HINT = "install one, for example the embedded CPU driver: pip install 'clsplat[pocl]'"
 
-# Passed to every program; the kernels' copy of clsplat/constants.py.
+# Names in clsplat/constants.py of the constants that every program receives as -D.
 MODEL_CONSTANTS = (
     "ALPHA_MIN",
     "LOG2_ALPHA_MIN",
@@ -34,19 +34,19 @@ MODEL_CONSTANTS = (
     "EXTENT_SLACK",
 )
 
-# Work-group size where a kernel needs none in particular. Left to the driver it depends on the range's divisors, and
-# PoCL compiles a kernel anew for every size it meets: 0.05 to 0.15 s whenever the number of Gaussians changed.
+# Work-group size of kernels that require no particular one. A driver would choose it by the range's divisors, and
+# PoCL compiles a kernel again for each size, that is, whenever the number of Gaussians changes.
 GROUP = 64
 
-# Buffers of one name whose sizes differ by no more than this factor are allocated in one size.
+# Largest ratio of the sizes of two buffers of one name that are allocated with the same size.
 SAME_ORDER = 4
 
-# Safe with every driver tried; -cl-fast-relaxed-math is not: it drops exp to 2e-4 on one and breaks it on another.
+# Options that are safe with every tested driver. -cl-fast-relaxed-math is not: it degrades or breaks exp on some.
 BUILD_OPTIONS = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros"]
 
 
 def kernel_folder() -> Path:
-    """Folder of the OpenCL sources: inside the package when installed, beside it in a checkout."""
+    """Folder of the OpenCL sources: inside the package when installed, next to it in a checkout."""
     here = Path(__file__).resolve().parent
     for folder in (here / "cl", here.parent / "cl"):
         if (folder / "common.h").is_file():
@@ -55,9 +55,9 @@ def kernel_folder() -> Path:
 
 
 def inline_includes(name: str, folder: Path) -> str:
-    """Source of cl/`name` with every ``#include "..."`` replaced by the file, and #line directives.
+    """Source of cl/`name` in which each ``#include "..."`` is replaced by the file, with #line directives.
 
-    Compilers then report errors as cl/FILE:LINE, and no driver's program cache can miss an edited header.
+    Compilers then report errors as cl/FILE:LINE, and the program cache of a driver cannot overlook an edited header.
     """
     lines = [f'#line 1 "cl/{name}"']
     for number, line in enumerate((folder / name).read_text().splitlines(), start=1):
@@ -70,32 +70,32 @@ def inline_includes(name: str, folder: Path) -> str:
 
 
 def list_devices() -> list[cl.Device]:
-    """All OpenCL devices, in the order of platforms; empty where there is no driver."""
+    """All OpenCL devices, in the order of the platforms; an empty list if there is no driver."""
     try:
         platforms = cl.get_platforms()
-    except cl.LogicError:  # the loader's way to say that there is no driver
+    except cl.LogicError:  # the loader found no driver
         return []
     devices: list[cl.Device] = []
     for platform in platforms:
         try:
             devices += platform.get_devices()
-        except cl.Error:  # a platform without devices says so by an error
+        except cl.Error:  # a platform without devices raises this
             continue
     return devices
 
 
 def device_label(device: cl.Device) -> str:
-    """Platform and name of a device, as the user may write them after ``--device``."""
+    """Platform and name of a device. ``--device`` selects by a part of it."""
     return f"{device.platform.name.strip()}: {device.name.strip()}"
 
 
 def select_device(name: str | None = None) -> cl.Device:
-    """The first device whose label contains `name`; without a name what PYOPENCL_CTX says, else GPU before CPU.
+    """Select the first device whose label contains `name`; without a name, that of PYOPENCL_CTX, else GPU before CPU.
 
     Raises
     ------
     DeviceError
-        If there is no driver, no label contains `name`, or PYOPENCL_CTX selects nothing.
+        If there is no driver, no label contains `name`, or PYOPENCL_CTX selects no device.
     """
     devices = list_devices()
     if not devices:
@@ -123,21 +123,21 @@ class Device:
     Parameters
     ----------
     cl_device : pyopencl.Device, optional
-        Taken from `select_device` where not given.
+        Default: the result of `select_device`.
     real : float32 or float64
-        Type of every real number on the device. float64 needs cl_khr_fp64 and is meant for tests.
+        Type of all real numbers on the device. float64 requires cl_khr_fp64 and is meant for tests.
     memory_limit : int, optional
-        Bytes that buffers may take together, those kept for reuse included; default and maximum: the device's memory.
+        Largest total size of all buffers, those kept for reuse included, bytes. Default and maximum: device memory.
     model : mapping, optional
-        Other values of constants of the rendering model, by their names in `MODEL_CONSTANTS`: to measure what they
-        buy. LOG2_ALPHA_MIN follows ALPHA_MIN; the twins keep the values of `clsplat.constants`.
+        Other values for constants of the rendering model, by their names in `MODEL_CONSTANTS`, to measure their
+        effect. LOG2_ALPHA_MIN follows ALPHA_MIN. The twins keep the values of `clsplat.constants`.
 
     Attributes
     ----------
     memory_limit : int
         As above.
     memory_peak : int
-        The most bytes that buffers have taken so far.
+        Largest total size of all buffers so far, bytes.
     """
 
     def __init__(
@@ -168,24 +168,24 @@ class Device:
 
     @property
     def label(self) -> str:
-        """Platform and device name."""
+        """Platform and name of the device."""
         return device_label(self.cl_device)
 
     @property
     def memory(self) -> int:
-        """Bytes that buffers take now, those kept for reuse included."""
+        """Current total size of all buffers, bytes, including those kept for reuse."""
         return int(self._pool.managed_bytes)
 
     @cached_property
     def is_cpu(self) -> bool:
-        """Whether work-items run on CPU cores: few of them then own large contiguous pieces of work."""
+        """Whether work-items run on CPU cores. Launches then use few work-items with large pieces of work."""
         return bool(self.cl_device.type & cl.device_type.CPU)
 
     @cached_property
     def subgroup_size(self) -> int:
-        """Work-items of a subgroup, as the driver forms them in most kernels; 0 where there are no subgroups.
+        """Number of work-items in a subgroup, as the driver forms them in most kernels; 0 without subgroups.
 
-        They are an extension, or a feature of OpenCL 2.1 and later.
+        Subgroups are an extension, or a feature of OpenCL 2.1 and later.
         """
         major, minor = self.cl_device.version.split()[1].split(".")  # "OpenCL 3.0 ..."
         feature = (int(major), int(minor)) >= (2, 1) and self.cl_device.max_num_sub_groups > 0
@@ -198,10 +198,10 @@ class Device:
 
     @cached_property
     def vector_width(self) -> int:
-        """Floats in the vectors of kernels for CPUs: 16 where the compiler has registers for them, else 8.
+        """Number of floats in the vectors of kernels for CPUs: 16 if the compiler has registers for them, else 8.
 
-        PoCL 3.0 (LLVM 14) compiles for AMD's Zen 4, which has AVX-512, as for a Zen 3 without; no Zen that LLVM knows
-        under an earlier name has vectors of 16.
+        PoCL 3.0 (LLVM 14) compiles for AMD's Zen 4, which has AVX-512, as for a Zen 3, which has not. No Zen that
+        LLVM knows under an earlier name has vectors of 16.
         """
         mismatched = "znver" in self.cl_device.version
         return 16 if self.cl_device.native_vector_width_float >= 16 and not mismatched else 8
@@ -215,13 +215,13 @@ class Device:
             )
 
     def _block(self, nbytes: int) -> int:
-        """Bytes that the pool takes for a buffer of `nbytes`, which it rounds up to a class of sizes."""
+        """Bytes that the pool allocates for a buffer of `nbytes`: it rounds up to a size class."""
         return int(self._pool.alloc_size(self._pool.bin_number(nbytes)))
 
     def _capacity(self, what: str, nbytes: int) -> int:
-        """Bytes to allocate for `nbytes`: as many as for the largest of its name so far, if of the same order.
+        """Bytes to allocate for `nbytes`: the largest size of this name so far, if within `SAME_ORDER`.
 
-        Lists of intersections differ in length from image to image; in blocks of one size they reuse each other's.
+        Lists of intersections differ in length from image to image. Blocks of one size can be reused.
         """
         largest = self._largest.get(what, 0)
         if largest / SAME_ORDER <= nbytes <= largest:
@@ -239,9 +239,9 @@ class Device:
             capacity = nbytes
         if self.memory + self._block(capacity) > self.memory_limit:
             raise DeviceError(
-                f"{what}: needs {nbytes / 2**20:.0f} MiB beside {self.memory / 2**20:.0f} MiB in use, but the limit "
-                f"is {self.memory_limit / 2**20:.0f} MiB (--memory-limit); use fewer Gaussians or a smaller image "
-                "(--downscale)"
+                f"{what}: needs {nbytes / 2**20:.0f} MiB in addition to {self.memory / 2**20:.0f} MiB in use, "
+                f"but the limit is {self.memory_limit / 2**20:.0f} MiB (--memory-limit); use fewer Gaussians or a "
+                "smaller image (--downscale)"
             )
         try:
             block = self._pool.allocate(capacity)
@@ -254,12 +254,12 @@ class Device:
         return block
 
     def empty(self, what: str, shape: tuple[int, ...] | int, dtype: DTypeLike | None = None) -> cl.array.Array:
-        """Uninitialised array of `dtype` (default: real); `what` names it in errors.
+        """Uninitialised array of `dtype` (default: real). `what` names it in errors.
 
         Raises
         ------
         DeviceError
-            If it exceeds the device's largest buffer, its memory, or the limit.
+            If the array exceeds the device's largest buffer, its memory, or the limit.
         """
         dtype = self.real if dtype is None else np.dtype(dtype)
         nbytes = int(np.prod(shape)) * dtype.itemsize
@@ -268,9 +268,9 @@ class Device:
         return cl.array.Array(self.queue, shape, dtype, data=data)
 
     def scratch(self, what: str, size: int, layout: Any = None) -> cl.array.Array:
-        """The flat array of reals named `what`, kept between calls.
+        """Flat array of `size` reals named `what`, kept between calls.
 
-        Zero where no kernel has written since `size` or `layout` last changed.
+        It is filled with zeros when it is created, and again when `size` or `layout` changes.
         """
         if what in self._scratch and self._scratch[what][0] != (size, layout):
             del self._scratch[what]
@@ -279,14 +279,14 @@ class Device:
         return self._scratch[what][1]
 
     def upload(self, what: str, array: Any, dtype: DTypeLike | None = None) -> cl.array.Array:
-        """Copy of a host array on the device, converted to `dtype` (default: real)."""
+        """Copy a host array to the device, converted to `dtype` (default: real)."""
         host = np.ascontiguousarray(array, dtype=self.real if dtype is None else dtype)
         result = self.empty(what, host.shape, host.dtype)
         result.set(host)
         return result
 
     def constant(self, what: str, values: Any) -> cl.array.Array:
-        """Reals named `what` on the device, uploaded when they change: an upload waits for all that is queued."""
+        """Reals named `what` on the device, uploaded only when they change: an upload waits for the queue."""
         host = np.ascontiguousarray(values, dtype=self.real)
         if what not in self._constants or self._constants[what][0] != host.tobytes():
             self._constants[what] = host.tobytes(), self.upload(what, host)
@@ -304,9 +304,9 @@ class Device:
     ) -> None:
         """Queue `kernel` of cl/`stage`.cl, built with `defines`, over `global_size` work-items.
 
-        Arguments are device arrays, Python ints (passed as 32 bits), floats (as real) or NumPy scalars and structs.
-        A one-dimensional range without a `group` is rounded up to whole groups: such kernels ignore work-items past
-        their end.
+        Arguments are device arrays, Python ints (passed as 32 bits), floats (passed as real), or NumPy scalars and
+        structs. A one-dimensional range without a `group` is rounded up to whole groups. Kernels launched this way
+        ignore surplus work-items.
         """
         if group is None and len(global_size) == 1:
             group = (GROUP,)
@@ -341,8 +341,8 @@ class Device:
         ]
         shown = bool(os.environ.get("PYOPENCL_COMPILER_OUTPUT"))
         with warnings.catch_warnings():
-            # Drivers report on every success, for example which kernels they vectorised; PoCL's compiler counts its
-            # warnings on stderr.
+            # Drivers report on successful builds, for example which kernels they vectorised, and PoCL's compiler
+            # prints the number of its warnings to stderr.
             if not shown:
                 warnings.simplefilter("ignore", cl.CompilerWarning)
                 options.append("-w")

@@ -1,7 +1,7 @@
-"""Image metrics as the field reports them: PSNR, SSIM, and FLIP where it is installed.
+"""Image metrics as the field reports them: PSNR, SSIM and, if installed, FLIP.
 
-Images are (H, W, 3), uint8 or floats in [0, 1]; floats are rounded to 8 bits first, since that is what a photo
-and a saved render are. Figures of a scene are the means over its images, not metrics of the mean error.
+Images are (H, W, 3), uint8 or floats in [0, 1]. Floats are first rounded to 8 bits, the precision of photos and of
+saved renders. The metric of a scene is the mean over its images, not the metric of the mean error.
 """
 
 import math
@@ -17,12 +17,12 @@ Array = NDArray[Any]
 
 
 def to_uint8(image: Array) -> NDArray[np.uint8]:
-    """Round an image to 8 bits, (H, W, 3): values are clamped to [0, 1]; uint8 is returned as it is.
+    """Round an image (H, W, 3) to 8 bits. Floats are clamped to [0, 1]; uint8 is returned unchanged.
 
     Raises
     ------
     InputError
-        If the shape is not (H, W, 3), the dtype neither uint8 nor float, or a value not finite.
+        If the shape is not (H, W, 3), the dtype is neither uint8 nor float, or a value is not finite.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise InputError(f"image: expected shape (H, W, 3), found {image.shape}")
@@ -47,7 +47,7 @@ def psnr(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> f
     Returns
     -------
     float
-        Decibels; infinite for equal images.
+        PSNR, dB. Infinite for equal images.
 
     Raises
     ------
@@ -60,16 +60,16 @@ def psnr(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> f
 
 
 def psnr_fitted(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> float:
-    """PSNR after the affine map of the image's colours that brings it closest to the truth.
+    """PSNR after the affine map of the image's colours that brings the image closest to the truth.
 
-    It does not count what a photo's exposure and white balance changed in all its pixels alike, which no training
-    could have known (Martin-Brualla et al. 2021 and Barron et al. 2022 fit the held-out photos likewise).
+    It ignores changes that a photo's exposure and white balance make to all pixels alike, and that no training could
+    predict. Martin-Brualla et al. 2021 and Barron et al. 2022 fit held-out photos in a similar way.
 
-    Parameters, result and errors as of `psnr`; never below it by more than what rounding and clamping do.
+    Parameters, result and errors are those of `psnr`. Up to rounding and clamping, the result is at least `psnr`.
     """
     a, b, mask = _prepare(image, truth, mask)
     inputs, outputs = np.c_[a[mask], np.ones(mask.sum())], b[mask]
-    # By the normal equations: 4 unknowns per channel, many pixels. The pseudo-inverse takes flat images too.
+    # Normal equations: 4 unknowns per channel, many pixels. The pseudo-inverse also handles flat images.
     fit = np.linalg.pinv(inputs.T @ inputs) @ (inputs.T @ outputs)
     return psnr(a @ fit[:3] + fit[3], b, mask)
 
@@ -77,19 +77,19 @@ def psnr_fitted(image: Array, truth: Array, mask: NDArray[np.bool_] | None = Non
 def ssim(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> float:
     """Structural similarity (Wang et al. 2004, doi:10.1109/TIP.2003.819861), mean over all pixels and channels.
 
-    Gaussian window of 11x11 pixels, sigma 1.5, population variances, borders padded with zeros as in the
-    original's training loss; scikit-image mirrors the borders instead.
+    The window is a Gaussian of 11x11 px with sigma 1.5 px. Variances are population variances. Borders are padded
+    with zeros, as in the training loss of the original code; scikit-image mirrors them instead.
 
     Parameters
     ----------
     image, truth : (H, W, 3) uint8 or float in [0, 1]
     mask : (H, W) bool, optional
-        True where pixels count. Windows that reach beyond see the truth's pixels there in both images.
+        True where pixels count. Elsewhere, windows contain the pixels of the truth for both images.
 
     Returns
     -------
     float
-        1 for equal images.
+        SSIM, at most 1; 1 for equal images.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def flip(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> f
     Returns
     -------
     float or None
-        0 for equal images, at most 1; None where the package flip-evaluator is not installed.
+        FLIP, 0 to 1; 0 for equal images. None if the package flip-evaluator is not installed.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def flip(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> f
 
 
 def _prepare(image: Array, truth: Array, mask: NDArray[np.bool_] | None) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Both images rounded to 8 bits as float64 in [0, 1], equal where the mask is False; and the mask."""
+    """Both images, rounded to 8 bits, as float64 in [0, 1], and the mask. Where it is False, the images are equal."""
     a, b = to_uint8(image) / 255, to_uint8(truth) / 255
     if a.shape != b.shape:
         raise InputError(f"image: expected the truth's shape {b.shape}, found {a.shape}")

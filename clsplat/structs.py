@@ -1,4 +1,4 @@
-"""NumPy dtypes of the structs that kernels take by value; cl/structs.h holds their OpenCL side."""
+"""NumPy dtypes of the structs that kernels take by value. cl/structs.h holds their OpenCL counterparts."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ RATES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "sh_rest")
 
 
 def camera_struct(camera: Camera, real: Any) -> np.ndarray:
-    """The `Camera` struct of cl/structs.h for a build whose reals are `real` (float32 or float64)."""
+    """The struct `Camera` of cl/structs.h, for a build with reals of the type `real` (float32 or float64)."""
     dtype = np.dtype(
         [
             ("rotation", real, 9),
@@ -44,18 +44,18 @@ def lens_define(camera: Camera) -> str:
     Raises
     ------
     InputError
-        If it is equirectangular, which no kernel projects to.
+        If the camera is equirectangular: no kernel projects to such an image.
     """
     if camera.model == "equirectangular":
         raise InputError(
-            "camera: expected a pinhole, orthographic or fisheye one, found an equirectangular one; `render` shows "
-            "such a panorama, and datasets train on its six faces"
+            "camera: expected a pinhole, orthographic or fisheye camera, found an equirectangular one; "
+            "`render` draws such panoramas, and datasets train on their six faces"
         )
     return camera.model.upper()
 
 
 def adam_struct(step: AdamStep, real: Any) -> np.ndarray:
-    """The `Adam` struct of cl/structs.h; differences from 1 are taken in double precision."""
+    """The struct `Adam` of cl/structs.h. The differences 1 - beta and the corrections are computed in float64."""
     correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
     rates = [step.rates[name] / correction1 for name in RATES]
     betas = [step.beta1, 1 - step.beta1, step.beta2, 1 - step.beta2]

@@ -1,6 +1,7 @@
-"""What the tests of a kernel are made of; public, so that authors of plug-ins can use it too.
+"""Building blocks for tests of kernels and plug-ins.
 
-Scenes that keep away from every threshold, gradients by central differences, comparison by a table of tolerances.
+They are scenes that keep a distance from every threshold, a check of gradients by central differences, and a
+comparison of arrays by a table of tolerances.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -27,12 +28,12 @@ from clsplat.stages import Splats
 
 Array = NDArray[Any]
 
-# A fresh draw violates a margin of 1e-3 in about one row of eight: 40 rounds leave none.
+# Largest number of draws. With a margin of 1e-3 a draw violates it in about one row of eight, so 40 draws suffice.
 DRAWS_MAX = 40
 
 
 class Tolerance(NamedTuple):
-    """How close is close: |actual - expected| <= rtol |expected| + atol max|expected|, and why that much."""
+    """Tolerance |actual - expected| <= rtol |expected| + atol max|expected|, and the reason for it."""
 
     rtol: float
     atol: float
@@ -51,17 +52,17 @@ def assert_matches(
     Parameters
     ----------
     quantity : str
-        Key of `tolerances`; named in the error.
+        Key of `tolerances`, and name of the array in the error.
     actual, expected : arrays of one shape
     tolerances : mapping of quantity to Tolerance
     where : array of bool, optional
-        Compares only these entries, indexing the leading axes.
+        Entries to compare, as an index of the leading axes. Default: all.
 
     Raises
     ------
     AssertionError
-        If the shapes differ, something is not finite, or an entry is too far off; says which, how far and why the
-        tolerance is what it is.
+        If the shapes differ, a value is not finite, or an entry exceeds the tolerance. The message names the worst
+        entry, its error, and the reason for the tolerance.
     """
     actual, expected = np.asarray(actual), np.asarray(expected)
     assert actual.shape == expected.shape, f"{quantity}: expected shape {expected.shape}, found {actual.shape}"
@@ -92,28 +93,28 @@ def gradcheck(
     rtol: float = 1e-6,
     seed: int = 0,
 ) -> None:
-    """Compare gradients with central differences, along three random directions and at six single entries of each.
+    """Compare gradients with central differences, along three random directions and at six entries of each input.
 
     Parameters
     ----------
     function : callable
-        ``function(**inputs)`` is the scalar that was differentiated, computed in float64.
+        ``function(**inputs)`` computes the differentiated scalar in float64.
     inputs : mapping of name to float64 array
-        Of the order of 1. `function` must be smooth within a few `step` of them.
+        Values of the order of 1. `function` must be smooth within a few `step` of them.
     gradients : mapping of name to array
-        The gradient with respect to inputs[name], of its shape; other inputs are held fixed.
+        Gradients with respect to inputs[name], of the same shape. Inputs without a gradient are held fixed.
     step : float
-        Of the differences. Their rounding error is about 1e-16/step, their truncation error about step^2.
+        Step of the differences. Their rounding error is about 1e-16/step, their truncation error about step^2.
     rtol : float
-        Largest error, as a fraction of the gradient's norm along directions, of its root mean square or the entry,
-        whichever is larger, at entries.
+        Largest relative error. Along directions it is relative to the norm of the gradient; at entries, to the root
+        mean square of the gradient or to the entry, whichever is larger.
     seed : int
-        Of the directions and entries. One half of the entries are those of the largest gradients.
+        Seed of the directions and entries. Half of the entries are those with the largest gradients.
 
     Raises
     ------
     AssertionError
-        Names the input and both values.
+        If a gradient exceeds the tolerance. The message names the input and both values.
     """
     rng = np.random.default_rng(seed)
     for name, gradient in gradients.items():
@@ -140,7 +141,7 @@ def gradcheck(
 
 
 def _pixel_distances(splats: Splats, width: int, height: int) -> Iterator[tuple[int, Array]]:
-    """Front to back, without tiles or boxes: each splat and the distances (H, W) of its pixels from a threshold."""
+    """Yield each splat and the distances (H, W) of its pixels from a threshold, front to back, without tiles."""
     x, y = np.arange(width)[None, :] + 0.5, np.arange(height)[:, None] + 0.5
     transmittance: Array = np.ones((height, width))
     live = np.ones((height, width), dtype=bool)
@@ -160,16 +161,16 @@ def _pixel_distances(splats: Splats, width: int, height: int) -> Iterator[tuple[
 
 
 def ambiguous_pixels(splats: Splats, width: int, height: int, *, margin: float = 1e-3) -> NDArray[np.bool_]:
-    """Pixels in which rounding may decide whether a pair is drawn, clamped, or the last.
+    """Pixels in which rounding may decide whether a splat is drawn, is clamped, or is the last one.
 
     Parameters
     ----------
     splats : Splats of NumPy arrays
     width, height : int
-        Image size in pixels.
+        Image size, px.
     margin : float
-        Relative distance of an alpha from ALPHA_MIN or ALPHA_MAX, or of the transmittance from TRANSMITTANCE_MIN
-        at a drawn pair, below which a pixel counts.
+        Relative distance below which a pixel is ambiguous: that of an alpha from ALPHA_MIN or ALPHA_MAX, or that of
+        the transmittance behind a drawn splat from TRANSMITTANCE_MIN.
 
     Returns
     -------
@@ -182,23 +183,24 @@ def ambiguous_pixels(splats: Splats, width: int, height: int, *, margin: float =
 
 
 def threshold_distances(gaussians: Gaussians, camera: Camera, *, antialiased: bool = False) -> NDArray[np.float64]:
-    """Each Gaussian's distance from the nearest threshold of the rendering model.
+    """Distance of each Gaussian from the nearest threshold of the rendering model.
 
     Parameters
     ----------
     gaussians : Gaussians
     camera : Camera
     antialiased : bool
-        Of the mode that renders them.
+        True if the mode "antialiased" renders them.
 
     Returns
     -------
     (N,) float64
-        The smallest of: |ln(alpha/ALPHA_MIN)| and |ln(alpha/ALPHA_MAX)| over the pixels, |ln(T/TRANSMITTANCE_MIN)|
-        behind the Gaussian where it is drawn, |ln(opacity/ALPHA_MIN)|, |ln(z/NEAR)|, |ln(z/z')| to the next depth,
-        the colour's distance from its clamp at 0, that of a pinhole's x/z and y/z from the clamp of the Jacobian,
-        that of a fisheye's angle from its largest, and that of the opacity's compensation from its floor, as a
-        logarithm. For an invisible Gaussian that of the depth from NEAR, infinite if that is not why.
+        For a visible Gaussian, the smallest of: |ln(alpha/ALPHA_MIN)| and |ln(alpha/ALPHA_MAX)| over the pixels;
+        |ln(T/TRANSMITTANCE_MIN)| behind the Gaussian, where it is drawn; |ln(opacity/ALPHA_MIN)|; |ln(z/NEAR)|;
+        |ln(z/z')| with the next depth z'; the distance of the colour from its clamp at 0; for a pinhole, that of x/z
+        and y/z from the clamp of the Jacobian; for a fisheye, that of the angle from its maximum; if antialiased,
+        |ln| of the opacity's compensation over its floor. For an invisible Gaussian, only the distances of the depth,
+        infinite behind the camera, and of a fisheye's angle.
     """
     g = gaussians.astype(np.float64)
     splats = project_fwd(g, camera, g.sh_degree, antialiased=antialiased)
@@ -221,16 +223,13 @@ def threshold_distances(gaussians: Gaussians, camera: Camera, *, antialiased: bo
     colors = 0.5 + np.einsum("nk,nkc->nc", basis, g.sh)
     distances = np.minimum(distances, np.abs(colors).min(axis=1))
 
-    focal, size = np.array([camera.fx, camera.fy]), np.array([camera.width, camera.height])
-    centre, margin = np.array([camera.cx, camera.cy]), FRUSTUM_MARGIN * 0.5 * size
-    slopes = points[:, :2] / z[:, None]
-    for limit in (-(centre + margin) / focal, (size - centre + margin) / focal) if camera.model == "pinhole" else ():
-        distances = np.minimum(distances, np.abs(slopes - limit).min(axis=1))
+    if camera.model == "pinhole":
+        distances = np.minimum(distances, _clamp_distances(points[:, :2] / z[:, None], camera))
     if antialiased:
         opacities = sigmoid(g.logit_opacities)
         with np.errstate(divide="ignore"):
             floor = np.log(splats.opacities / opacities / COMPENSATION_MIN)
-        # At the floor itself nothing says how far below it the ratio lies: such a scene does not count as clear.
+        # At the floor the distance is 0: how far below it the ratio lies is unknown.
         distances = np.minimum(distances, np.where(shown, floor, np.inf))
 
     order = np.flatnonzero(shown)[np.argsort(z[shown], kind="stable")]
@@ -239,6 +238,14 @@ def threshold_distances(gaussians: Gaussians, camera: Camera, *, antialiased: bo
     for row, pixels in _pixel_distances(splats, camera.width, camera.height):
         distances[row] = min(distances[row], pixels.min())
     return np.where(shown, distances, near)
+
+
+def _clamp_distances(slopes: Array, camera: Camera) -> Array:
+    """Distance of the slopes x/z and y/z (N, 2) from the clamp of a pinhole's Jacobian, (N,)."""
+    focal, size = np.array([camera.fx, camera.fy]), np.array([camera.width, camera.height])
+    centre, margin = np.array([camera.cx, camera.cy]), FRUSTUM_MARGIN * 0.5 * size
+    limits = np.array([-(centre + margin) / focal, (size - centre + margin) / focal])
+    return np.abs(slopes[:, None] - limits).min(axis=(1, 2))
 
 
 def synthetic_scene(
@@ -258,40 +265,29 @@ def synthetic_scene(
         Number of Gaussians.
     seed : int
     width, height : int
-        Image size in pixels; the focal length is 1.2 widths.
+        Image size, px. The focal length is 1.2 widths.
     sh_degree : int
         Degree of the spherical harmonics, 0 to 3.
     margin : float
-        Gaussians are drawn anew until each has at least this `threshold_distances`, in both modes. 1e-3 admits
-        central differences with a step of 1e-6; 0 takes the first draw.
+        Gaussians are redrawn until `threshold_distances` is at least this in both modes. 1e-3 admits central
+        differences with a step of 1e-6. 0 accepts the first draw.
 
     Returns
     -------
     gaussians : Gaussians, float64
-        Within 1.5 of the origin, 1 to 6 pixels in size, opacities 0.12 to 0.95.
+        Within 1.5 of the origin, 1 to 6 px in size, with opacities of 0.12 to 0.95.
     camera : Camera
         At a distance of 4 from the origin.
 
     Raises
     ------
     InputError
-        If the margin cannot be kept, because it or n is too large for the image.
+        If the margin cannot be kept, because the margin or n is too large for the image.
     """
     rng = np.random.default_rng(seed)
     camera = Camera.look_at((1.5, -1.0, 3.57), (0, 0, 0), (0, 1, 0), 1.2 * width, width, height)
 
-    def draw(count: int) -> Gaussians:
-        sh = rng.normal(0, 0.15, (count, (sh_degree + 1) ** 2, 3))
-        sh[:, 0] = rng.normal(0.3, 0.6, (count, 3))
-        return Gaussians(
-            means=rng.uniform(-1.5, 1.5, (count, 3)) * [1, height / width, 1],
-            log_scales=rng.uniform(np.log(0.03), np.log(0.4), (count, 3)),
-            quats=rng.normal(size=(count, 4)),
-            logit_opacities=rng.uniform(-2, 3, count),
-            sh=sh,
-        )
-
-    gaussians = draw(n)
+    gaussians = _draw(rng, n, height / width, sh_degree)
     if margin <= 0:
         return gaussians, camera
     for _ in range(DRAWS_MAX):
@@ -300,10 +296,23 @@ def synthetic_scene(
             near |= threshold_distances(gaussians, camera, antialiased=antialiased) < margin
         if not near.any():
             return gaussians, camera
-        fresh = draw(int(near.sum())).arrays()
+        fresh = _draw(rng, int(near.sum()), height / width, sh_degree).arrays()
         for name, array in gaussians.arrays().items():
             array[near] = fresh[name]
     raise InputError(
         f"margin: expected one that {n} random Gaussians can keep at {width}x{height} px, found {margin}; "
         "use fewer Gaussians or a smaller margin"
+    )
+
+
+def _draw(rng: np.random.Generator, n: int, aspect: float, sh_degree: int) -> Gaussians:
+    """Random Gaussians of `synthetic_scene`. `aspect` is the image's height over its width."""
+    sh = rng.normal(0, 0.15, (n, (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = rng.normal(0.3, 0.6, (n, 3))
+    return Gaussians(
+        means=rng.uniform(-1.5, 1.5, (n, 3)) * [1, aspect, 1],
+        log_scales=rng.uniform(np.log(0.03), np.log(0.4), (n, 3)),
+        quats=rng.normal(size=(n, 4)),
+        logit_opacities=rng.uniform(-2, 3, n),
+        sh=sh,
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
-sys.path[:0] = [str(ROOT), str(HERE / "_ext")]
+sys.path[:0] = [str(ROOT), str(HERE / "_ext"), str(ROOT / "tests" / "stability" / "scenes")]
 # The kernels of the notebooks run in separate processes.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
 

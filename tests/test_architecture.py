@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pyopencl as cl
@@ -128,6 +129,20 @@ def test_twins_import_numpy_only(path):
     for name in imports_of(path):
         allowed = name in ours or name.startswith("clsplat.reference.") or name.split(".")[0] == "numpy"
         assert allowed or name.split(".")[0] in sys.stdlib_module_names, name
+
+
+def test_no_two_modules_share_a_name():
+    """Except for the two modules of a stage in ops and reference."""
+    names = Counter(p.stem for p in MODULES if p.stem not in ("__init__", "__main__") and unit_of(p) != "reference")
+    assert [name for name, count in names.items() if count > 1] == []
+    shared = {p.stem for p in MODULES if unit_of(p) == "reference"} & set(names)
+    assert shared - {"__init__"} == set(STAGES)
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if p.stem == "__init__"], ids=lambda p: p.parent.name)
+def test_every_package_says_what_belongs_there(path):
+    docstring = " ".join((ast.get_docstring(ast.parse(path.read_text())) or "").split())
+    assert "Belongs here:" in docstring and "Does not belong here:" in docstring
 
 
 def test_import_is_light():

@@ -115,7 +115,9 @@ class TestBuffers:
         # Only what is kept for reuse stands in the way: it goes.
         other = device.empty("other", 5 << 18)
         assert device.memory <= device.memory_limit
-        with pytest.raises(DeviceError, match=r"^more: needs 4 MiB beside \d MiB in use, but the limit is 10 MiB"):
+        with pytest.raises(
+            DeviceError, match=r"^more: needs 4 MiB in addition to \d MiB in use, but the limit is 10 MiB"
+        ):
             device.empty("more", 1 << 20)
         del kept, other
         device.empty("more", 1 << 20)

@@ -1,4 +1,4 @@
-"""The sub-commands of `clsplat bench`: a dataclass each, from which tyro makes flags and help."""
+"""Sub-commands of `clsplat bench`: one dataclass each, from which tyro makes flags and help."""
 
 import json
 import sys
@@ -21,22 +21,23 @@ def _say(text: str) -> None:
 
 @dataclass(frozen=True)
 class Kernels:
-    """Time training's step, its stages and their kernels, beside what the device can do at best."""
+    """Time a training step, its stages and their kernels, and compare them with the limits of the device."""
 
     workloads: tuple[str, ...] = DEFAULT
     """Synthetic scenes: number of Gaussians and image size."""
     scene: Path | None = None
-    """File of Gaussians to time instead; needs --cameras."""
+    """File of Gaussians to time instead; requires --cameras."""
     cameras: Path | None = None
-    """Dataset whose views the scene is timed with, as given to `train`."""
+    """Dataset with the views for --scene, as for `train`."""
     views: int = 1
-    """Views of the dataset, evenly spread, each a workload of its own."""
+    """Number of views of the dataset, evenly spread. Each is a workload."""
     downscale: Literal[1, 2, 4, 8] = 1
-    """Of the dataset's photos, as given to `train`."""
+    """Factor by which the dataset's photos are reduced, as for `train`."""
     scaling: Path | None = None
-    """Also time more numbers of Gaussians and of pixels, and draw the chart in this file (.png, .svg, .pdf)."""
+    """File for a chart of time against the numbers of Gaussians and pixels (.png, .svg, .pdf); its workloads are
+    timed too."""
     repeats: int = 15
-    """Steps of each kind that count: whole, stage by stage, kernel by kernel."""
+    """Number of timed steps of each kind: whole, by stages, by kernels."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """JSON file for all results."""
     device: str | None = None
@@ -73,28 +74,28 @@ class Kernels:
 
 @dataclass(frozen=True)
 class Knobs:
-    """Turn each knob of the renderer, one at a time: what it buys in time, and its error against the float64 twin."""
+    """Change each setting of the renderer, one at a time, and measure its time and error against the float64 twin."""
 
     workload: str = KNOBS_DEFAULT
     """Synthetic scene: number of Gaussians and image size."""
     scene: Path | None = None
-    """File of Gaussians to use instead; needs --cameras."""
+    """File of Gaussians to use instead; requires --cameras."""
     cameras: Path | None = None
-    """Dataset whose views the scene is seen from, as given to `train`."""
+    """Dataset with the views for --scene, as for `train`."""
     views: int = 1
-    """Views of the dataset, evenly spread, each a workload of its own."""
+    """Number of views of the dataset, evenly spread. Each is a workload."""
     downscale: Literal[1, 2, 4, 8] = 1
-    """Of the dataset's photos, as given to `train`."""
+    """Factor by which the dataset's photos are reduced, as for `train`."""
     repeats: int = 7
-    """Runs of each setting that count, in turn with as many of the default."""
+    """Number of timed runs of each setting. They alternate with runs of the default."""
     chart: Path | None = None
-    """Error against time, for the first workload (.png, .svg, .pdf)."""
+    """File for a chart of error against time, for the first workload (.png, .svg, .pdf)."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """JSON file for all results."""
     device: str | None = None
     """Part of the platform's or device's name."""
     render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
-    """What the knobs are turned from."""
+    """The default that single settings are changed from."""
 
     def run(self) -> None:
         """Run the command."""
@@ -117,66 +118,52 @@ class Knobs:
 
 @dataclass(frozen=True)
 class Stability:
-    """Measure how the method's known failures show without their remedies and with them."""
+    """Measure the known failures of the method without their remedies and with them."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Experiments; default: all."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder for stability.json, in which rows that are not measured now stay as they are, and charts."""
-    data: Path | None = None
-    """Folder with the real scenes that some experiments train on; they do not run without it."""
+    """Folder for stability.json and for charts. Rows of the file that are not measured now stay as they are."""
     device: str | None = None
     """Part of the platform's or device's name."""
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.atomic import replacing
-        from clsplat.bench.stability.run import run_experiments
-        from clsplat.bench.stability.stability_report import chart_file, charts, save_chart, table
+        from clsplat.bench.stability.run import measure_rows
+        from clsplat.bench.stability.stability_report import table
         from clsplat.device import Device, select_device
 
-        for folder in filter(None, (self.out, self.data)):
-            if not folder.is_dir():
-                raise InputError(f"{folder}: expected a folder that exists, found none")
-        results = _read_results(self.out / "stability.json") if self.out is not None else {}
-        device = Device(select_device(self.device))
-        _say(f"device: {device.label}")
-        rows = run_experiments(self.names, device, self.data, lambda name: _say(f"measuring: {name}"))
-        # A row that could not run says less than the same row measured earlier.
-        results |= {name: row for name, row in rows.items() if "not_run" not in row or name not in results}
-        if self.out is not None:
-            with replacing(self.out / "stability.json") as file:
-                file.write((json.dumps(results, indent=1, allow_nan=False) + "\n").encode())
-            for name in charts(rows):
-                save_chart(name, rows[name], self.out / chart_file(name))
-            _say(f"results: {self.out / 'stability.json'}")
+        results, failed = measure_rows(self.names, Device(select_device(self.device)), self.out, _say)
         print(table(results))
-        if failed := [name for name, row in rows.items() if "error" in row]:
+        if failed:
             raise ClsplatError(f"experiments failed, see above: {', '.join(failed)}")
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Train on scenes by several methods, and chart what time, Gaussians, bytes and memory buy in quality."""
+    """Train on scenes by several methods, and chart quality against time, Gaussians, bytes and memory."""
 
     data: tyro.conf.Positional[tuple[str, ...]]
-    """Datasets, as given to `train`; how photos are read follows a colon: lego:background=white, fern:downscale=2."""
+    """Datasets, as for `train`. Options for reading the photos follow a colon: lego:background=white,
+    fern:downscale=2."""
     methods: tuple[str, ...] = ("paper-7k", "fast")
-    """Presets of `train`, or files as its --config takes them."""
+    """Presets of `train`, or configuration files as for its --config."""
     budgets: tuple[str, ...] = ("own",)
-    """Caps on the number of Gaussians: a method's own, a factor of it such as x0.5, or a number such as 40000."""
+    """Caps on the number of Gaussians: "own" for the method's cap, a factor of it such as x0.5, or a number such as
+    40000."""
     iterations: tuple[int, ...] = ()
-    """Optimisation steps; default: each method's own."""
+    """Numbers of iterations; default: that of each method."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("clsplat-quality")
-    """Folder for results.jsonl and the charts. Trainings that it holds are not repeated; failed ones are."""
+    """Folder for results.jsonl and the charts. Finished trainings in it are not repeated; failed ones are."""
     device: str | None = None
     """Part of the platform's or device's name."""
     memory_limit: str | None = None
-    """Device memory that a training may use, such as 4GB."""
+    """Largest device memory of a training, such as 4GB."""
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.bench.quality import make_cells, run_cells
+        from clsplat.bench.cells import make_cells
+        from clsplat.bench.quality import run_cells
         from clsplat.bench.results import FILE
         from clsplat.device import Device, select_device
 
@@ -186,11 +173,11 @@ class Quality:
         try:
             self.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{self.out}: expected a folder that can be made, found: {error.strerror}") from error
+            raise InputError(f"cannot create {self.out}: {error.strerror}") from error
         try:
             run_cells(cells, device, self.out / FILE, _say)
         except KeyboardInterrupt:
-            _say(f"{self.out}: the same command continues after the last training that ended")
+            _say(f"{self.out}: the same command continues after the last finished training")
             raise
         Chart(self.out).run()
 
@@ -200,7 +187,7 @@ class Chart:
     """Draw the charts of `bench quality` from its results."""
 
     out: tyro.conf.Positional[Path]
-    """Folder with results.jsonl, for index.html, and for the charts as PNG and SVG."""
+    """Folder with results.jsonl. index.html and the charts, as PNG and SVG, are written to it."""
 
     def run(self) -> None:
         """Run the command."""
@@ -214,7 +201,7 @@ class Chart:
 
 
 def _check(repeats: int, out: Path | None, chart_option: str, chart: Path | None) -> None:
-    """Refuse now what would fail after minutes of measuring."""
+    """Check arguments that would otherwise fail after minutes of measuring."""
     if repeats < 1:
         raise InputError(f"--repeats: expected 1 or more, found {repeats}")
     if chart is not None and chart.suffix.lower() not in CHART_SUFFIXES:
@@ -225,7 +212,7 @@ def _check(repeats: int, out: Path | None, chart_option: str, chart: Path | None
 
 
 def _write(out: Path | None, results: dict[str, Any]) -> None:
-    """The results as JSON; before anything is printed, since a pipe may end early."""
+    """Write the results as JSON. This happens before anything is printed, because a pipe may be closed early."""
     from clsplat.atomic import replacing
 
     if out is not None:
@@ -237,21 +224,9 @@ def _write(out: Path | None, results: dict[str, Any]) -> None:
 def _of_files(
     scene: Path | None, cameras: Path | None, views: int, downscale: Literal[1, 2, 4, 8]
 ) -> list[Workload] | None:
-    """Workloads of --scene and --cameras; None where neither is given."""
+    """Workloads of --scene and --cameras; None if neither is given."""
     if (scene is None) != (cameras is None):
         raise InputError("--scene and --cameras: expected both or neither, found one of them")
     if scene is None or cameras is None:
         return None
     return from_files(scene, cameras, views, DataConfig(downscale=downscale))
-
-
-def _read_results(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        return {}
-    try:
-        results = json.loads(path.read_bytes())
-        if not isinstance(results, dict):
-            raise ValueError(f"a {type(results).__name__}")
-        return results
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected results of an earlier run, found: {error}") from error

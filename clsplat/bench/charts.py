@@ -1,4 +1,4 @@
-"""The charts of `clsplat bench quality`: quality against each cost, and the published figures."""
+"""Charts of `clsplat bench quality`: quality against each cost, and the published figures."""
 
 import json
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.bench.kernel_report import COLORS
-from clsplat.bench.summary import (
+from clsplat.bench.quality_summary import (
     COSTS,
     MEAN,
     METRICS,
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SHOWN_BELOW = {"psnr": 4.0, "ssim": 0.12, "flip": 0.08}
-"""How far below the worst end the axis of a metric reaches: the first samples are all alike, and far below."""
+"""Distance from the worst final value to the end of the axis, in units of the metric. The first samples are far worse
+and similar for all trainings, so they are cut off."""
 
 INK, SOFT = "#1d1d1f", "#77777d"
 
@@ -43,7 +44,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Label:
-    """A text that wants to stand beside a point, in the axes' units."""
+    """A text to be placed next to a point. The point is in units of the axes."""
 
     x: float
     y: float
@@ -58,11 +59,11 @@ def method_colors(finished: list[Run]) -> dict[str, str]:
 
 
 def quality_chart(finished: list[Run], cost: str, metric: str) -> "Figure":
-    """Quality against a cost: the mean over scenes, large, and each scene.
+    """Draw quality against a cost: a large panel for the mean over scenes, and a panel per scene.
 
-    A point is where a training ended. For the time, thin lines are trainings on their way, and a thick one is the
-    best that a method of several settings had reached by then. Otherwise lines join a method's caps. Dashed: the
-    Pareto front of all.
+    A point is the end of a training. Against the time, a thin line is the course of a training, and a thick line the
+    best quality that any setting of a method had reached by that time. Against other costs, lines join the caps of a
+    method. A dashed line is the Pareto front of all trainings.
     """
     from matplotlib.figure import Figure
 
@@ -82,7 +83,7 @@ def quality_chart(finished: list[Run], cost: str, metric: str) -> "Figure":
     better = "less" if COSTS[cost].less_is_better else "more"
     figure.suptitle(
         f"{METRICS[metric].name} on held-out photos against {COSTS[cost].name} ({better} is better)\n"
-        "Dashed: Pareto front; ≤: at most so many Gaussians; it: iterations",
+        "Dashed: Pareto front; ≤: maximal number of Gaussians; it: iterations",
         fontsize=10,
         color=SOFT,
         x=0.01,
@@ -120,7 +121,7 @@ def _panel(axes: "Axes", of_panel: list[Run], cost: str, metric: str, colors: di
 
 
 def _method_lines(of_method: list[Run], cost: str, metric: str) -> list[list[tuple[float, float]]]:
-    """For the time, the front of all samples of several settings; otherwise, the ends of those of unlike caps."""
+    """Lines of a method: against the time, the front of all its samples; otherwise, lines through the ends by cap."""
     if len(of_method) < 2:
         return []
     if cost in TIMES:
@@ -135,14 +136,14 @@ def _method_lines(of_method: list[Run], cost: str, metric: str) -> list[list[tup
 
 
 def _dashes(axes: "Axes", best: list[tuple[float, float]], less_is_better: bool) -> None:
-    """The Pareto front: the border of what is beaten."""
+    """Draw the Pareto front as a staircase."""
     if len(best) > 1:
         steps = _steps(sorted(best), post=less_is_better)
         axes.plot(*zip(*steps, strict=True), color=INK, linewidth=1, linestyle="--", zorder=1)
 
 
 def _steps(points: list[tuple[float, float]], post: bool) -> list[tuple[float, float]]:
-    """With the corners of a staircase, which keeps to a value after its point or before it."""
+    """Add the corners of a staircase to points. A value holds after its point (`post`) or before it."""
     path = points[:1]
     for (x0, y0), (x1, y1) in pairwise(points):
         path += [(x1, y0) if post else (x0, y1), (x1, y1)]
@@ -150,7 +151,7 @@ def _steps(points: list[tuple[float, float]], post: bool) -> list[tuple[float, f
 
 
 def _dress(axes: "Axes", x: Quantity, y: Quantity) -> None:
-    """Logarithmic costs with plain figures; quality upwards, whichever direction is better."""
+    """Set axes and labels. The axis of costs is logarithmic."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     axes.set_xscale("log")
@@ -166,7 +167,7 @@ def _dress(axes: "Axes", x: Quantity, y: Quantity) -> None:
 
 
 def _ticks(axes: "Axes") -> None:
-    """Few enough figures below the axis not to touch."""
+    """Choose few enough ticks that their labels do not touch."""
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     left, right = axes.get_xlim()
@@ -176,7 +177,7 @@ def _ticks(axes: "Axes") -> None:
 
 
 def _limits(axes: "Axes", ends: list[tuple[float, float]], below: float, less_is_better: bool) -> None:
-    """Room for the labels around the ends, and for the lines down to `below` the worst of them."""
+    """Set limits with space for the labels around the ends, and for the lines down to `below` the worst end."""
     if not ends:
         return
     xs, ys = zip(*ends, strict=True)
@@ -192,10 +193,10 @@ def _limits(axes: "Axes", ends: list[tuple[float, float]], below: float, less_is
 
 
 def place_labels(axes: "Axes", labels: list[Label], size: float) -> None:
-    """Write labels beside their points: none over another or a point, none outside, and off the lines if possible.
+    """Place labels next to their points, without overlaps and inside the axes, and away from lines if possible.
 
-    Each, from the top, takes the best of the places around its point; one that is far gets a line to it. The layout
-    of the figure must be final.
+    From top to bottom, each label takes the best of several positions around its point. A line joins a distant label
+    to its point. The layout of the figure must be final.
     """
     from matplotlib.text import Text
 
@@ -219,7 +220,7 @@ def place_labels(axes: "Axes", labels: list[Label], size: float) -> None:
             zorder=5,
             arrowprops={"arrowstyle": "-", "color": labels[i].color, "linewidth": 0.6, "shrinkA": 1, "shrinkB": 3},
         )
-        extent = Text.get_window_extent(text)  # an annotation's would have its line
+        extent = Text.get_window_extent(text)  # without the line of the annotation
         width, height = extent.width + 4 * unit, extent.height + 2 * unit
 
         def cost(offset: tuple[float, float]) -> float:
@@ -244,7 +245,7 @@ def place_labels(axes: "Axes", labels: list[Label], size: float) -> None:
 
 
 def _along(axes: "Axes", path: Any) -> Array:
-    """Points on a line, in pixels, closer to each other than a letter is high."""
+    """Points on a line, px, closer to each other than the height of a letter."""
     corners = axes.transData.transform(np.asarray(path, dtype=float))
     parts = [np.linspace(a, b, 1 + int(np.hypot(*(b - a)) / 4)) for a, b in pairwise(corners)]
     return np.concatenate([corners, *parts])
@@ -255,14 +256,14 @@ def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float,
 
 
 def _readable(color: str) -> Any:
-    """A colour as text needs it: darker than a line."""
+    """A darker version of a colour, for text."""
     from matplotlib.colors import to_rgb
 
     return tuple(0.72 * channel for channel in to_rgb(color))
 
 
 def read_published() -> dict[str, Any]:
-    """The tables of the original paper, a dictionary of columns for each dataset and method."""
+    """Read the tables of the original paper: a dictionary of columns for each dataset and method."""
     data: dict[str, Any] = json.loads(PUBLISHED.read_text(encoding="utf-8"))
     data["datasets"] = {
         dataset: {name: dict(zip(data["columns"], values, strict=True)) for name, values in methods.items()}
@@ -272,7 +273,7 @@ def read_published() -> dict[str, Any]:
 
 
 def published_chart(metric: str) -> "Figure":
-    """The published figures: quality against training time, a panel per dataset."""
+    """Draw the published figures: quality against training time, one panel per dataset."""
     from matplotlib.figure import Figure
 
     data = read_published()
@@ -298,7 +299,7 @@ def published_chart(metric: str) -> "Figure":
         axes.set_title(dataset, fontsize=10, color=INK, loc="left", fontweight="bold")
     figure.suptitle(
         f"Published: Kerbl et al. 2023, table 1. Other scenes, other hardware ({data['device']}):\n"
-        "compare methods within a panel, not with ours",
+        "compare methods within a panel, not with the other charts",
         fontsize=10,
         color=SOFT,
         x=0.01,
@@ -312,7 +313,7 @@ def published_chart(metric: str) -> "Figure":
 
 
 def published_table() -> list[list[str]]:
-    """A row per method, a column per dataset; the first row is the header."""
+    """Table of the published figures: a row per method, a column per dataset. The first row is the header."""
     data = read_published()
     rows = [["SSIM / PSNR / LPIPS; training, frames/s, memory", *data["datasets"]]]
     for name in next(iter(data["datasets"].values())):

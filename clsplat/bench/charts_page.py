@@ -1,4 +1,4 @@
-"""The charts of `clsplat bench quality` as files, and all of them on one page that needs no network."""
+"""Charts of `clsplat bench quality` as files, and together on one page that needs no network."""
 
 import base64
 import html
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from clsplat.atomic import replacing
 from clsplat.bench.charts import published_chart, published_table, quality_chart
+from clsplat.bench.quality_summary import COSTS, METRICS, failures, measured_metrics, origins, runs, table, verdict
 from clsplat.bench.results import Record
-from clsplat.bench.summary import COSTS, METRICS, failures, measured_metrics, origins, runs, table, verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,19 +22,19 @@ NAMES = {
     "memory_bytes": "memory",
     "fps": "speed",
 }
-"""Cost -> what its charts' files are called after."""
+"""Names of the costs in file names of charts."""
 
 NOTES = {
-    "seconds": "Wall time of training, from its start to its end: without evaluation, without reading the photos and "
-    "building the kernels. On the way, learning rates are those of a training that goes on.",
-    "cpu_seconds": "The same in seconds of all the host's cores: beside other work wall times are longer, these "
-    "hardly. Where a GPU trains, it is the host's part.",
-    "num_gaussians": "At the end of training.",
-    "spz_bytes": "Written as .spz, at the end of training; a .ply has up to ten times as many.",
-    "memory_bytes": "The most that buffers took on the device while it trained, photos included.",
-    "fps": "One over the median time from a held-out camera to its image in the host's memory.",
+    "seconds": "Wall time of the training, without evaluation, reading the photos and building the kernels. Before "
+    "the end, learning rates are those of a training that continues.",
+    "cpu_seconds": "Processor time of the training on all cores of the host. Other work on the machine lengthens "
+    "wall times, but hardly processor times. If a GPU trains, this is the host's part only.",
+    "num_gaussians": "Number at the end of the training.",
+    "spz_bytes": "Size of the .spz file at the end of the training. A .ply file is up to ten times as large.",
+    "memory_bytes": "Peak of the buffers on the device during the training, photos included.",
+    "fps": "Reciprocal of the median time from a held-out camera to its image in the host's memory.",
 }
-"""Cost -> how it is measured."""
+"""Explanation of each cost on the page."""
 
 PAGE = """<!doctype html>
 <html lang="en">
@@ -94,14 +94,14 @@ document.querySelector("nav").onclick = event => {
 
 
 def write_charts(records: list[Record], out: Path) -> None:
-    """Draw every chart that the results allow, as PNG, as SVG and on the page index.html.
+    """Draw all charts of the results, as PNG, as SVG and on the page index.html.
 
     Parameters
     ----------
     records : list of dict
-        Of `clsplat.bench.results.read_records`.
+        Result of `clsplat.bench.results.read_records`.
     out : Path
-        Folder.
+        Folder for the files.
     """
     finished = runs(records)
     metrics = measured_metrics(finished)
@@ -115,13 +115,13 @@ def write_charts(records: list[Record], out: Path) -> None:
         sections.append(_section(NAMES[cost], COSTS[cost].name, NOTES[cost], metrics, shown, table(finished, cost)))
     failed = failures(records)
     if failed:
-        rows = [["training", "why it failed"], *map(list, failed)]
+        rows = [["training", "reason"], *map(list, failed)]
         sections.append(f"<section id=failed><h2>Failed</h2>{_table(rows)}</section>")
     shown = [
         _figure(metric, published_chart(metric if metric != "flip" else "psnr"), out / f"published-{metric}")
         for metric in metrics
     ]
-    note = "Of other scenes, on other hardware: no figure here compares with one above."
+    note = "Measured on other scenes and other hardware: these figures cannot be compared with those above."
     sections.append(_section("published", "Published by Kerbl et al. 2023", note, metrics, shown, published_table()))
     links = {NAMES[cost]: COSTS[cost].name for cost in COSTS if finished}
     links |= {"failed": "failed"} if failed else {}
@@ -148,7 +148,7 @@ def _section(name: str, heading: str, note: str, metrics: list[str], shown: list
 
 
 def _figure(metric: str, figure: "Figure", path: Path) -> str:
-    """Write a chart beside the page as PNG and SVG; the page gets the SVG into itself."""
+    """Write a chart as PNG and SVG, and return the HTML that embeds the SVG in the page."""
     drawn = io.BytesIO()
     figure.savefig(drawn, format="svg", metadata={"Date": None})
     svg = drawn.getvalue()

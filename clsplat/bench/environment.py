@@ -1,4 +1,4 @@
-"""What belongs beside every figure: date, device, driver, software."""
+"""The environment of a measurement: date, device, driver and software."""
 
 import os
 import platform
@@ -12,7 +12,7 @@ from clsplat.device import Device
 
 
 def commit() -> str | None:
-    """Commit of the checkout that this package runs from, with a + if files differ from it; None elsewhere."""
+    """Commit of the checkout that this package runs from, with a + if files differ from it; None if there is none."""
     root = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str:
@@ -29,7 +29,7 @@ def commit() -> str | None:
 
 
 def describe(device: Device) -> dict[str, Any]:
-    """Date, device, driver and software; load: processes that ran when the measurement began (Unix only)."""
+    """Date, device, driver and software. `load` is the load average at the start of the measurement (Unix only)."""
     d = device.cl_device
     return {
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),

@@ -1,4 +1,4 @@
-"""Results of `clsplat bench kernels` as Markdown, which reads well on a terminal too, and as a chart."""
+"""Results of `clsplat bench kernels` as Markdown that is also readable on a terminal, and as a chart."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,11 +11,11 @@ from clsplat.errors import InputError
 Results = dict[str, Any]
 
 COLORS = ("#0072b2", "#e69f00", "#d55e00", "#009e73", "#56b4e9", "#cc79a7", "#8c6d1f", "#888888")
-"""Okabe and Ito's, told apart with any colour vision; in the order of the stages."""
+"""Colours of series, distinguishable with any colour vision (Okabe and Ito)."""
 
 
 def table(rows: Iterable[Iterable[str]]) -> str:
-    """Markdown: the first row is the header; all columns but the first are flush right."""
+    """Markdown table. The first row is the header; all columns except the first are right-aligned."""
     cells = [[str(cell) for cell in row] for row in rows]
     widths = [max(3, *(len(row[i]) for row in cells)) for i in range(len(cells[0]))]
     lines = [
@@ -29,7 +29,7 @@ def table(rows: Iterable[Iterable[str]]) -> str:
 
 
 def milliseconds(value: float) -> str:
-    """A time in milliseconds, to four digits."""
+    """Text of a time in milliseconds, with up to four digits."""
     return f"{value:.3f}" if value < 1 else f"{value:.4g}" if value < 1000 else f"{value:.0f}"
 
 
@@ -38,7 +38,7 @@ def _percent(fraction: float) -> str:
 
 
 def origin(results: Results) -> list[str]:
-    """Device, driver, software, date and load of a measurement, a line each."""
+    """Device, driver, software, date and load of a measurement, one line each."""
     device, software = results["device"], results["software"]
     facts = [
         f"{device['label']}, {device['compute_units']} compute units",
@@ -47,12 +47,12 @@ def origin(results: Results) -> list[str]:
         f"measured {results['date']}, {results['settings']['repeats']} repeats",
     ]
     if results["load"] is not None:
-        facts.append(f"{results['load']:.2f} processes ran on the machine before it")
+        facts.append(f"load average of the machine before the measurement: {results['load']:.2f}")
     return facts
 
 
 def summary(results: Results) -> str:
-    """The device, what it can do, and a row for each workload."""
+    """The device, its limits, and a table with a row for each workload."""
     settings, roof = results["settings"], results["roof"]
     facts = origin(results)
     facts.append(f"compositor {settings['compositor']}, tiles of {settings['tile_size']} px")
@@ -101,7 +101,7 @@ def summary(results: Results) -> str:
 
 
 def details(workload: Results) -> str:
-    """A workload's counts and its stages; below each stage its kernels, where there are several."""
+    """Counts of a workload, and a table of its stages. A stage with several kernels is followed by a row for each."""
     counts, pixels = workload["counts"], workload["width"] * workload["height"]
     text = (
         f"{workload['name']}: {workload['gaussians']:,} Gaussians ({counts['visible']:,} visible, SH degree "
@@ -142,7 +142,7 @@ def scaling_chart(results: Results, figure: Any) -> None:
     Parameters
     ----------
     results : dict
-        Of `clsplat.bench.kernels.bench_kernels`, with the workloads of `scaling_names`.
+        Result of `clsplat.bench.kernels.bench_kernels` for the workloads of `scaling_names`.
     figure : matplotlib.figure.Figure
         Empty, about 10 by 4.5 inches.
     """
@@ -166,7 +166,7 @@ def scaling_chart(results: Results, figure: Any) -> None:
         for stage, color in zip(stages, COLORS, strict=False):
             y = [w["stages"][stage]["median_ms"] for w in workloads]
             axes.loglog(x, y, color=color, linewidth=1.4, marker="o", markersize=3, label=stage)
-        # In proportion to x, from the last step downwards.
+        # A line proportional to x through the time of the last step.
         axes.loglog(
             x, [steps[-1] * value / x[-1] for value in x], color="0.75", linestyle="--", label="in proportion"
         )
@@ -184,12 +184,12 @@ def scaling_chart(results: Results, figure: Any) -> None:
 
 
 def chart_title(results: Results) -> str:
-    """What a chart's file says it shows: device and date of the results."""
+    """Title in the metadata of a chart's file: device and date of the results."""
     return f"{results['benchmark']}: {results['device']['label']}, {results['date']}"
 
 
 def save_scaling_chart(results: Results, path: Path) -> None:
-    """Write `scaling_chart` to a file in the format of its suffix, one that matplotlib knows.
+    """Write `scaling_chart` to a file, in the format of its suffix.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Timings of training's step, of its stages and of their kernels, and what part of the device's limits they reach."""
+"""Timings of a training step, its stages and their kernels, and the fractions of the device's limits they reach."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
@@ -20,14 +20,14 @@ from clsplat.stages import FUNCTIONS
 from clsplat.training.loop import Training
 
 WARM_UP = 2
-"""Steps of each kind before those that count: they build kernels and fill the pool of buffers."""
+"""Number of untimed steps of each kind at the start. They build kernels and fill the pool of buffers."""
 
 REAL = 4
-"""Bytes of a real number."""
+"""Size of a real number, bytes."""
 
 
 class _Spent:
-    """Time and calls of what has been watched, by name, in the order of first calls."""
+    """Time and number of calls of stages or kernels by name, in the order of first calls."""
 
     def __init__(self) -> None:
         self.time: defaultdict[str, Clock] = defaultdict(lambda: np.zeros(2))
@@ -70,13 +70,15 @@ def _watched(training: Training, kernels: bool) -> Iterator[_Spent]:
 
 
 def stage_bytes(n: int, sh_degree: int, pixels: int, intersections: int) -> dict[str, int]:
-    """Bytes that a stage bound by memory must move: each input read once, each result written once.
+    """Smallest number of bytes that each memory-bound stage moves: it reads each input and writes each result once.
 
     Parameters
     ----------
     n : int
-        Gaussians.
-    sh_degree, pixels, intersections : int
+        Number of Gaussians.
+    sh_degree : int
+    pixels, intersections : int
+        Numbers of pixels and of intersections of splats with tiles.
     """
     parameters, splat, splat_grads = 11 + 3 * (sh_degree + 1) ** 2, 12, 9
     return {
@@ -84,7 +86,7 @@ def stage_bytes(n: int, sh_degree: int, pixels: int, intersections: int) -> dict
         "bin_splats": REAL * (n * 9 + 2 * intersections),  # without colours; gauss_ids and slots
         "l1_ssim": pixels * (3 * REAL + 3 + 3 * REAL),  # image, photo in 8 bits, gradient
         "observe": REAL * n * 8,  # extents and gradient; both statistics, read and written
-        # Splats' gradients; extents, conics, colours; parameters and both moments, read and written.
+        # Gradients of the splats; extents, conics, colours; parameters and both moments, read and written.
         "project_bwd_adam": REAL * n * (splat_grads + 8 + 6 * parameters),
     }
 
@@ -103,14 +105,14 @@ def _roof_fraction(name: str, result: dict[str, Any], accepted: int, roof: dict[
 
 
 def bench_workload(workload: Workload, render: RenderConfig, device: Device, repeats: int) -> dict[str, Any]:
-    """Time training's step on a workload, as a whole and by stages and kernels, in turn.
+    """Time a training step on a workload. Whole steps, steps by stages and steps by kernels alternate.
 
     Returns
     -------
     dict
-        name, gaussians, width, height, sh_degree, counts; step: a summary; stages: by function of `clsplat.ops`,
-        each with the summaries of its kernels. A summary holds median_ms, q1_ms and q3_ms, on CPUs also cpu_ms, the
-        CPU time over the number of cores.
+        name, gaussians, width, height, sh_degree, counts; step: a summary; stages: summaries by function of
+        `clsplat.ops`, each with the summaries of its kernels. A summary holds median_ms, q1_ms and q3_ms, and on CPUs
+        cpu_ms, the CPU time divided by the number of cores.
     """
     gaussians, view = workload.gaussians, workload.view
     config = TrainConfig(strategy="adc", size="fixed", render=render, optim=STILL)
@@ -145,13 +147,7 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
             steps.append(whole)
 
     cores = device.cl_device.max_compute_units if device.is_cpu else None
-    stages: dict[str, dict[str, Any]] = {}
-    for name, clocks in samples.items():
-        stage, _, kernel = name.partition("/")
-        if kernel:
-            stages[stage]["kernels"][kernel] = {"launches": calls[name], **quartiles(clocks, cores)}
-        else:
-            stages[stage] = {**quartiles(clocks, cores), "kernels": {}}
+    stages = _stages(samples, calls, cores)
     pixels = view.camera.width * view.camera.height
     for name, moved in stage_bytes(len(gaussians), gaussians.sh_degree, pixels, counts["intersections"]).items():
         if name in stages:
@@ -169,6 +165,20 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
     }
 
 
+def _stages(
+    samples: Mapping[str, list[Clock]], calls: Mapping[str, int], cores: int | None
+) -> dict[str, dict[str, Any]]:
+    """Summaries of the stages with those of their kernels. The name of a kernel in `samples` is STAGE/KERNEL."""
+    stages: dict[str, dict[str, Any]] = {}
+    for name, clocks in samples.items():
+        stage, _, kernel = name.partition("/")
+        if kernel:
+            stages[stage]["kernels"][kernel] = {"launches": calls[name], **quartiles(clocks, cores)}
+        else:
+            stages[stage] = {**quartiles(clocks, cores), "kernels": {}}
+    return stages
+
+
 def bench_kernels(
     workloads: list[Workload],
     render: RenderConfig,
@@ -182,17 +192,17 @@ def bench_kernels(
     ----------
     workloads : list of Workload
     render : RenderConfig
-        Mode, tile size and compositor; the mode of a workload from a file comes first.
+        Mode, tile size and compositor. The mode of a workload from a file takes precedence.
     device : Device
     repeats : int
-        Steps of each kind (whole, by stages, by kernels) that count; at least 1.
+        Number of timed steps of each kind (whole, by stages, by kernels), at least 1.
     progress : callable
-        Told what is being done.
+        Receives the name of each measurement before it starts.
 
     Returns
     -------
     dict
-        What `clsplat bench kernels -o FILE` writes: device, software, date, settings, roof, workloads.
+        Content of the file of `clsplat bench kernels -o FILE`: device, software, date, settings, roof, workloads.
     """
     results: dict[str, Any] = {
         "benchmark": "kernels",
@@ -216,5 +226,5 @@ def bench_kernels(
 
 
 def _better(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:
-    """The better of two measurements of the roof: rates count upwards, times downwards."""
+    """The better values of two measurements of the roof: the higher rates and the shorter times."""
     return {key: min(a[key], b[key]) if key.endswith("_us") else max(a[key], b[key]) for key in a}

@@ -9,13 +9,13 @@ from clsplat.bench.kernel_report import COLORS, Results, chart_title, millisecon
 PANELS = (("render", "rendering"), ("step", "a step of training"))
 
 FLOOR = 1e-9
-"""Smaller errors are drawn here, as triangles: float64's is of 1e-16."""
+"""Smallest error on the chart. Smaller ones, such as that of float64, are drawn here as triangles."""
 
 TICKS = (0.1, 0.2, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
 
 
 def knobs_text(results: Results) -> str:
-    """What was measured on, and a table for each workload."""
+    """Environment of the measurement, and a table for each workload."""
     parts = ["\n".join(f"- {fact}" for fact in origin(results))]
     for w in results["workloads"]:
         title = (
@@ -43,17 +43,17 @@ def _row(result: Results, results: Results) -> list[str]:
 
 
 def knobs_chart(workload: Results, figure: Any) -> None:
-    """Draw the error of every setting against its time, rendering on the left, training on the right.
+    """Draw the error of every setting against its time: rendering on the left, training on the right.
 
     Parameters
     ----------
     workload : dict
-        An entry of the workloads of `clsplat.bench.knobs.bench_knobs`.
+        An entry of `workloads` in the result of `clsplat.bench.knobs.bench_knobs`.
     figure : matplotlib.figure.Figure
         Empty, about 13 by 6 inches.
     """
     knobs = list(dict.fromkeys(r["knob"] for r in workload["results"]))
-    # The ninth is training's alone, the first rendering's and training's: labels tell them apart.
+    # Colours repeat after eight settings. The labels distinguish them.
     colors = dict(zip(knobs, ("black", *COLORS, *COLORS), strict=False))
     for axes, (job, title) in zip(figure.subplots(1, 2), PANELS, strict=True):
         axes.axvline(1, color="0.8", linewidth=1, zorder=0)
@@ -62,14 +62,14 @@ def knobs_chart(workload: Results, figure: Any) -> None:
             x, rms, color = r[job]["ratio"], r["error"]["rms"], colors[r["knob"]]
             axes.loglog(x, max(rms, FLOOR), color=color, marker="o" if rms > FLOOR else "v", markersize=5)
             points.append((max(rms, FLOOR), x, f"{r['knob']} {r['value']}".rstrip(), color))
-        # Of equal errors the slowest is the lowest: lines to the labels do not cross.
+        # Among equal errors, the slowest label is the lowest, so that the lines to the labels do not cross.
         for i, (y, x, name, color) in enumerate(sorted(points, key=lambda p: (float(f"{p[0]:.1e}"), -p[1]))):
             line = {"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.5, "relpos": (0, 0.5)}
             at = (1.06, (i + 0.5) / len(points))
             text = {"fontsize": 8, "color": color, "va": "center"}
             axes.annotate(name, (x, y), at, textcoords="axes fraction", arrowprops=line, **text)
         axes.set_title(title, fontsize=10)
-        axes.set_xlabel("time, of the default's")
+        axes.set_xlabel("time relative to the default")
         axes.set_ylim(FLOOR / 2, 1)
         axes.xaxis.set_major_formatter("{x:g}")
         axes.minorticks_off()
@@ -81,7 +81,7 @@ def knobs_chart(workload: Results, figure: Any) -> None:
 
 
 def save_knobs_chart(results: Results, path: Path) -> None:
-    """Write `knobs_chart` of the first workload to a file in the format of its suffix, one that matplotlib knows."""
+    """Write `knobs_chart` of the first workload to a file, in the format of its suffix."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 6.5), dpi=150, layout="constrained")

@@ -1,4 +1,4 @@
-"""What each knob of the renderer buys in time and costs in accuracy, one turned at a time."""
+"""Time and accuracy of the renderer's settings, called knobs, of which one is changed at a time."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
@@ -20,20 +20,20 @@ from clsplat.renderer import Renderer, download
 
 ALPHA_MINS = (0.5 * ALPHA_MIN, 2 * ALPHA_MIN, 4 * ALPHA_MIN, 8 * ALPHA_MIN)
 TRANSMITTANCE_MINS = (0.1 * TRANSMITTANCE_MIN, 10 * TRANSMITTANCE_MIN, 100 * TRANSMITTANCE_MIN)
-"""Values beside the default: one more careful, the others ever less."""
+"""Values other than the default: one more accurate, the others less and less accurate."""
 
 RENDER_KNOBS = ("tile_size", "sort", "compositor", "mode")
-"""Fields of RenderConfig: each of their values is a setting."""
+"""Fields of RenderConfig that are knobs. Each of their values is a setting."""
 
 WARM_UP = 1
-"""Runs of each kind before those that count: they build kernels and fill the pool of buffers."""
+"""Number of untimed runs of each kind at the start. They build kernels and fill the pool of buffers."""
 
 Image = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One position of one knob; everything else is as in the base."""
+    """One value of one knob. All other settings are those of the base."""
 
     knob: str
     value: str
@@ -45,23 +45,23 @@ class Setting:
 
     @property
     def renders(self) -> bool:
-        """Whether rendering knows the knob."""
+        """Whether the knob affects rendering."""
         return self.optimizer == "device"
 
     @property
     def trains(self) -> bool:
-        """Whether training does: it has no float64."""
+        """Whether training supports the setting: it has no float64."""
         return self.real == "float32"
 
 
 def settings(base: RenderConfig, sh_degree: int, device: Device) -> Iterator[Setting]:
-    """The base, then every other position of every knob that the device has.
+    """Yield the base, then every other value of every knob that the device supports.
 
     Parameters
     ----------
     base : RenderConfig
     sh_degree : int
-        Stored with the Gaussians.
+        Degree of the Gaussians' spherical harmonics.
     device : Device
     """
     yield Setting("default", "", base)
@@ -84,7 +84,7 @@ def settings(base: RenderConfig, sh_degree: int, device: Device) -> Iterator[Set
 
 
 class _Run:
-    """A setting's two jobs on a workload, ready to be timed: rendering its view, and a step of training."""
+    """The two jobs of a setting on a workload that are timed: rendering its view, and a training step."""
 
     def __init__(self, setting: Setting, workload: Workload, device: Device) -> None:
         gaussians = workload.gaussians
@@ -101,20 +101,20 @@ class _Run:
             self.step = partial(run_step, training)
 
     def render(self) -> Any:
-        """The image, on the device and finished."""
+        """Render the image on the device, and wait until it is finished."""
         run = self.renderer.forward(self.gaussians, self.camera, gradients=False)
         self.device.queue.finish()
         return run.image.rgb
 
 
 def twin_image(gaussians: Gaussians, workload: Workload, base: RenderConfig) -> Image:
-    """What everything is held against: the float64 twin with the default constants and all spherical harmonics."""
+    """Image for all comparisons: the float64 twin with default constants and all spherical harmonics."""
     image: Image = Renderer("reference", base).forward(gaussians, workload.view.camera, gradients=False).image.rgb
     return image
 
 
 def error(image: NDArray[Any], truth: Image) -> dict[str, float]:
-    """Largest and root-mean-square difference of an image from the twin's, neither clamped, and PSNR in dB."""
+    """Largest and root-mean-square difference, and PSNR, dB, of an image from the twin's. Neither is clamped."""
     difference = np.abs(image - truth)
     rms = float(np.sqrt(np.mean(difference**2)))
     return {"max_abs": float(difference.max()), "rms": rms, "psnr": float(-20 * np.log10(max(rms, 1e-300)))}
@@ -123,16 +123,16 @@ def error(image: NDArray[Any], truth: Image) -> dict[str, float]:
 def bench_workload(
     workload: Workload, base: RenderConfig, device: Device, repeats: int, progress: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Time and error of every setting on a workload.
+    """Measure time and error of every setting on a workload.
 
-    A setting is timed in turn with the default, so that what else the machine does meets both: `ratio` is the median
-    of the quotients of neighbouring runs.
+    Runs of a setting and of the default alternate, so that other work on the machine affects both. `ratio` is the
+    median of the quotients of neighbouring runs.
 
     Returns
     -------
     dict
         name, gaussians, width, height, sh_degree, mode; results: per setting knob, value, render and step (each a
-        summary as of `clsplat bench kernels`, and ratio; null where the job does not know the knob), error (max_abs,
+        summary as of `clsplat bench kernels`, and ratio; null if the knob does not apply to the job), error (max_abs,
         rms, psnr).
     """
     gaussians, camera = workload.gaussians, workload.view.camera
@@ -163,7 +163,7 @@ def bench_workload(
 def _paired(
     reference: Callable[[], Any], job: Callable[[], Any], repeats: int, cores: int | None
 ) -> dict[str, float]:
-    """Quartiles of a job's times, and the median of its time over that of the reference run before it."""
+    """Quartiles of a job's times, and the median of its time divided by that of the preceding reference run."""
     samples: list[Clock] = []
     quotients = []
     for repeat in range(-WARM_UP, repeats):
@@ -174,7 +174,7 @@ def _paired(
         end = clock()
         if repeat >= 0:
             samples.append(end - middle)
-            # CPU time where it counts the device's work: what else runs on the machine does not add to it.
+            # If the device is a CPU, compare CPU times: other work on the machine does not add to them.
             which = 0 if cores is None else 1
             quotients.append((end - middle)[which] / (middle - start)[which])
     return {**quartiles(samples, cores), "ratio": round(float(np.median(quotients)), 4)}
@@ -187,23 +187,23 @@ def bench_knobs(
     repeats: int,
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Turn every knob of the renderer on every workload.
+    """Measure every setting of every knob on every workload.
 
     Parameters
     ----------
     workloads : list of Workload
     render : RenderConfig
-        What the knobs are turned from; the mode of a workload from a file comes first.
+        The default that single knobs are changed from. The mode of a workload from a file takes precedence.
     device : Device
     repeats : int
-        Runs of each kind that count; at least 1.
+        Number of timed runs of each kind, at least 1.
     progress : callable
-        Told what is being done.
+        Receives the name of each measurement before it starts.
 
     Returns
     -------
     dict
-        What `clsplat bench knobs -o FILE` writes: device, software, date, settings, workloads.
+        Content of the file of `clsplat bench knobs -o FILE`: device, software, date, settings, workloads.
     """
     results: dict[str, Any] = {
         "benchmark": "knobs",

@@ -1,4 +1,4 @@
-"""The file of results that `clsplat bench quality` grows: a JSON object per line."""
+"""The file of results of `clsplat bench quality`: one JSON object per line."""
 
 import json
 from pathlib import Path
@@ -10,28 +10,28 @@ from clsplat.errors import InputError
 Record = dict[str, Any]
 
 FILE = "results.jsonl"
-"""Its name in the folder of a bench."""
+"""Name of the file."""
 
 KEYS = ("scene", "method", "max_gaussians", "iterations", "device")
-"""What every record has; records that agree in all of these belong to one training."""
+"""Entries of every record. Records that agree in all of them belong to one training."""
 
 
 def read_records(path: Path) -> list[Record]:
-    """The records in a file; none where there is no file.
+    """Read the records of a file; an empty list if the file does not exist.
 
-    A last line without its end is left out: a bench was interrupted while it wrote it.
+    A last line without a line end is ignored: the bench was interrupted while it wrote the line.
 
     Raises
     ------
     InputError
-        If the file cannot be read, or a line is no record.
+        If the file cannot be read, or a line is not a record.
     """
     if not path.exists():
         return []
     try:
         lines = path.read_text(encoding="utf-8").split("\n")[:-1]
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected results that can be read, found: {error}") from error
+        raise InputError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from error
     records = []
     for number, line in enumerate(lines, start=1):
         try:
@@ -45,12 +45,12 @@ def read_records(path: Path) -> list[Record]:
 
 
 def append_record(path: Path, record: Record) -> None:
-    """Add a line at once: what is measured is not lost when the bench is killed."""
+    """Append a record to the file immediately, so that it is not lost if the bench is killed."""
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(record, allow_nan=False) + "\n")
 
 
 def write_records(path: Path, records: list[Record]) -> None:
-    """Write all records in the place of those that are there."""
+    """Replace the records of a file."""
     with replacing(path) as file:
         file.writelines((json.dumps(record, allow_nan=False) + "\n").encode() for record in records)

@@ -1,4 +1,4 @@
-"""The device's limits, measured: what the fractions of `clsplat.bench` are fractions of."""
+"""Measurement of the device's limits, to which `clsplat bench kernels` relates its times."""
 
 import time
 from collections.abc import Callable
@@ -6,27 +6,27 @@ from collections.abc import Callable
 from clsplat.device import Device
 
 CHAINS = 16
-"""Independent values per work-item, as in cl/roof.cl."""
+"""Number of independent values per work-item, as in cl/roof.cl."""
 
 BUFFER_BYTES = 512 * 2**20
-"""Size of each buffer for bandwidth, memory permitting: beyond the caches of all devices but a few CPUs, whose last
-level may hold part of it."""
+"""Size of each buffer for bandwidth, bytes, if memory permits. It exceeds the caches of all devices, except for a few
+CPUs whose last level holds part of it."""
 
 MEMORY_SHARE = 16
-"""Each buffer takes at most one part in so many of the device's memory."""
+"""Ratio of the device's memory to the largest size of a buffer."""
 
 SECONDS = 0.02
-"""A measured run lasts at least this long: a thousand times what a launch costs."""
+"""Shortest time of a measured run, s: about a thousand times that of a launch."""
 
 RUNS = 5
-"""The best of so many runs counts: a roof is what nothing disturbed."""
+"""Number of runs, of which the fastest counts: a limit is what an undisturbed run reaches."""
 
 LAUNCHES = 1000
-"""Launches of the empty kernel that are queued one after the other."""
+"""Number of launches of the empty kernel in a row."""
 
 
 def _best(device: Device, run: Callable[[], None], runs: int) -> float:
-    """Seconds of the fastest of some runs, after one that builds the kernel and touches the memory."""
+    """Time of the fastest run, s, after a first one that builds the kernel and touches the memory."""
     seconds = []
     for _ in range(runs + 1):
         start = time.perf_counter()
@@ -37,13 +37,13 @@ def _best(device: Device, run: Callable[[], None], runs: int) -> float:
 
 
 def defines(device: Device, width: int) -> dict[str, int]:
-    """Those of cl/roof.cl for vectors of a width."""
+    """Defines of cl/roof.cl for vectors of the given width."""
     return {"WIDTH": width, "HALVES": int(device.vector_width < width)}
 
 
 def _arithmetic(device: Device, kernel: str, *scalars: float) -> float:
-    """Results per second."""
-    # A CPU's core wants wide vectors, a GPU scalar work-items in great number.
+    """Number of results per second."""
+    # CPU cores are fastest with wide vectors, GPUs with many scalar work-items.
     width, group = (16, 1) if device.is_cpu else (1, 256)
     items = (4 if device.is_cpu else 2048) * device.cl_device.max_compute_units
     out = device.empty("roof", items * width)
@@ -60,7 +60,7 @@ def _arithmetic(device: Device, kernel: str, *scalars: float) -> float:
 
 
 def _bandwidth(device: Device, kernel: str, buffers: int, *scalars: float) -> tuple[float, int]:
-    """Bytes per second read and written, and the size of each buffer."""
+    """Bytes read and written per second, and the size of each buffer, bytes."""
     width, group = (16, 1) if device.is_cpu else (4, 256)
     items = (4 if device.is_cpu else 2048) * device.cl_device.max_compute_units
     limit = min(BUFFER_BYTES, device.cl_device.global_mem_size // MEMORY_SHARE, device.cl_device.max_mem_alloc_size)
@@ -82,9 +82,9 @@ def measure_roof(device: Device) -> dict[str, float]:
     Returns
     -------
     dict
-        fma_gflops: multiply-adds, each counted as two operations, in 1e9/s; exp_gops, exp2_gops: 1e9/s;
-        copy_gbs, triad_gbs: 1e9 bytes/s read and written; buffer_mib: size of each buffer of theirs;
-        launch_us: an empty kernel and waiting for it; queued_launch_us: one of many empty kernels in a row.
+        fma_gflops: multiply-adds, each counted as two operations, in 1e9/s; exp_gops, exp2_gops: 1e9/s; copy_gbs,
+        triad_gbs: 1e9 bytes/s read and written; buffer_mib: size of each of their buffers; launch_us: time of an
+        empty kernel and of waiting for it; queued_launch_us: time of one of many empty kernels in a row.
     """
     out = device.empty("roof", 64)
 

@@ -1,4 +1,4 @@
-"""Clocks, what becomes of their readings, and the training step that is timed."""
+"""Clocks, quartiles of their readings, and the training step that is timed."""
 
 import time
 
@@ -17,22 +17,23 @@ from clsplat.training.state import State
 from clsplat.training.step import step
 
 ITERATION = 3001
-"""Of a default run: all bands of the spherical harmonics are trained, densification watches, and no edit is due."""
+"""Iteration of a default run that is timed: it trains all bands of the spherical harmonics and collects the
+statistics of densification, and no edit is due."""
 
 STILL = OptimConfig(1e-30, 1e-30, 1e-30, 1e-30, 1e-30, 1e-30, 1e-30)
-"""Learning rates that leave every parameter as it is, so that all steps of a measurement do the same work."""
+"""Learning rates that change no parameter, so that all steps of a measurement do the same work."""
 
-# Wall time, CPU time of the process, both in seconds.
+# Wall time and CPU time of the process, s.
 Clock = NDArray[np.float64]
 
 
 def clock() -> Clock:
-    """Now."""
+    """Current readings of both clocks."""
     return np.array([time.perf_counter(), time.process_time()])
 
 
 def quartiles(samples: list[Clock], cores: int | None) -> dict[str, float]:
-    """Median and quartiles of wall times; median CPU time per core where the device's cores are the host's."""
+    """Median and quartiles of wall times, ms. If the device is the host's CPU, also the median CPU time per core."""
     wall, cpu = 1e3 * np.array(samples).T
     q1, median, q3 = np.percentile(wall, [25, 50, 75])
     result = {"median_ms": median, "q1_ms": q1, "q3_ms": q3}

@@ -1,4 +1,4 @@
-"""What is timed: Gaussians and a view of them, synthetic or from files."""
+"""Workloads of measurements: Gaussians and a view of them, synthetic or from files."""
 
 import re
 from dataclasses import dataclass
@@ -14,29 +14,32 @@ from clsplat.scene import View
 
 DEFAULT = ("10k-640x480", "100k-640x480", "1M-640x480", "100k-1280x720")
 KNOBS_DEFAULT = "100k-640x480"
-"""What is timed unless told otherwise."""
+"""Default workloads of `clsplat bench kernels` and `clsplat bench knobs`."""
 
 SCALING_GAUSSIANS = ("10k", "30k", "100k", "300k", "1M")
 SCALING_SIZES = ("160x120", "320x240", "640x480", "1280x960", "1920x1440")
-"""Of the charts: time against Gaussians at the third size, and against pixels with the third number of Gaussians."""
+"""Workloads of the scaling chart: time against Gaussians at the third size, and time against pixels with the third
+number of Gaussians."""
 
 REFERENCE_COUNT = 100_000
 SIZE_MEDIAN = 2.35
 SIZE_SPREAD = 0.5
 OPACITY_LOGIT_MEAN = -0.2
 OPACITY_LOGIT_SPREAD = 2.0
-"""With so many Gaussians at 640x480: median of their standard deviations in pixels, spread of its logarithm, mean and
-spread of the logit of their opacities. Found by trial: 62 drawn pairs per pixel and 365 000 intersections with tiles
-of 16x16, near what trained scenes have (Mip-NeRF 360's garden with 112 000 points at 648x420: 48 pairs)."""
+"""Synthetic scenes, at REFERENCE_COUNT Gaussians and 640x480 px: median of the Gaussians' standard deviations, px,
+spread of its logarithm, and mean and spread of the logit of the opacities. Found by trial, so that the numbers of
+pairs per pixel and of intersections are similar to those of trained scenes (docs/benchmarks.md)."""
 
 SEED = 0
+"""Seed of the random numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """A view of some Gaussians; its photo is what training compares with.
+    """A view of Gaussians, with the photo for the training step.
 
-    extent: of the scene, in world units; mode: what the Gaussians were trained for, if a file says it.
+    `extent` is the extent of the scene, world units. `mode` is the mode that the Gaussians were trained for, if
+    known.
     """
 
     name: str
@@ -47,21 +50,22 @@ class Workload:
 
 
 def scaling_names() -> list[str]:
-    """Workloads of the charts."""
+    """Names of the workloads of the scaling chart."""
     names = [f"{count}-{SCALING_SIZES[2]}" for count in SCALING_GAUSSIANS]
     return names + [f"{SCALING_GAUSSIANS[2]}-{size}" for size in SCALING_SIZES if size != SCALING_SIZES[2]]
 
 
 def synthetic(name: str) -> Workload:
-    """The synthetic workload of a name such as 100k-640x480: number of Gaussians, width and height.
+    """The synthetic workload with a name such as 100k-640x480: number of Gaussians, width and height.
 
-    The scene depends on the number alone: other sizes see it at another resolution, flatter ones less of its height.
-    More Gaussians are smaller in proportion, as in a scene that is densified, so that pairs per pixel stay alike.
+    The scene depends only on the number. Other image sizes show it at another resolution, and flatter images show
+    less of its height. With more Gaussians, each is smaller, as in a densified scene, so that the number of pairs per
+    pixel stays similar.
 
     Raises
     ------
     InputError
-        If the name is of another form.
+        If the name has another form.
     """
     match = re.fullmatch(r"([1-9]\d*)(k|M)?-([1-9]\d*)x([1-9]\d*)", name)
     if match is None:
@@ -70,7 +74,7 @@ def synthetic(name: str) -> Workload:
         )
     n = int(match[1]) * {None: 1, "k": 1000, "M": 1_000_000}[match[2]]
     width, height = int(match[3]), int(match[4])
-    # A focal length of one width shows x/z and 4/3 y/z from -1/2 to 1/2 where the image is 4:3.
+    # With a focal length of one width, a 4:3 image shows x/z and 4/3 y/z from -1/2 to 1/2.
     camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), width, width, height)
     rng = np.random.default_rng(SEED)
     photo = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
@@ -81,7 +85,7 @@ def _scene(n: int) -> Gaussians:
     rng = np.random.default_rng(SEED)
     depths = rng.uniform(2, 6, (n, 1))
     slopes = rng.uniform(-0.5, 0.5, (n, 2)) * [1, 0.75]
-    # The width of the image is one focal length and, in the reference, 640 pixels.
+    # The width of the image is one focal length, which is 640 px in the reference.
     median = SIZE_MEDIAN / 640 * np.sqrt(REFERENCE_COUNT / n)
     sh = rng.normal(0, 0.1, (n, 16, 3))
     sh[:, 0] = rng.normal(0, 0.8, (n, 3))
@@ -95,18 +99,18 @@ def _scene(n: int) -> Gaussians:
 
 
 def from_files(scene: Path, cameras: Path, views: int, data: DataConfig) -> list[Workload]:
-    """Workloads of a trained scene: views spread evenly over a dataset's.
+    """Workloads of a trained scene, with views spread evenly over those of a dataset.
 
     Parameters
     ----------
     scene : Path
         File of Gaussians.
     cameras : Path
-        Dataset, as `clsplat.dataset.load_scene` takes it.
+        Dataset, as for `clsplat.dataset.load_scene`.
     views : int
-        How many of its views, at most; at least 1.
+        Largest number of views, at least 1.
     data : DataConfig
-        How the photos are read.
+        Options for reading the photos.
 
     Raises
     ------
@@ -121,7 +125,7 @@ def from_files(scene: Path, cameras: Path, views: int, data: DataConfig) -> list
     gaussians, mode, offset = load_gaussians(scene)
     dataset = load_scene(cameras, data)
     gaussians.means[:] = gaussians.means + (offset - dataset.offset)
-    # The middles of equal parts.
+    # The middle view of each of `views` equal parts.
     chosen = sorted({int((i + 0.5) * len(dataset.train) / views) for i in range(views)})
     return [
         Workload(f"{scene.stem}: {dataset.train[i].name}", gaussians, dataset.train[i], dataset.extent, mode)

@@ -74,7 +74,7 @@ def scene_lines(path: Path) -> list[str]:
 
 def run_lines(folder: Path) -> list[str]:
     """What `info` says about a folder that `train` has written, finished or not."""
-    from clsplat.show.evaluation_page import read_log
+    from clsplat.show.training_curve import read_log
     from clsplat.training.presets import DATA_PATH
 
     last = read_log(folder / "log.jsonl")[-1]

@@ -146,7 +146,7 @@ def train_and_report(
     """Train with a progress bar; write scene.ply, the evaluation and the training curve to `out`."""
     from clsplat.formats import save_gaussians
     from clsplat.renderer import Renderer
-    from clsplat.show.evaluation_page import training_curve
+    from clsplat.show.training_curve import training_curve
 
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     gaussians = train_with_progress(scene, config, renderer, out, resume, viewer)
@@ -245,7 +245,7 @@ class Demo:
         """Run the command."""
         from clsplat.demo import make_photos
         from clsplat.render import render_views
-        from clsplat.show.evaluation_page import side_by_side
+        from clsplat.show.pictures import side_by_side
         from clsplat.training.preparation import prepare
 
         if self.out.exists() and any(self.out.iterdir()):

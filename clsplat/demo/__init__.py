@@ -1,7 +1,7 @@
 """Ray-traced photos of a still life, with known cameras and geometry: a scene that needs no download.
 
-Belongs here: the photos and what makes them. Does not belong here: splatting; nothing but the camera is shared with
-it, so that the photos can test it.
+Belongs here: the photos, and the ray tracer that makes them. Does not belong here: splatting. The two share only the
+camera, so that the photos can test the splatting.
 """
 
 from clsplat.demo.known_photos import known_scene, make_photos

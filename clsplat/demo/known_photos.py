@@ -1,4 +1,4 @@
-"""The demonstration that needs no download: photos of a scene made of formulas, and training on them."""
+"""Photos of the still life from known cameras: as files, or as a scene in memory."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -9,23 +9,25 @@ import numpy as np
 
 from clsplat.atomic import replacing
 from clsplat.camera import Camera
-from clsplat.demo.ray_tracer import Array, Solid, bake, camera_rays, radiance, trace
+from clsplat.demo.ray_tracer import Solid, bake, camera_rays, radiance, trace
+from clsplat.demo.shapes import Array
 from clsplat.demo.still_life import still_life
 from clsplat.errors import InputError
 from clsplat.scene import Scene, View
 
 SENSOR_NOISE = 0.005
-"""Standard deviation in sRGB of full scale 1: a good camera in daylight."""
+"""Standard deviation of the sensor's noise, in sRGB of full scale 1: a good camera in daylight."""
 
 TILE = 128
-"""Edge in rays of the squares of a photo that are traced at once: their arrays stay in a core's cache."""
+"""Edge of the squares of a photo that are traced at once, rays. Their arrays fit into a core's cache."""
 
 FOCAL_35MM = 35
-"""Focal length in millimetres of the 35 mm camera with the same diagonal field of view: all that EXIF knows of it."""
+"""Focal length of the 35 mm camera with the same diagonal field of view, mm. The EXIF data of the photos contain
+it."""
 
 
 def viewpoints(count: int, width: int, height: int, rng: np.random.Generator) -> list[Camera]:
-    """Cameras on one and a half rings around the scene: two thirds on a low one, the others on a high one."""
+    """Cameras around the scene: two thirds on a low ring, the others on a high ring."""
     fx = FOCAL_35MM * np.hypot(width, height) / np.hypot(36, 24)
     low = count - count // 3
     turns = np.concatenate([np.arange(low) / low, (np.arange(count - low) + 0.25) / max(count - low, 1)])
@@ -39,9 +41,10 @@ def viewpoints(count: int, width: int, height: int, rng: np.random.Generator) ->
 
 
 def expose(rgb: Array) -> Array:
-    """sRGB in [0, 1] of linear radiance, highlights rolled off more mildly than by Reinhard et al. 2002, eq. 4.
+    """Convert linear radiance to sRGB in [0, 1].
 
-    The three numbers were chosen by eye: sunlit white cloth stays below 1, shadows keep their colours.
+    Highlights are compressed less than by Reinhard et al. 2002, equation 4. The three numbers were chosen by eye:
+    sunlit white cloth stays below 1, and shadows keep their colours.
     """
     x = 0.62 * rgb
     x = np.clip(x * (1 + x / 4) / (1 + 0.55 * x), 0, 1)
@@ -49,7 +52,10 @@ def expose(rgb: Array) -> Array:
 
 
 def take_photo(camera: Camera, solids: list[Solid]) -> Array:
-    """sRGB (H, W, 3) in [0, 1]: two rays per pixel and axis, each pixel a weighted mean over four."""
+    """Render a photo: sRGB (H, W, 3) in [0, 1].
+
+    There are two rays per pixel and axis. A pixel is a weighted mean over four rays per axis.
+    """
     xs, ys = ((np.arange(-1, 2 * n + 1) + 0.5) / 2 for n in (camera.width, camera.height))
     fine: Array = np.empty((len(ys), len(xs), 3))
     for top in range(0, len(ys), TILE):
@@ -65,28 +71,29 @@ def take_photo(camera: Camera, solids: list[Solid]) -> Array:
 
 
 def make_photos(folder: Path, count: int = 30, width: int = 480, height: int = 360, seed: int = 0) -> list[Camera]:
-    """Write photos of the still life: ``000.jpg`` and on.
+    """Write photos of the still life, ``000.jpg`` and so on.
 
     Parameters
     ----------
     folder : Path
-        Made where it is missing; files of the same names are replaced.
+        Created if it does not exist. Files of the same names are replaced.
     count : int
         Number of photos.
     width, height : int
-        Their size in pixels.
+        Size of a photo, px.
     seed : int
-        Of the cameras' places and of the noise of the sensor; the scene is always the same.
+        Seed of the cameras' positions and of the sensor's noise. The scene is always the same.
 
     Returns
     -------
     list of Camera
-        The true cameras of the photos, in their order, in metres.
+        The true cameras in the order of the photos, in metres.
 
     Raises
     ------
     InputError
-        If there would be no photo, or one without a pixel; if the seed is negative; if a file cannot be written.
+        If the number or the size of the photos is less than 1, if the seed is negative, or if a file cannot be
+        written.
     """
     from PIL import ExifTags, Image
 
@@ -114,20 +121,20 @@ def make_photos(folder: Path, count: int = 30, width: int = 480, height: int = 3
 
 
 def known_scene(count: int = 24, width: int = 160, height: int = 120, points: int = 2000, seed: int = 0) -> Scene:
-    """The still life with its true cameras and points: no files, no structure from motion, no noise of a sensor.
+    """The still life with its true cameras and points, without files, structure from motion or sensor noise.
 
-    For experiments that take seconds: the light is gathered from fewer directions than in `make_photos`.
+    It is meant for experiments that take seconds: the light is gathered from fewer directions than in `make_photos`.
 
     Parameters
     ----------
     count : int
-        Number of photos; every eighth is held out.
+        Number of photos. Every eighth is held out.
     width, height : int
-        Their size in pixels.
+        Size of a photo, px.
     points : int
-        Number of rays from the photos to train on that look for a surface; each that meets one leaves a point.
+        Number of random rays from the training photos. Each ray that hits a surface yields a point.
     seed : int
-        Of the cameras' places and of the points.
+        Seed of the cameras' positions and of the points.
 
     Returns
     -------
@@ -137,7 +144,7 @@ def known_scene(count: int = 24, width: int = 160, height: int = 120, points: in
     Raises
     ------
     InputError
-        If there would be no photo to train on, one without a pixel, or no point.
+        If `count` is less than 2, or another number less than 1.
     """
     if count < 2 or min(width, height, points) < 1:
         found = f"found {count}, {width}, {height}, {points}"
@@ -158,7 +165,7 @@ def known_scene(count: int = 24, width: int = 160, height: int = 120, points: in
 
 
 def _points(view: View, count: int, seed: list[int], solids: list[Solid]) -> tuple[Array, Array]:
-    """Points (count, 3) where random rays of a photo end, and their colours, uint8."""
+    """Points (P, 3) where `count` random rays of a photo hit a surface, and their colours (P, 3), uint8."""
     camera, rng = view.camera, np.random.default_rng(seed)
     x, y = rng.uniform(0, [[camera.width], [camera.height]], (2, count))
     rays = camera_rays(camera, x, y)

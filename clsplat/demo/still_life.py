@@ -1,21 +1,23 @@
-"""The scene of `clsplat.demo`: a still life in a courtyard, its textures drawn by formulas.
+"""The scene of `clsplat.demo`: a still life in a courtyard with procedural textures.
 
-A texture maps points (3, N), in metres from the solid's centre, to albedos (3, N). It depends on the point alone,
-so that all photos agree, and it is irregular everywhere, so that photos can be matched.
+A texture maps points (3, N), in metres from the solid's centre, to albedos (3, N). It depends only on the point, so
+that all photos agree. It is irregular everywhere, so that photos can be matched.
 """
 
 import numpy as np
 
-from clsplat.demo.ray_tracer import Array, Cube, Lathe, Solid, Sphere, Square, Texture
+from clsplat.demo.ray_tracer import Solid, Texture
+from clsplat.demo.shapes import Array, Cube, Lathe, Sphere, Square
 
 LATTICE = np.random.default_rng(20).random((32, 32, 32))
 CELLS = np.random.default_rng(21).random(4096)
 OBLIQUE = np.array([[2, 2, -1], [-1, 2, 2], [2, -1, 2]]) / 3
-"""A rotation that keeps the lattice of the noise from showing along a solid's axes."""
+"""Random values on a lattice, random values of cells, and a rotation that turns the lattice out of the solids' axes,
+so that it is not visible."""
 
 
 def noise(points: Array) -> Array:
-    """Value noise in [0, 1] with details of about one unit, (N,) (Perlin 1985, with values for gradients)."""
+    """Value noise in [0, 1] with details of about one unit, (N,) (Perlin 1985, with values instead of gradients)."""
     from scipy.ndimage import map_coordinates
 
     points = OBLIQUE @ points
@@ -25,7 +27,7 @@ def noise(points: Array) -> Array:
 
 
 def fractal(points: Array, octaves: int = 3) -> Array:
-    """Octaves of `noise`, each of half the size and half the height, stretched to about [0, 1]."""
+    """Sum of octaves of `noise`, each with half the size and half the amplitude, stretched to about [0, 1]."""
     total = np.full(points.shape[1], 0.5)
     for k in range(octaves):
         total += 0.9 * (noise(points * 2.0**k + 7.7 * k) - 0.5) * 0.5**k
@@ -33,7 +35,7 @@ def fractal(points: Array, octaves: int = 3) -> Array:
 
 
 def cell_random(*indices: Array) -> Array:
-    """A random number in [0, 1) for each cell of a pattern, from the cell's integer indices."""
+    """Random number in [0, 1) for each cell of a pattern, determined by the cell's integer indices."""
     code = sum(i.astype(np.int64) * k for i, k in zip(indices, (1, 61, 1009), strict=False))
     return CELLS[code % len(CELLS)]
 
@@ -45,23 +47,23 @@ def linear(colour: str) -> Array:
 
 
 def ramp(x: Array, *colours: str) -> Array:
-    """Albedos (3, N) along equally spaced sRGB colours; x from 0 to 1."""
+    """Albedos (3, N): interpolation between equally spaced sRGB colours, for x from 0 to 1."""
     knots = np.linspace(0, 1, len(colours))
     return np.stack([np.interp(x, knots, c) for c in np.hstack([linear(c) for c in colours])])
 
 
 def mix(a: Array, b: Array, t: Array) -> Array:
-    """From a, where t is 0, to b, where t is 1."""
+    """Interpolate linearly from a, at t = 0, to b, at t = 1."""
     return a + (b - a) * t
 
 
 def edge(x: Array, width: float) -> Array:
-    """From 0 to 1 around x = 0 over the given width."""
+    """Ramp from 0 to 1 around x = 0 over the given width."""
     return np.clip(x / width + 0.5, 0, 1)
 
 
 def cells(u: Array, v: Array, width: float, height: float, shift: float) -> tuple[Array, Array, Array]:
-    """Row, column and distance to the border of the cell of a bond whose rows are shifted at random."""
+    """Row, column and distance to the border of the cells of a brick bond with randomly shifted rows."""
     row = np.floor(v / height)
     u = u / width + shift * cell_random(row)
     column = np.floor(u)
@@ -70,7 +72,7 @@ def cells(u: Array, v: Array, width: float, height: float, shift: float) -> tupl
 
 
 def wood(dark: str, light: str, scale: float = 1.0) -> Texture:
-    """Year rings around the x axis, streaks along it."""
+    """Wood with annual rings around the x axis and streaks along it."""
 
     def texture(p: Array) -> Array:
         x, y, z = p * scale
@@ -121,7 +123,7 @@ def quilt(p: Array) -> Array:
 
 
 def porcelain(p: Array) -> Array:
-    """Cream glaze painted with blue arabesques between bands."""
+    """Cream glaze with blue arabesques between bands."""
     n = fractal(p * 5.5)
     paint = np.maximum(edge(n - 0.6, 0.03), 1 - edge(np.abs(n - 0.45) - 0.03, 0.02))
     band = np.abs((p[2] + 0.006 * noise(p * 20) + 0.02) % 0.26 - 0.13)
@@ -130,7 +132,7 @@ def porcelain(p: Array) -> Array:
 
 
 def globe(p: Array) -> Array:
-    """Continents of no known planet, and a graticule of 30 degrees."""
+    """Continents of an imaginary planet, and a graticule of 30 degrees."""
     p = p / np.linalg.norm(p, axis=0)
     height = fractal(p * 2.1 + 4, 5)
     sea = ramp(height * 1.9, "1f4e74", "2f7396", "7fb3b8")
@@ -144,7 +146,7 @@ def globe(p: Array) -> Array:
 
 
 def peel(*colours: str, streak: float = 0.0) -> Texture:
-    """Skin of a fruit, mottled and porous; `streak` draws the mottling out from pole to pole."""
+    """Skin of a fruit, mottled and porous. `streak` stretches the spots from pole to pole."""
 
     def texture(p: Array) -> Array:
         mottle = fractal(p * np.array([[14], [14], [14 * (1 - streak)]]) + int(colours[0], 16) % 31)
@@ -154,7 +156,7 @@ def peel(*colours: str, streak: float = 0.0) -> Texture:
 
 
 def cover(colour: str, gilt: str) -> Texture:
-    """Book cloth with a printed label in a gilt frame."""
+    """Cloth of a book cover with a printed label in a gilt frame."""
 
     def texture(p: Array) -> Array:
         x, y, _ = p
@@ -178,7 +180,7 @@ TOY = wood("8f6437", "dcb27c", 2.0)
 
 
 def toy(paint: str, mark: str) -> Texture:
-    """A wooden block whose faces are painted, marked and a little chipped."""
+    """Paint of a wooden block whose faces are marked and slightly chipped."""
 
     def texture(p: Array) -> Array:
         inside = edge(0.085 - np.sort(np.abs(p), axis=0)[1], 0.006)
@@ -218,7 +220,7 @@ def trunk(p: Array) -> Array:
 def book(
     centre: tuple[float, float, float], size: tuple[float, float, float], yaw: float, cloth: Texture
 ) -> list[Solid]:
-    """Pages between two covers and a spine; half edges in metres."""
+    """Pages between two covers and a spine. `size` is half of the edges, m; `yaw` is in degrees."""
     x, y, z = size
     a = np.radians(yaw)
     across = np.array([-np.sin(a), np.cos(a), 0])
@@ -232,7 +234,7 @@ def book(
 
 
 def pumpkin(x: float, y: float) -> list[Solid]:
-    """Nine ribs and a stalk."""
+    """A pumpkin of nine ribs and a stalk."""
     skin = peel("a9521c", "d07c2a", "e3a552", streak=0.7)
     stalk = Lathe((0, -1), (1, -1), (0.5, 0), (0.7, 1), (0, 1))
     solids = [Solid(stalk, wood("4b4a26", "8f8a4e", 3), (x, y, 0.42), (0.05, 0.05, 0.08), tilt=12)]
@@ -244,7 +246,7 @@ def pumpkin(x: float, y: float) -> list[Solid]:
 
 
 def still_life() -> list[Solid]:
-    """Things on a quilt, on the boards of a walled court; unlit until `clsplat.demo.ray_tracer.bake`."""
+    """Objects on a quilt in a walled courtyard, unlit until `clsplat.demo.ray_tracer.bake`."""
     bowl = Lathe((0, 0), (0.16, 0), (0.17, 0.03), (0.3, 0.08), (0.4, 0.22), (0.385, 0.225), (0.28, 0.1), (0, 0.06))
     vase = Lathe(
         *((0, 0), (0.17, 0), (0.2, 0.06), (0.36, 0.4), (0.3, 0.68), (0.12, 0.8), (0.12, 0.94), (0.19, 1.0)),

@@ -7,7 +7,7 @@ from clsplat.gaussians import SHAPES, Gaussians
 from clsplat.stages import AdamStep
 from clsplat.structs import adam_struct
 
-# Values per work-item: one vector.
+# Number of values per work-item: one vector.
 RUN = 16
 
 
@@ -19,7 +19,7 @@ def adam_step(
     second: Gaussians,
     step: AdamStep,
 ) -> None:
-    """One step of Adam (Kingma and Ba 2015, algorithm 1), in place.
+    """Take one step of Adam (Kingma and Ba 2015, algorithm 1), in place.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def adam_step(
             stride, width, split = 3 * gaussians.sh.shape[1], 3 * (step.sh_degree + 1) ** 2, 3
             rates = [struct["sh0"], struct["sh_rest"]]
         else:
-            # Whole rows: the effective rank is of all three scales.
+            # A work-item takes whole rows, because the effective rank depends on all three scales.
             run = RUN if name != "log_scales" else 3 * (RUN // 3)
             stride, width, split = run, run, 0
             rates = [struct[name]] * 2

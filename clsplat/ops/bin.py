@@ -24,27 +24,25 @@ def bin_splats(
     gradients: bool = True,
     scheme: str = "auto",
 ) -> Bins:
-    """Lists of splats per tile, by depth and then by index.
+    """List the splats of each tile, sorted by depth and then by index.
 
     Parameters
     ----------
     splats : Splats of N >= 1 Gaussians
-    width, height : int
-        Image size in pixels.
-    tile_size : int
-        Edge of a tile in pixels.
+    width, height, tile_size : int
+        Size of the image and edge of a tile, px.
     gradients : bool
-        Whether `composite_bwd` will follow; without it first_slots and slots of the result are None.
+        True if `composite_bwd` will follow. If False, first_slots and slots of the result are None.
     scheme : {"auto", "global", "per_tile"}
-        Sort all splats by depth and distribute them to the tiles, or distribute them and sort each tile's list. The
-        lists are the same; order is by depth or by index.
+        "global" sorts all splats by depth and distributes them to the tiles. "per_tile" distributes them and sorts
+        the list of each tile. The lists are the same; `order` of the result is by depth or by index.
 
     Raises
     ------
     InputError
-        If there is no such scheme.
+        If the scheme is unknown.
     DeviceError
-        If the intersections do not fit the device.
+        If the intersections do not fit on the device.
     """
     if scheme not in ("auto", "global", "per_tile"):
         raise InputError(f"scheme: expected auto, global or per_tile, found {scheme!r}")
@@ -52,7 +50,7 @@ def bin_splats(
     n = splats.depths.shape[0]
     tile_count = -(-width // tile_size) * -(-height // tile_size)
     defines = {"TILE": tile_size, "GRADIENTS": int(gradients)}
-    # A double's sort key is 64 bits wide; the sign bit of a depth is never set, but that of LAST is.
+    # The key of a double has 64 bits. The sign bit of a depth is never set, but that of LAST is.
     keys = device.empty("depth keys", n, np.uint32 if device.real == np.float32 else np.uint64)
     bits = 8 * keys.dtype.itemsize
     ellipses = device.empty("ellipses", (n, 8))
@@ -83,7 +81,7 @@ def bin_splats(
 
 
 def _list(device: Device, m: int) -> Array:
-    """A list of m entries; a buffer cannot be empty: where nothing is visible one unused entry stands in."""
+    """A list of m entries. A buffer cannot be empty, so a list without entries has one unused entry."""
     return device.empty("intersections", max(m, 1), np.uint32)[:m]
 
 
@@ -96,11 +94,11 @@ def _gather(device: Device, m: int, permutation: Array, values: Array, defines: 
 def _counting_sort(
     device: Device, n: int, tile_count: int, geometry: list[Any], defines: dict[str, Any]
 ) -> tuple[Array, Array, Array, Array]:
-    """gauss_ids, slots, first_slots and tile_begins: a core counts in tables of its own."""
+    """gauss_ids, slots, first_slots and tile_begins by a counting sort, in which each core has its own counters."""
     runs = min(n, 4 * device.cl_device.max_compute_units)
     head = [n, runs, tile_count, *geometry]
     counters = device.empty("tile counters", (runs, tile_count), np.uint32)
-    # Where no gradients are asked for the kernels do not touch these.
+    # Without gradients, the kernels do not access these.
     counts = first_slots = slots = counters
     if defines["GRADIENTS"]:
         counts = device.empty("tiles per Gaussian", n, np.uint32)
@@ -123,7 +121,7 @@ def _counting_sort(
 def _radix_sort(
     device: Device, n: int, tile_count: int, geometry: list[Any], defines: dict[str, Any]
 ) -> tuple[Array, Array, Array, Array]:
-    """The same by a radix sort of the tile numbers, which keeps all of a GPU busy."""
+    """The same result as `_counting_sort`, by a radix sort of the tile numbers, which uses all cores of a GPU."""
     counts = device.empty("tiles per Gaussian", n, np.uint32)
     device.launch("bin", "bin_count", (n,), [n, *geometry, counts], defines=defines)
     first_slots, partial = queue_scan(device, counts)

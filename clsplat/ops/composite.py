@@ -6,22 +6,21 @@ from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.stages import Bins, Image, SplatGrads, Splats
 
-# Splats per batch of the GPU variant without subgroups, each a work-item of the backward kernel: two or four times
-# what the GPUs known run in lockstep.
+# Number of splats per batch of the GPU variant without subgroups. Each is a work-item of the backward kernel. Known
+# GPUs run 16 or 32 work-items in lockstep.
 GPU_BATCH = 64
 
-# Splats that a pixel composites in one round where pixels are sorted; changes speed, not the image. 16 took a quarter
-# longer, 48 was no faster (100 000 Gaussians at 640x480 with 62 drawn pairs per pixel).
+# Number of splats that a pixel composites in one round if pixels are sorted. It changes the speed, not the image.
 WINDOW = 32
 
 
 def gpu_batch(device: Device) -> int:
-    """Splats per batch of the GPU variant: a subgroup's work-items, where there are subgroups."""
+    """Number of splats per batch of the GPU variant: the work-items of a subgroup, if there are subgroups."""
     return device.subgroup_size or GPU_BATCH
 
 
 def variant(device: Device, compositor: str = "auto", disparities: Any = None) -> str:
-    """The stage of the kernels' variant."""
+    """Name of the kernel variant, composite_cpu, composite_gpu or composite_sorted."""
     if disparities is not None:
         return "composite_sorted"
     if compositor == "auto":
@@ -39,7 +38,7 @@ def _defines(device: Device, bins: Bins, channels: int, stage: str) -> dict[str,
 
 
 def packed(device: Device, splats: Splats, bins: Bins, stage: str) -> Any:
-    """The splats as the kernels read them: SPLAT_REALS each (cl/composite.h)."""
+    """Splats in the layout that the kernels read: SPLAT_REALS each (cl/composite.h)."""
     n, channels = splats.colors.shape
     result = device.empty("packed splats", (n, -(-(8 + channels) // 4) * 4))
     geometry = [splats.means2d, splats.conics, splats.extents, splats.opacities, splats.colors]
@@ -77,10 +76,10 @@ def composite_fwd(
     bins : Bins of the same splats
     background : (C,) array on the host
     compositor : {"auto", "cpu", "gpu"}
-        Kernel variant, for the order of `bins`.
+        Kernel variant, if pixels use the order of `bins`.
     disparities : (N, 3), optional
-        As `project_disparities` gives them: each pixel takes its splats by them, nearest first, rather than in the
-        order of `bins`, which decides ties.
+        Result of `project_disparities`. If given, each pixel sorts its splats by disparity, nearest first. The order
+        of `bins` decides ties.
     """
     channels = splats.colors.shape[1]
     result = Image(
@@ -118,7 +117,7 @@ def composite_bwd(
     Raises
     ------
     InputError
-        If the lists were made without what gradients need.
+        If the lists were made without gradients.
     """
     if bins.slots is None:
         raise InputError(

@@ -10,7 +10,7 @@ from clsplat.stages import Bins, Splats
 
 
 def count_pairs(device: Device, splats: Splats, bins: Bins) -> tuple[Array, Array]:
-    """Pairs of a splat and a pixel: what compositing an image takes.
+    """Count the pairs of a splat and a pixel that compositing evaluates and draws.
 
     Parameters
     ----------
@@ -20,9 +20,9 @@ def count_pairs(device: Device, splats: Splats, bins: Bins) -> tuple[Array, Arra
     Returns
     -------
     evaluated : (H, W) uint32
-        Splats of the tile's list in whose box of extents the pixel lies, until the pixel is finished.
+        Number of splats of the tile's list whose box of extents contains the pixel, until the pixel is finished.
     accepted : (H, W) uint32
-        Those that are drawn.
+        Number of those that are drawn.
     """
     evaluated, accepted = (device.empty("pairs", (bins.height, bins.width), np.uint32) for _ in range(2))
     geometry = [splats.means2d, splats.conics, splats.extents, splats.opacities, bins.gauss_ids, bins.tile_ranges]

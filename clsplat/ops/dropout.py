@@ -7,12 +7,12 @@ from clsplat.stages import Dropout, SplatGrads, Splats
 
 
 def dropout_fwd(device: Device, splats: Splats, dropout: Dropout) -> None:
-    """Leave splats out at random and make the others more opaque, in place.
+    """Drop random splats and make the others more opaque, in place.
 
     Parameters
     ----------
     splats : Splats of N >= 1 rows
-        Dropped ones become invisible: extents and opacity 0.
+        Dropped splats become invisible: their extents and opacities are 0.
     dropout : Dropout
     """
     n = len(splats.opacities)
@@ -22,7 +22,9 @@ def dropout_fwd(device: Device, splats: Splats, dropout: Dropout) -> None:
 
 
 def dropout_bwd(device: Device, v_splats: SplatGrads, dropout: Dropout) -> None:
-    """Turn gradients with respect to the splats after `dropout_fwd` into those before it, in place; dropped splats
-    have none."""
+    """Turn gradients by the splats after `dropout_fwd` into gradients by those before it, in place.
+
+    Gradients of dropped splats are 0.
+    """
     n = len(v_splats.opacities)
     device.launch("dropout", "dropout_bwd", (n,), [n, dropout.gain, v_splats.opacities])

@@ -8,21 +8,23 @@ from pyopencl.array import Array
 
 from clsplat.device import Device
 
-# Pixels per work-item of the backward kernel on a CPU, and work-items on a GPU: their sums are added up on the host.
+# Number of pixels per work-item of the backward kernel on a CPU, and number of work-items on a GPU. The host adds up
+# their sums.
 CPU_PIXELS = 4096
 GPU_ITEMS = 2048
 
 
 def exposure_fwd(device: Device, image: Array, affine: NDArray[Any], photo: Array) -> Array:
-    """Map an image's colours, as the camera of a photo would show them.
+    """Map the colours of an image by the affine map of a photo.
 
     Parameters
     ----------
     image : (H, W, 3) real
     affine : (3, 4) array on the host
-        A and b of A x + b, side by side.
+        A and b of A x + b, in the first three columns and in the last one.
     photo : (H, W, 3) uint8
-        Where it is 255, the result is 1 at most, where it is 0, 0 at least: what a camera clips, it cannot tell.
+        The result is at most 1 where the photo is 255, and at least 0 where the photo is 0: the camera clips values
+        beyond.
 
     Returns
     -------
@@ -44,7 +46,7 @@ def exposure_bwd(
     image, affine, photo
         As given to `exposure_fwd`.
     v_image : (H, W, 3) real
-        Gradient with respect to its result; becomes that with respect to `image`, in place.
+        Gradient with respect to its result. It is replaced by the gradient with respect to `image`, in place.
 
     Returns
     -------

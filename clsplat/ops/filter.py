@@ -12,24 +12,24 @@ from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.structs import camera_struct, lens_define
 
-# Of the kernels that see no camera; all are built together.
+# Defines of the kernels that use no camera. LENS is required, since all kernels of the file are built together.
 DEFINES = {"FILTER_VARIANCE": FILTER_VARIANCE, "LENS": "PINHOLE"}
 
 
 def pixel_sizes(device: Device, gaussians: Gaussians, cameras: Iterable[Camera]) -> Any:
-    """The smallest size of a pixel at each Gaussian, of all cameras that see it.
+    """Smallest size of a pixel at each Gaussian, over all cameras that see it.
 
     Parameters
     ----------
     gaussians : Gaussians of N >= 1 rows
     cameras : iterable of Camera
-        One sees a Gaussian whose centre lies where it draws Gaussians and in its image, enlarged as for the clamp.
+        A camera sees a Gaussian if the centre is not culled and lies in the image, enlarged by FRUSTUM_MARGIN.
 
     Returns
     -------
     (N,)
-        depth/focal (orthographic: 1/focal), in world units. Where no camera sees a Gaussian the largest of all; 0
-        where none sees any.
+        depth/focal (orthographic: 1/focal), world units. For Gaussians that no camera sees, the largest of the
+        others; 0 if no camera sees any Gaussian.
     """
     n = len(gaussians)
     result = device.upload("pixel sizes", np.full(n, np.inf))
@@ -45,18 +45,18 @@ def pixel_sizes(device: Device, gaussians: Gaussians, cameras: Iterable[Camera])
 
 
 def filter_fwd(device: Device, gaussians: Gaussians, pixels: Any) -> Gaussians:
-    """Gaussians that are no thinner than the cameras can resolve, and as much less opaque.
+    """Widen Gaussians to at least the size that the cameras resolve, and reduce their opacities accordingly.
 
     Parameters
     ----------
     gaussians : Gaussians of N >= 1 rows
     pixels : (N,)
-        As `pixel_sizes` gives them; 0 leaves a Gaussian as it is.
+        Result of `pixel_sizes`. 0 leaves a Gaussian unchanged.
 
     Returns
     -------
     Gaussians
-        With log_scales and logit_opacities of their own; the other fields are shared.
+        log_scales and logit_opacities are new arrays; the other fields are shared with the input.
     """
     n = len(gaussians)
     log_scales: Any
@@ -68,14 +68,14 @@ def filter_fwd(device: Device, gaussians: Gaussians, pixels: Any) -> Gaussians:
 
 
 def filter_bwd(device: Device, gaussians: Gaussians, pixels: Any, v: Gaussians) -> Gaussians:
-    """Gradients with respect to the Gaussians that were filtered; `v`, of the filtered ones, is changed in place.
+    """Gradients of `filter_fwd`.
 
     Parameters
     ----------
     gaussians, pixels
         As given to `filter_fwd`.
     v : Gaussians
-        Gradients with respect to its result.
+        Gradients with respect to its result. They are replaced by gradients with respect to `gaussians`, in place.
     """
     n = len(gaussians)
     arguments = [n, pixels, gaussians.log_scales, gaussians.logit_opacities, v.log_scales, v.logit_opacities]

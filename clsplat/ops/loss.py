@@ -7,13 +7,13 @@ from clsplat.device import GROUP, Device
 
 RADIUS = len(SSIM_TAPS) // 2
 
-# Vectors of neighbouring values that a work-item owns: long runs suit a CPU's prefetchers, neighbouring work-items a
-# GPU's memory. On two cores 24 vectors were the fastest of 4 to 32, above all with cold caches.
+# Number of values per vector, and number of neighbouring vectors per work-item. Long runs suit the prefetchers of a
+# CPU. On a GPU, neighbouring work-items should access neighbouring values.
 CPU_SHAPE = {"LANES": 16, "VECTORS": 24}
 GPU_SHAPE = {"LANES": 1, "VECTORS": 1}
 
-# Rows that a work-item owns: on a CPU few enough for four work-items per core, within limits. With 64 rows 16 % are
-# blurred twice along the row, with 16 rows 63 %.
+# Smallest and largest number of rows per work-item. On a CPU, there are four work-items per core within these limits.
+# Rows at the edges of a band are blurred twice along the row.
 BAND_MIN, BAND_MAX = 16, 64
 
 
@@ -27,9 +27,9 @@ def l1_ssim(
     image : (H, W, 3) real
     photo : (H, W, 3) uint8
     ssim_weight : float
-        lambda of (1 - lambda) L1 + lambda (1 - SSIM).
+        Weight lambda in (1 - lambda) L1 + lambda (1 - SSIM).
     mask : (H, W) uint8, optional
-        1 where pixels count; image and photo are taken as black elsewhere.
+        1 where pixels count. Elsewhere, image and photo are treated as black.
 
     Returns
     -------

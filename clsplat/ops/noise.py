@@ -8,15 +8,15 @@ from clsplat.stages import GATE_OPACITY, GATE_SLOPE
 
 
 def add_noise(device: Device, gaussians: Gaussians, size: float, seed: int, iteration: int) -> None:
-    """Add noise to the means, in place: along each Gaussian's covariance, and the less the more opaque it is.
+    """Add noise to the means, in place, shaped by each Gaussian's covariance and reduced by its opacity.
 
     Parameters
     ----------
     gaussians : Gaussians of N >= 1 rows
     size : float
-        Factor on covariance times normal numbers, in inverse world units.
+        Factor on the covariance times normal random numbers, in inverse world units.
     seed, iteration : int
-        Each pair has numbers of its own; seed within 64 bits, iteration within 32.
+        Each pair yields different random numbers. The seed has 64 bits, the iteration 32.
     """
     n, g = len(gaussians), gaussians
     key = np.array([seed & 0xFFFFFFFF, seed >> 32], np.uint32)

@@ -14,11 +14,11 @@ def observe(
     Parameters
     ----------
     extents, v_means2d : (N, 2) real
-        Of the splats, and the gradient with respect to their centres, per pixel.
+        Extents of the splats, px, and gradients with respect to their centres, px^-1.
     width, height : int
-        Size of the image in pixels.
+        Size of the image, px.
     grad_sum : (N,) real
-        Sum of the norms of the positional gradient, in normalised device coordinates.
+        Sum over iterations of the norm of the positional gradient, in normalised device coordinates.
     seen : (N,) int32
         Number of iterations in which the Gaussian was visible.
     """

@@ -10,7 +10,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.stages import AdamStep, CameraGrads, SplatGrads, Splats
 from clsplat.structs import adam_struct, camera_struct, lens_define
 
-# Work-group size of the backward kernel where it adds up the camera's gradient: 4 KiB of local memory.
+# Work-group size of the backward kernel if it adds up the camera's gradient. It takes 4 KiB of local memory.
 CAMERA_GROUP = 64
 
 
@@ -30,11 +30,11 @@ def project_fwd(
     gaussians : Gaussians of N >= 1 rows
     camera : Camera
     sh_degree : int
-        Highest degree evaluated, at most the stored one.
+        Highest degree that is evaluated, at most the stored one.
     antialiased : bool
-        Compensate the opacity for the blur of the 2D covariance.
+        True to compensate the opacity for the blur of the 2D covariance.
     channels : {3, 4}
-        4 adds the depth to the colours.
+        Number of colour channels. The fourth one is the depth.
 
     Returns
     -------
@@ -66,7 +66,7 @@ def project_fwd(
 
 
 def project_disparities(device: Device, gaussians: Gaussians, camera: Camera, splats: Splats) -> Any:
-    """The disparity at which a pixel's ray meets each Gaussian where it is densest, as a plane over the image.
+    """Disparity of each Gaussian's maximum along the rays of pixels, as a linear function over the image.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def project_disparities(device: Device, gaussians: Gaussians, camera: Camera, sp
     -------
     (N, 3)
         1/z at the splat's centre, in inverse world units, and its derivatives by x and y, per pixel; 0 for invisible
-        Gaussians. It has no gradient: only the order within a pixel depends on it.
+        Gaussians. It has no gradient, because only the order within a pixel depends on it.
     """
     n, g = len(gaussians), gaussians
     result = device.empty("disparities", (n, 3))
@@ -100,7 +100,7 @@ def project_bwd(
     antialiased: bool = False,
     camera_grad: bool = False,
 ) -> tuple[Gaussians, CameraGrads | None]:
-    """Gradients with respect to the Gaussians and, if asked for, the camera.
+    """Gradients with respect to the Gaussians and, optionally, the camera.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def project_bwd(
     Returns
     -------
     v_gaussians : Gaussians
-        One gradient per field; 0 for invisible Gaussians.
+        Gradient for each field; 0 for invisible Gaussians.
     v_camera : CameraGrads or None
     """
     n, g = len(gaussians), gaussians
@@ -144,7 +144,7 @@ def project_bwd(
 def _backward(
     device: Device, kernel: str, n: int, arguments: list[Any], defines: dict[str, Any]
 ) -> CameraGrads | None:
-    """Launch a backward kernel; the gradients with respect to the camera, if it is defined to write them."""
+    """Launch a backward kernel. Returns the gradients with respect to the camera if `defines` request them."""
     if not defines["CAMERA_GRAD"]:
         device.launch("project", kernel, (n,), arguments, defines=defines)
         return None
@@ -177,13 +177,16 @@ def project_bwd_adam(
     antialiased: bool = False,
     camera_grad: bool = False,
 ) -> CameraGrads | None:
-    """`project_bwd` and `adam_step` in one pass over the Gaussians, in place; arguments as theirs.
+    """`project_bwd` and `adam_step` in one pass over the Gaussians, in place.
+
+    Parameters not listed are those of the two functions.
 
     Parameters
     ----------
     moments : (first, second)
+        Running means of the gradients and of their squares.
     step : AdamStep
-        Its degree of the spherical harmonics is that of `project_fwd`.
+        Its degree of the spherical harmonics must be that of `project_fwd`.
 
     Returns
     -------

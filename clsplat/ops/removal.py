@@ -13,7 +13,7 @@ from clsplat.stages import Bins, Removal, Splats
 def removal(
     device: Device, splats: Splats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
 ) -> Removal:
-    """What becomes of an image's squared error if one splat alone is removed or changes its colour.
+    """Change of an image's squared error if a single splat is removed or changes its colour.
 
     Parameters
     ----------
@@ -21,19 +21,19 @@ def removal(
     bins : Bins of the same splats, made with gradients
     background : (C,) array on the host
     residuals : (H, W, C) array on the host, optional
-        Image less target; 0 where not given.
+        Image minus target. Default: 0.
     mask : (H, W) array of bool on the host, optional
-        True where pixels count; everywhere if not given.
+        True where pixels count. Default: everywhere.
 
     Returns
     -------
     Removal
-        Arrays of the host.
+        Arrays on the host.
 
     Raises
     ------
     InputError
-        If the lists were made without what gradients need.
+        If the lists were made without gradients.
     """
     if bins.slots is None:
         raise InputError(

@@ -14,14 +14,14 @@ def exclusive_scan(device: Device, values: Array, what: str = "scan") -> tuple[A
     ----------
     values : (n,) uint32, n >= 1
     what : str
-        Names the sum in the error.
+        Name of the sum in the error.
 
     Returns
     -------
     sums : (n + 1,) uint32
         sums[i] is the sum of values[:i].
     total : int
-        The sum of all values, read back from the device.
+        Sum of all values, read back from the device.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def exclusive_scan(device: Device, values: Array, what: str = "scan") -> tuple[A
 
 
 def checked_total(partial: Array, what: str) -> int:
-    """The total of a `queue_scan`, read back from the device; errors as of `exclusive_scan`."""
+    """Read back the total of `queue_scan` from the device. Errors as for `exclusive_scan`."""
     total = int(partial[-1].get())
     if total >= 2**32:
         raise DeviceError(
@@ -43,15 +43,15 @@ def checked_total(partial: Array, what: str) -> int:
 
 
 def queue_scan(device: Device, values: Array) -> tuple[Array, Array]:
-    """`exclusive_scan` without waiting for the device: the sums, and an array that ends with their true total."""
+    """Queue an exclusive scan without waiting. Returns the sums, and an array that ends with their 64-bit total."""
     n = values.shape[0]
-    # A few chunks per core on a CPU; enough work-items to fill any GPU otherwise.
+    # A few chunks per core on a CPU; otherwise enough work-items to fill any GPU.
     chunks = 4 * device.cl_device.max_compute_units if device.is_cpu else 8192
     chunks = min(chunks, n)
     defines = {"GROUP": 1 if device.is_cpu else 64}
     partial = device.empty("scan", chunks + 1, np.uint64)
     sums = device.empty("scan", n + 1, np.uint32)
-    # A group of one chunk: on a CPU a group runs on one core.
+    # On a CPU, a group runs on one core, so each group has one chunk.
     group = (1,) if device.is_cpu else None
     device.launch("scan", "scan_reduce", (chunks,), [n, chunks, values, partial], defines=defines, group=group)
     device.launch(

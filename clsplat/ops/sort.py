@@ -9,18 +9,18 @@ from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.ops.scan import queue_scan
 
-# Longest list that one work-group sorts in local memory: 12 KiB with 64-bit keys, within the 16 KiB of the smallest
-# embedded devices.
+# Length of the longest list that one work-group sorts in local memory. With 64-bit keys it takes 12 KiB; the smallest
+# embedded devices have 16 KiB.
 BITONIC_MAX = 1024
 
-# Longest segment for which a core takes the bitonic sort.
+# Length of the longest segment that a CPU core sorts by the bitonic sort.
 CPU_SHORT_SEGMENT = 16
 
 
 def _defines(device: Device, keys: Array, **changes: Any) -> dict[str, Any]:
     return {
         "KEY_BITS": 8 * keys.dtype.itemsize,
-        # A core counts 2048 digits in its L1 cache; a GPU's work-item keeps 16 counters in local memory.
+        # The 2048 counters of a core fit into its L1 cache. A work-item of a GPU has 16 counters in local memory.
         "DIGIT_BITS": 11 if device.is_cpu else 4,
         "GROUP": 1 if device.is_cpu else 64,
         "BITONIC": BITONIC_MAX,
@@ -36,13 +36,13 @@ def argsort(
     Parameters
     ----------
     keys : (n,) uint32 or uint64, n >= 1
-        Left unchanged.
+        Not modified.
     bits : int
-        Number of low bits that may be set; fewer take fewer passes.
+        Number of low bits that may be set. Fewer bits need fewer passes.
     method : {"auto", "radix", "bitonic"}
-        auto takes bitonic for at most `BITONIC_MAX` keys.
+        "auto" selects "bitonic" for at most `BITONIC_MAX` keys.
     values : (n,) uint32, optional
-        Permuted instead of the positions 0 to n - 1. Left unchanged.
+        Permuted instead of the positions 0 to n - 1. Not modified.
 
     Returns
     -------
@@ -53,7 +53,7 @@ def argsort(
     Raises
     ------
     InputError
-        If there are more keys than a bitonic sort that was asked for can hold.
+        If method is "bitonic" and there are more than `BITONIC_MAX` keys.
     """
     n = keys.shape[0]
     if method == "bitonic" and n > BITONIC_MAX:
@@ -68,7 +68,7 @@ def argsort(
         return sorted_keys, order
 
     group, digit_bits = defines["GROUP"], defines["DIGIT_BITS"]
-    # Blocks: a few per core, or runs of about 16 keys per work-item.
+    # A few blocks per core on a CPU; otherwise about 16 keys per work-item.
     groups = 4 * device.cl_device.max_compute_units if device.is_cpu else -(-n // (group * 16))
     histogram = device.empty("sort histogram", groups << digit_bits, np.uint32)
     order = device.empty("sort order", n, np.uint32) if values is None else values
@@ -102,19 +102,19 @@ def argsort_segments(device: Device, keys: Array, bits: int, ranges: Array, valu
     Parameters
     ----------
     keys : (n,) uint32 or uint64, n >= 1
-        Left unchanged.
+        Not modified.
     bits : int
-        Number of low bits that may be set; fewer take fewer passes.
+        Number of low bits that may be set. Fewer bits need fewer passes.
     ranges : (s, 2) uint32
-        Begin and end of each segment; they do not overlap.
+        Begin and end of each segment. Segments do not overlap.
     values : (n,) uint32, optional
-        Permuted instead of the positions 0 to n - 1. Left unchanged.
+        Permuted instead of the positions 0 to n - 1. Not modified.
 
     Returns
     -------
     order : (n,) uint32
         keys[order] is sorted within each segment; equal keys keep their order. With `values`: values[order].
-        Undefined outside all segments.
+        Undefined outside of segments.
     """
     n, segments = keys.shape[0], ranges.shape[0]
     defines = _defines(device, keys)

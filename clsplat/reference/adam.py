@@ -1,4 +1,4 @@
-"""Twin of the stage adam, in the dtype of its arrays: also the optimiser of ``--optimizer numpy``."""
+"""Twin of the stage adam, in the dtype of its arrays. It is also the optimiser of ``--optimizer numpy``."""
 
 from typing import Any
 
@@ -10,14 +10,14 @@ from clsplat.stages import ERANK_SLACK, AdamStep
 
 Array = NDArray[Any]
 
-# Values updated at once: their five arrays stay in a core's L2 cache.
+# Number of values updated at once. Their five arrays fit into a core's L2 cache.
 BLOCK = 32768
 
 
 def adam_step(
     gaussians: Gaussians, gradients: Gaussians, first: Gaussians, second: Gaussians, step: AdamStep
 ) -> None:
-    """One step of Adam (Kingma and Ba 2015, algorithm 1), in place; arguments as of `clsplat.ops.adam_step`."""
+    """Take one step of Adam (Kingma and Ba 2015, algorithm 1), in place. Arguments as for `clsplat.ops.adam_step`."""
     correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
     for name in SHAPES:
         n = len(gaussians)
@@ -37,7 +37,7 @@ def adam_step(
 
 
 def _penalised(name: str, p: Array, g: Array, step: AdamStep) -> Array:
-    """Gradients with those of the penalties: d exp(p)/dp = exp(p), and o (1 - o) for o = sigmoid(p)."""
+    """Add the gradients of the penalties: d exp(p)/dp = exp(p), and o (1 - o) for o = sigmoid(p)."""
     opacity, scale, erank = step.penalties
     if name == "log_scales" and scale:
         g = g + scale * np.exp(p)
@@ -49,8 +49,10 @@ def _penalised(name: str, p: Array, g: Array, step: AdamStep) -> Array:
 
 
 def erank_gradient(log_scales: Array) -> Array:
-    """Gradient (N, 3) of max(-ln(erank - 1 + ERANK_SLACK), 0) of each Gaussian by ln(scales) (N, 3), where erank is
-    exp(entropy of s^2 / sum of s^2) (Hyung et al. 2024, equations 5 and 8)."""
+    """Gradient (N, 3) of max(-ln(erank - 1 + ERANK_SLACK), 0) by ln(scales) (N, 3).
+
+    The effective rank erank is exp(entropy of s^2 / sum of s^2) (Hyung et al. 2024, equations 5 and 8).
+    """
     log_q = 2 * (log_scales - log_scales.max(axis=1, keepdims=True))
     log_q = log_q - np.log(np.exp(log_q).sum(axis=1, keepdims=True))
     q = np.exp(log_q)

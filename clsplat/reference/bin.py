@@ -1,4 +1,4 @@
-"""Twin of the stage bin: every splat against every row of tiles."""
+"""Twin of the stage bin: tests each splat against each row of tiles."""
 
 import numpy as np
 
@@ -15,10 +15,10 @@ def bin_splats(
     gradients: bool = True,
     scheme: str = "auto",
 ) -> Bins:
-    """Lists of splats per tile; arguments and result as `clsplat.ops.bin_splats`; auto is global.
+    """List the splats of each tile. Arguments and result as for `clsplat.ops.bin_splats`; "auto" is "global".
 
-    A splat belongs to a tile if the ellipse {alpha >= ALPHA_MIN}, cut at the first and the last row of pixel centres
-    of the tile, spans a pixel centre of one of the tile's columns.
+    The ellipse {alpha >= ALPHA_MIN} is cut at the first and at the last row of pixel centres of the tile. The splat
+    belongs to the tile if this part spans a pixel centre of one of the tile's columns.
     """
     tiles_x, tiles_y = -(-width // tile_size), -(-height // tile_size)
     visible = splats.extents[:, 0] > 0
@@ -54,7 +54,7 @@ def _tiles_of(splats: Splats, g: int, width: int, height: int, tile_size: int) -
         hi = min(min((ty + 1) * tile_size, height) - 0.5 - my, ey)
         if lo > hi:
             continue
-        # dx is extreme at dy = -+(b/c) ex, or at the nearer end of [lo, hi].
+        # dx has its extremes at dy = -+(b/c) ex, or at the nearer end of [lo, hi].
         left, right = np.clip(b / c * ex, lo, hi), np.clip(-b / c * ex, lo, hi)
         x_min = (-b * left - np.sqrt(a * r2 * max(1 - (left / ey) ** 2, 0))) / a
         x_max = (-b * right + np.sqrt(a * r2 * max(1 - (right / ey) ** 2, 0))) / a

@@ -1,7 +1,7 @@
-"""Twin of the stage composite: one splat after the other over the pixels of a tile.
+"""Twin of the stage composite: composites one splat after the other over the pixels of a tile.
 
-Kerbl et al. 2023, equations 3 and 4. The cost of a splat is that of the box of its extents, outside which
-alpha < ALPHA_MIN: with one tile as large as the image (`clsplat.render`) nothing but that box is left of tiling.
+Kerbl et al. 2023, equations 3 and 4. A splat is evaluated in the box of its extents, outside which alpha < ALPHA_MIN.
+The renderer (`clsplat.render`) uses a single tile of the size of the image, so that tiling has no effect.
 """
 
 from collections.abc import Iterator
@@ -17,19 +17,19 @@ Array = NDArray[np.float64]
 
 
 class Hit(NamedTuple):
-    """One splat over the box of its extents within a tile; arrays of the box's shape (h, w)."""
+    """One splat over the box of its extents within a tile. Arrays have the shape of the box, (h, w)."""
 
     splat: int
     box: tuple[slice, slice]
     dx: Array
     dy: Array
-    alpha: Array  # not clamped, 0 where the splat is not drawn
+    alpha: Array  # not clamped; 0 where the splat is not drawn
     before: Array  # transmittance in front of the splat
-    live: NDArray[np.bool_]  # where no splat in front has finished the pixel
+    live: NDArray[np.bool_]  # True where compositing has not stopped before this splat
 
 
 class Layer(NamedTuple):
-    """One splat in each of P different pixels; arrays (P,)."""
+    """One splat in each of P different pixels. Arrays have the shape (P,)."""
 
     pixels: tuple[NDArray[np.intp], NDArray[np.intp]]  # rows, columns
     splats: NDArray[np.intp]
@@ -42,7 +42,7 @@ class Layer(NamedTuple):
 def hits(
     splats: Splats, bins: Bins, transmittance: Array, transmittance_min: float = TRANSMITTANCE_MIN
 ) -> Iterator[Hit]:
-    """Yield hits tile by tile, front to back; `transmittance` (H, W) is brought from 1 to its end."""
+    """Yield hits tile by tile, front to back. `transmittance` (H, W) is set to 1 and updated to its final value."""
     transmittance[:] = 1
     live = np.ones(transmittance.shape, dtype=bool)
     tiles_x = -(-bins.width // bins.tile_size)
@@ -73,10 +73,10 @@ def hits(
 def layers(splats: Splats, bins: Bins, disparities: Array, transmittance: Array) -> Iterator[Layer]:
     """Yield the splats of all pixels by disparity: first the nearest of each pixel, then the second, and so on.
 
-    `transmittance` is brought from 1 to its end, as by `hits`.
+    `transmittance` is updated as in `hits`.
     """
     found = [np.zeros((7, 0))]
-    for hit in hits(splats, bins, transmittance, transmittance_min=-1.0):  # all that are seen: no pixel stops
+    for hit in hits(splats, bins, transmittance, transmittance_min=-1.0):  # all splats: no pixel stops
         y, x = np.nonzero(hit.alpha)
         dx, dy = hit.dx[0, x], hit.dy[y, 0]
         disparity = disparities[hit.splat] @ [np.ones(len(x)), dx, dy]
@@ -102,7 +102,7 @@ def layers(splats: Splats, bins: Bins, disparities: Array, transmittance: Array)
 def composite_fwd(
     splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto", disparities: Any = None
 ) -> Image:
-    """Composite splats front to back, pixels exactly sorted; arguments and result as `clsplat.ops.composite_fwd`."""
+    """Composite splats front to back. Arguments and result as for `clsplat.ops.composite_fwd`."""
     transmittance = np.empty((bins.height, bins.width))
     image = np.zeros((bins.height, bins.width, splats.colors.shape[1]))
     if disparities is None:
@@ -125,7 +125,7 @@ def composite_bwd(
     compositor: str = "auto",
     disparities: Any = None,
 ) -> SplatGrads:
-    """Gradients of `composite_fwd`; arguments and result as `clsplat.ops.composite_bwd`."""
+    """Gradients of `composite_fwd`. Arguments and result as for `clsplat.ops.composite_bwd`."""
     v = SplatGrads(*(np.zeros_like(a) for a in (splats.means2d, splats.conics, splats.opacities, splats.colors)))
     transmittance = np.empty((bins.height, bins.width))
     behind = (image.rgb * v_image.rgb).sum(axis=2) - (1 - image.alpha) * v_image.alpha
@@ -149,7 +149,7 @@ def composite_bwd(
             np.add.at(v.conics, many, (v_sigma * [0.5 * dx**2, dx * dy, 0.5 * dy**2]).T)
             np.subtract.at(v.opacities, many, v_sigma / splats.opacities[many])
             np.add.at(v.colors, many, weight[:, None] * v_pixels)
-    # A splat whose gradients overflow gets none: they would stay in the statistics of densification.
+    # Gradients that overflow are set to 0: they would stay in the statistics of densification.
     finite = np.all([np.isfinite(a.reshape(len(a), -1)).all(axis=1) for a in v], axis=0)
     for gradients in v:
         gradients[~finite] = 0
@@ -157,10 +157,10 @@ def composite_bwd(
 
 
 def _v_sigma(alpha: Array, before: Array, u: Array, behind: Array) -> tuple[Array, Array, Array]:
-    """Gradient of sigma, the weight, and `behind` without this splat's term.
+    """Gradient of sigma, the weight, and `behind` without the term of this splat.
 
-    With u = colour . v_image and `behind` the sum of u alpha T over the splats behind, the background and alpha's own
-    term included, v_alpha = T u - behind/(1 - alpha).
+    With u = colour . v_image, v_alpha = T u - behind/(1 - alpha). `behind` is the sum of u alpha T over the splats
+    behind, plus the terms of the background and of the gradient with respect to alpha.
     """
     clamped = np.minimum(alpha, ALPHA_MAX)
     weight = clamped * before

@@ -1,4 +1,4 @@
-"""Twin of the stage count: what compositing would meet, counted."""
+"""Twin of the stage count: counts the pairs that compositing evaluates and draws."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ Array = NDArray[Any]
 
 
 def count_pairs(splats: Splats, bins: Bins) -> tuple[Array, Array]:
-    """Pairs of a splat and a pixel; arguments and result as `clsplat.ops.count_pairs`."""
+    """Count the pairs of a splat and a pixel. Arguments and result as for `clsplat.ops.count_pairs`."""
     evaluated, accepted = np.zeros((2, bins.height, bins.width), np.uint32)
     for hit in hits(splats, bins, np.empty(evaluated.shape)):
         evaluated[hit.box] += hit.live

@@ -8,7 +8,7 @@ from clsplat.stages import Dropout, SplatGrads, Splats
 
 
 def dropout_fwd(splats: Splats, dropout: Dropout) -> None:
-    """Leave splats out at random; arguments as of `clsplat.ops.dropout_fwd`."""
+    """Drop random splats, in place. Arguments as for `clsplat.ops.dropout_fwd`."""
     n = len(splats.opacities)
     counters = np.zeros((n, 4), np.uint32)
     counters[:, 0], counters[:, 1], counters[:, 2] = np.arange(n), dropout.iteration, 1
@@ -23,5 +23,5 @@ def dropout_fwd(splats: Splats, dropout: Dropout) -> None:
 
 
 def dropout_bwd(v_splats: SplatGrads, dropout: Dropout) -> None:
-    """Gradients before `dropout_fwd`; arguments as of `clsplat.ops.dropout_bwd`."""
+    """Gradients of `dropout_fwd`, in place. Arguments as for `clsplat.ops.dropout_bwd`."""
     v_splats.opacities[:] *= dropout.gain

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 def pixel_sizes(gaussians: Gaussians, cameras: Iterable[Camera]) -> Array:
-    """Smallest sizes of a pixel; arguments and result as `clsplat.ops.pixel_sizes`."""
+    """Smallest size of a pixel at each Gaussian. Arguments and result as for `clsplat.ops.pixel_sizes`."""
     sizes = np.full(len(gaussians), np.inf)
     for camera in cameras:
         points = gaussians.means.astype(np.float64) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
@@ -31,9 +31,9 @@ def pixel_sizes(gaussians: Gaussians, cameras: Iterable[Camera]) -> Array:
 
 
 def filter_fwd(gaussians: Gaussians, pixels: Array) -> Gaussians:
-    """Filtered Gaussians; arguments and result as `clsplat.ops.filter_fwd`.
+    """Widen Gaussians. Arguments and result as for `clsplat.ops.filter_fwd`.
 
-    The odds 1/opacity - 1 become ((1 + odds) - factor)/factor.
+    The opacity is multiplied by a factor, so that odds = 1/opacity - 1 become ((1 + odds) - factor)/factor.
     """
     g = gaussians.astype(np.float64)
     with np.errstate(all="ignore"):
@@ -50,7 +50,7 @@ def filter_fwd(gaussians: Gaussians, pixels: Array) -> Gaussians:
 
 
 def filter_bwd(gaussians: Gaussians, pixels: Array, v: Gaussians) -> Gaussians:
-    """Gradients of `filter_fwd`; arguments and result as `clsplat.ops.filter_bwd`."""
+    """Gradients of `filter_fwd`. Arguments and result as for `clsplat.ops.filter_bwd`."""
     after, g = filter_fwd(gaussians, pixels), gaussians.astype(np.float64)
     kept = np.exp(2 * (g.log_scales - after.log_scales))
     rest = sigmoid(-after.logit_opacities)  # 1 - opacity

@@ -12,20 +12,20 @@ from clsplat.errors import InputError
 Array = NDArray[np.float64]
 
 AXIS = 1e-3
-"""rho/z below which a fisheye's derivatives are those of its power series: cancellation there costs more digits than
-what the series leaves out, O((rho/z)^6)."""
+"""Largest rho/z at which the derivatives of a fisheye come from the power series. There, cancellation loses more
+digits than the truncation of the series, O((rho/z)^6)."""
 
 
 def lens(camera: Camera, points: Array) -> dict[str, Any]:
-    """Where a camera sees points (N, 3) of its frame, and the derivatives to second order.
+    """Image positions of points (N, 3) in the camera's frame, with derivatives to second order.
 
     Returns
     -------
     dict
-        means2d (N, 2) px; jacobian (N, 2, 3) of the local affine approximation; hessian (N, 2, 3, 3), the jacobian's
-        derivative by the point; slope_jacobian (N, 2, 3), the derivative of means2d, which differs from jacobian
-        where a pinhole's is clamped; means2d_by (N, 2, 4) and jacobian_by (N, 2, 3, 4), derivatives by fx, fy, cx,
-        cy; depths (N,), onward (N, 3) their gradient; seen (N,) bool.
+        means2d (N, 2) px; jacobian (N, 2, 3) of the local affine approximation; hessian (N, 2, 3, 3), the derivative
+        of jacobian by the point; slope_jacobian (N, 2, 3), the derivative of means2d, which differs from jacobian
+        where that of a pinhole is clamped; means2d_by (N, 2, 4) and jacobian_by (N, 2, 3, 4), the derivatives by fx,
+        fy, cx, cy; depths (N,), and onward (N, 3), their gradient; seen (N,) bool, False for culled points.
     """
     if camera.model == "equirectangular":
         raise InputError("camera: expected a pinhole, orthographic or fisheye one, found an equirectangular one")
@@ -43,7 +43,7 @@ def lens(camera: Camera, points: Array) -> dict[str, Any]:
             (depths > camera.near) & (np.arctan2(np.hypot(x, y), z) < camera.angle_max),
         )
         s, gradient, second = _radial(camera, points)
-        # (x s)_jk = e_j s_k + e_k s_j + x s_jk, and with y
+        # (x s)_jk = e_j s_k + e_k s_j + x s_jk, and the same for y
         slopes = points[:, :2] * s[:, None]
         across = np.eye(2, 3)
         slope_jacobian = across * s[:, None, None] + points[:, :2, None] * gradient[:, None]
@@ -80,7 +80,7 @@ def lens(camera: Camera, points: Array) -> dict[str, Any]:
 
 
 def _radial(camera: Camera, points: Array) -> tuple[Array, Array, Array]:
-    """theta_d/rho of a fisheye, (N,), its gradient (N, 3) and its second derivatives (N, 3, 3)."""
+    """theta_d/rho of a fisheye (N,), its gradient (N, 3) and its second derivatives (N, 3, 3)."""
     x, y, z = points.T
     powers = np.polynomial.Polynomial([0, 1, 0, camera.distortion[0], 0, camera.distortion[1], 0,
                                        camera.distortion[2], 0, camera.distortion[3]])  # fmt: skip

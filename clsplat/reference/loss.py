@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 def blur(image: Array) -> Array:
-    """Gaussian window over the first two axes of (H, W, C), zeros outside; symmetric, hence its own adjoint."""
+    """Gaussian window over the first two axes of (H, W, C), with zero padding. It is its own adjoint."""
     radius = len(SSIM_TAPS) // 2
     for axis in (0, 1):
         n = image.shape[axis]
@@ -24,7 +24,7 @@ def blur(image: Array) -> Array:
 def l1_ssim(
     image: NDArray[Any], photo: NDArray[np.uint8], ssim_weight: float, mask: NDArray[np.uint8] | None = None
 ) -> tuple[float, Array]:
-    """Training loss and its gradient; arguments and result as `clsplat.ops.l1_ssim`."""
+    """Training loss and its gradient. Arguments and result as for `clsplat.ops.l1_ssim`."""
     weight = np.ones((*image.shape[:2], 1)) if mask is None else mask[:, :, None].astype(np.float64)
     x, y = weight * image, weight * photo / 255
     mx, my, exx, eyy, exy = blur(x), blur(y), blur(x * x), blur(y * y), blur(x * y)

@@ -14,7 +14,7 @@ Array = NDArray[Any]
 
 
 def add_noise(gaussians: Gaussians, size: float, seed: int, iteration: int) -> None:
-    """Add noise to the means, in place; arguments as of `clsplat.ops.add_noise`."""
+    """Add noise to the means, in place. Arguments as for `clsplat.ops.add_noise`."""
     g = gaussians.astype(np.float64)
     counters = np.zeros((len(g), 4), np.uint32)
     counters[:, 0], counters[:, 1] = np.arange(len(g)), iteration
@@ -28,7 +28,7 @@ def add_noise(gaussians: Gaussians, size: float, seed: int, iteration: int) -> N
 
 
 def philox(counters: Array, key: tuple[int, int]) -> Array:
-    """Philox4x32-10 (Salmon et al. 2011, section 3.3): (N, 4) uint32 from as many, and a key of two words."""
+    """Philox4x32-10 (Salmon et al. 2011, section 3.3): random (N, 4) uint32 from counters (N, 4) and a 64-bit key."""
     a, b, c, d = (column.astype(np.uint64) for column in counters.T)
     low, shift = np.uint64(0xFFFFFFFF), np.uint64(32)
     k0, k1 = key

@@ -9,7 +9,7 @@ Array = NDArray[Any]
 
 
 def observe(extents: Array, v_means2d: Array, width: int, height: int, grad_sum: Array, seen: Array) -> None:
-    """Add an iteration to the statistics, in place; arguments as of `clsplat.ops.observe`."""
+    """Add an iteration to the statistics, in place. Arguments as for `clsplat.ops.observe`."""
     visible = extents[:, 0] > 0
     grad_sum[visible] += np.hypot(v_means2d[visible, 0] * (width / 2), v_means2d[visible, 1] * (height / 2))
     seen[visible] += 1

@@ -37,7 +37,7 @@ def rotations(quats: Array) -> Array:
 
 
 def _rotation_jacobian(quats: Array) -> Array:
-    """d R_ij / d q_k of `rotations`, (..., 3, 3, 4): linear in q, since R is quadratic."""
+    """Derivatives d R_ij / d q_k of `rotations`, (..., 3, 3, 4). They are linear in q, since R is quadratic."""
     w, x, y, z = np.moveaxis(quats, -1, 0)
     o = np.zeros_like(w)
     by_quat = [
@@ -50,7 +50,7 @@ def _rotation_jacobian(quats: Array) -> Array:
 
 
 def _forward(gaussians: Gaussians, camera: Camera, sh_degree: int) -> dict[str, Any]:
-    """Every intermediate quantity, for all Gaussians, visible or not."""
+    """All intermediate quantities, for visible and invisible Gaussians."""
     g = gaussians.astype(np.float64)
     view, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     p = g.means @ view.T + translation
@@ -77,8 +77,8 @@ def _forward(gaussians: Gaussians, camera: Camera, sh_degree: int) -> dict[str, 
 def project_fwd(
     gaussians: Gaussians, camera: Camera, sh_degree: int, *, antialiased: bool = False, channels: int = 3
 ) -> Splats:
-    """Project Gaussians into a camera; arguments and result as `clsplat.ops.project_fwd`."""
-    with np.errstate(all="ignore"):  # invalid Gaussians are found by what they yield
+    """Project Gaussians into a camera. Arguments and result as for `clsplat.ops.project_fwd`."""
+    with np.errstate(all="ignore"):  # invalid Gaussians are detected by their results
         f = _forward(gaussians, camera, sh_degree)
         opacities = sigmoid(f["g"].logit_opacities)
         if antialiased:
@@ -91,7 +91,7 @@ def project_fwd(
             colors = np.concatenate([colors, f["depths"][:, None]], axis=1)
         conics = np.stack([cov[:, 1, 1], -cov[:, 0, 1], cov[:, 0, 0]], axis=1) / f["det"][:, None]
 
-        # The first and the last pixel centre inside the box exist and are in order.
+        # A Gaussian is visible only if the box contains a pixel centre of the image.
         size = np.array([camera.width, camera.height])
         first = np.ceil(np.clip(f["means2d"] - extents - 0.5, 0, size))
         last = np.floor(np.clip(f["means2d"] + extents - 0.5, -1, size - 1))
@@ -111,9 +111,10 @@ def project_fwd(
 
 
 def project_disparities(gaussians: Gaussians, camera: Camera, splats: Splats) -> Array:
-    """Disparity along the rays of pixels; arguments and result as `clsplat.ops.project_disparities`.
+    """Disparity along the rays of pixels. Arguments and result as for `clsplat.ops.project_disparities`.
 
-    Image position and depth are jointly normal, with covariance root root^T where root has a third row for the depth.
+    Image position and depth are jointly normal. Their covariance is root root^T, with a third row of root for the
+    depth.
     """
     shown = splats.extents[:, 0] > 0
     f = _forward(gaussians.take(shown), camera, 0)
@@ -135,7 +136,7 @@ def project_bwd(
     antialiased: bool = False,
     camera_grad: bool = False,
 ) -> tuple[Gaussians, CameraGrads | None]:
-    """Gradients of `project_fwd`; arguments and result as `clsplat.ops.project_bwd`."""
+    """Gradients of `project_fwd`. Arguments and result as for `clsplat.ops.project_bwd`."""
     shown = splats.extents[:, 0] > 0
     rows = gaussians.take(shown)
     f = _forward(rows, camera, sh_degree)
@@ -220,7 +221,7 @@ def project_bwd_adam(
     antialiased: bool = False,
     camera_grad: bool = False,
 ) -> CameraGrads | None:
-    """`project_bwd`, then `adam_step`; arguments as of `clsplat.ops.project_bwd_adam`."""
+    """`project_bwd`, then `adam_step`. Arguments as for `clsplat.ops.project_bwd_adam`."""
     v, v_camera = project_bwd(
         gaussians, camera, step.sh_degree, splats, v_splats, antialiased=antialiased, camera_grad=camera_grad
     )

@@ -1,4 +1,4 @@
-"""Twin of the stage removal: without splat i, what lies behind it shines through as bright again."""
+"""Twin of the stage removal: without a splat, everything behind it is brighter by the factor 1/(1 - alpha)."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from clsplat.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 from clsplat.reference.composite import hits
 from clsplat.stages import Bins, Removal, Splats
 
-# Without a splat of the largest alpha, the transmittance at such a stop would be TRANSMITTANCE_MIN.
+# Transmittance at which compositing stops here. Without one splat of the largest alpha it would be TRANSMITTANCE_MIN.
 STOP = TRANSMITTANCE_MIN * (1 - ALPHA_MAX)
 
 
 def removal(splats: Splats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None) -> Removal:
-    """What becomes of the squared error; arguments and result as `clsplat.ops.removal`."""
+    """Change of the squared error. Arguments and result as for `clsplat.ops.removal`."""
     n, channels = splats.colors.shape
     transmittance = np.empty((bins.height, bins.width))
     counts = np.ones(transmittance.shape) if mask is None else np.asarray(mask, dtype=np.float64)

@@ -1,7 +1,7 @@
-"""Real spherical harmonics up to degree 3, as polynomials: the twin of cl/sh.h.
+"""Real spherical harmonics up to degree 3 as polynomials; twin of cl/sh.h.
 
-Each basis function is a sum of terms (coefficient, powers of x, y, z), from which value and derivative follow.
-Normalisation and signs: Sloan 2008, "Stupid Spherical Harmonics Tricks", appendix A2.
+Each basis function is a sum of terms (coefficient, powers of x, y, z), which yield its value and its derivatives.
+Normalisation and signs follow Sloan 2008, "Stupid Spherical Harmonics Tricks", appendix A2.
 """
 
 from math import pi, sqrt
@@ -37,13 +37,13 @@ BASIS: list[list[Term]] = [
 
 
 def sh_basis(directions: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
-    """Basis functions at unit vectors (N, 3): (N, (degree + 1)^2)."""
+    """Values of the basis functions at unit vectors (N, 3), (N, (degree + 1)^2)."""
     polynomials = BASIS[: (degree + 1) ** 2]
     return np.stack([sum(c * np.prod(directions**e, axis=1) for c, e in terms) for terms in polynomials], axis=1)
 
 
 def sh_basis_jacobian(directions: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
-    """Derivatives by the components of the direction, taken as independent: (N, (degree + 1)^2, 3)."""
+    """Derivatives by the components of the direction, as independent variables, (N, (degree + 1)^2, 3)."""
     result = np.zeros((len(directions), (degree + 1) ** 2, 3))
     for k, terms in enumerate(BASIS[: (degree + 1) ** 2]):
         for c, powers in terms:

@@ -1,4 +1,4 @@
-"""Camera paths: an orbit around what the training cameras look at; viewpoints for a scene without cameras."""
+"""Camera paths and viewpoints: an orbit around the scene, and the first view that a viewer shows."""
 
 import math
 from typing import Any, NamedTuple
@@ -14,34 +14,36 @@ from clsplat.pruning.viewpoints import FIELD_OF_VIEW, bounds
 Array = NDArray[Any]
 
 FULL_CIRCLE_GAP = math.pi / 2
-"""Where the photos leave out more of the circle than this, in radians, the path swings over the rest instead of
-closing: Gaussians seen from where no photo was taken look arbitrary."""
+"""Angle between neighbouring photos, radians, from which on the path is no full circle but swings back and forth over
+the remaining arc. Gaussians look arbitrary from directions without a photo."""
 
 OVERVIEW_HEIGHT = math.radians(20)
-"""Of `overview` above the horizon, in radians: as a person looks at a table."""
+"""Elevation of `overview` above the horizon, radians: the angle at which a person looks at a table."""
 
 OVERVIEW_RADII = 3.5
-"""Distance of `overview` from the scene's centre, in its radii: half of the weight is within one, two are seen."""
+"""Distance of `overview` from the scene's centre, in radii of the scene. A ball of one radius holds half of the
+scene's weight. At this distance, two radii are visible."""
 
 OVERVIEW_SIZE = (1280, 720)
-"""Of `overview`, in pixels."""
+"""Width and height of `overview`, px."""
 
 
 def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[Camera]:
     """Cameras on a horizontal circle around the scene's focus, for a video that loops.
 
-    The centre is `focus_point`, the axis the mean of the cameras' up vectors, radius and height above the centre
-    are the cameras' means. Where the cameras leave a quarter of the circle or more without a photo, the path
-    swings smoothly over the arc they cover, there and back.
+    The centre is `focus_point`. The axis is the mean of the cameras' up vectors. Radius and height above the centre
+    are means over the cameras. If a quarter of the circle or more has no photo, the path swings smoothly back and
+    forth over the arc that the cameras cover.
 
     Parameters
     ----------
     cameras : list of Camera
-        The training cameras; the first one lends its field of view, so that the whole of its image is seen.
+        The training cameras. Each frame has the field of view of the first one, so that it shows at least what the
+        first photo shows.
     frames : int
         Number of cameras on the path, at least 1.
     width, height : int
-        Size of the frames in pixels.
+        Size of the frames, px.
 
     Returns
     -------
@@ -51,7 +53,7 @@ def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[C
     Raises
     ------
     InputError
-        If there is no camera, no frame, or no camera stands beside what they look at: a panorama from one place.
+        If there is no camera or no frame, or if all cameras stand at the focus, as in a panorama from one place.
     """
     centre = focus_point(cameras)
     if frames < 1:
@@ -62,8 +64,8 @@ def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[C
     heights = arms @ up
     arms -= heights[:, None] * up
     radii = np.linalg.norm(arms, axis=1)
-    if radii.mean() <= 1e-9 * (1 + np.linalg.norm(centre)):  # 0 but for the rounding of the positions
-        raise InputError("cameras: expected cameras around what they look at, found none beside it")
+    if radii.mean() <= 1e-9 * (1 + np.linalg.norm(centre)):  # 0, up to the rounding of the positions
+        raise InputError("cameras: expected cameras around the scene, found all of them in one place")
     east = arms[np.argmax(radii)] / radii.max()
     north = np.cross(up, east)
     angles = np.arctan2(arms @ north, arms @ east)
@@ -85,8 +87,7 @@ def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[C
 
 
 class Viewpoint(NamedTuple):
-    """Where a scene is first looked at from: a camera; the focus (3,), what there is to look at; and what is up (3,),
-    a unit vector."""
+    """The first view of a scene: camera, focus (3,) around which it turns, and up direction (3,), a unit vector."""
 
     camera: Camera
     focus: Array
@@ -94,19 +95,22 @@ class Viewpoint(NamedTuple):
 
 
 def first_photo(cameras: list[Camera]) -> Viewpoint:
-    """The first of a scene's cameras.
+    """Viewpoint of the first camera of a scene.
 
     Raises
     ------
     InputError
-        If there is none.
+        If there is no camera.
     """
     return Viewpoint(cameras[0], focus_point(cameras), _up(cameras))
 
 
 def overview(gaussians: Gaussians) -> Viewpoint:
-    """A first look at a scene of which no cameras are known: from before it and a little above, `FIELD_OF_VIEW`
-    across the shorter edge of the picture. Up is -y, as in most scenes of photogrammetry."""
+    """Viewpoint for a scene without cameras: in front of it and a little above.
+
+    The field of view across the shorter edge of the picture is `FIELD_OF_VIEW`. Up is -y, as in most scenes of
+    photogrammetry.
+    """
     centre, radius = bounds(gaussians)
     up = np.array([0.0, -1.0, 0.0])
     eye = centre + OVERVIEW_RADII * radius * (math.sin(OVERVIEW_HEIGHT) * up - [0, 0, math.cos(OVERVIEW_HEIGHT)])
@@ -115,8 +119,8 @@ def overview(gaussians: Gaussians) -> Viewpoint:
 
 
 def _up(cameras: list[Camera]) -> Array:
-    """The mean of the directions to the photos' upper edges, a unit vector."""
+    """Mean of the cameras' up vectors, a unit vector."""
     ups = np.array([-camera.viewmat[1, :3] for camera in cameras])
     up = ups.mean(axis=0)
-    up = up if np.linalg.norm(up) > 1e-3 else ups[0]  # as many upside down as not: the first decides
+    up = up if np.linalg.norm(up) > 1e-3 else ups[0]  # the up vectors cancel: half of the cameras are upside down
     return np.asarray(up / np.linalg.norm(up))

@@ -1,27 +1,13 @@
-"""What a person looks at after a run: the page of an evaluation, the training curve, pictures side by side."""
+"""The page of an evaluation."""
 
 import html
-import json
 import math
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
-from numpy.typing import NDArray
-
 from clsplat.atomic import replacing
-from clsplat.errors import InputError
-from clsplat.metrics import to_uint8
-
-Array = NDArray[Any]
-
-DIFFERENCE_MAX = 0.2
-"""Mean absolute difference of the channels, of full scale 1, at which the difference picture saturates: errors look
-five times as large as they are."""
-
-COLOR_MAP = "magma"
-"""Perceptually uniform: equal steps of the difference look equally large."""
+from clsplat.show.pictures import DIFFERENCE_MAX, palette
 
 METRICS = {
     "psnr": ("PSNR", "dB", 2, "higher"),
@@ -29,8 +15,7 @@ METRICS = {
     "ssim": ("SSIM", "", 3, "higher"),
     "flip": ("FLIP", "", 3, "lower"),
 }
-"""Metric -> its name, unit, decimals on the page, and which direction is better."""
-
+"""Name, unit, number of decimals and better direction of each metric."""
 
 PAGE = """<!doctype html>
 <html lang="en">
@@ -118,137 +103,15 @@ order.onclick = event => {
 """
 
 
-def save_png(path: Path, image: Array) -> None:
-    """Write an image, (H, W, 3) uint8 or float in [0, 1], as PNG, whole or not at all."""
-    from PIL import Image
-
-    with replacing(path) as file:
-        Image.fromarray(to_uint8(image)).save(file, format="PNG")
-
-
-def save_difference(path: Path, image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> None:
-    """Write the mean absolute difference of the channels as a PNG in magma, saturated at `DIFFERENCE_MAX`.
-
-    Parameters
-    ----------
-    path : Path
-    image, truth : (H, W, 3) uint8 or float in [0, 1]
-    mask : (H, W) bool, optional
-        Pixels that do not count are drawn as equal.
-    """
-    from PIL import Image
-
-    error = np.abs(to_uint8(image).astype(np.float64) - to_uint8(truth)).mean(axis=2)
-    level = np.rint(np.minimum(error / DIFFERENCE_MAX, 255)).astype(np.uint8)
-    picture = Image.fromarray(level if mask is None else level * mask)
-    picture.putpalette(_palette(256).tobytes())
-    with replacing(path) as file:
-        picture.save(file, format="PNG")
-
-
-def side_by_side(path: Path, pairs: list[tuple[Array, Array]]) -> None:
-    """Write a PNG with one row per pair: the photo on the left, its render on the right.
-
-    Parameters
-    ----------
-    path : Path
-    pairs : list of ((H, W, 3), (H, W, 3))
-        Photo and render, uint8 or float in [0, 1]; rows may differ in size.
-
-    Raises
-    ------
-    InputError
-        If there is no pair, or the file cannot be written.
-    """
-    from PIL import Image, ImageDraw, ImageFont
-
-    if not pairs:
-        raise InputError("pairs: expected at least one photo and its render, found none")
-    gap, margin = 8, 28
-    rows = [[to_uint8(image) for image in pair] for pair in pairs]
-    column = max(image.shape[1] for row in rows for image in row)
-    height = margin + sum(max(image.shape[0] for image in row) + gap for row in rows)
-    sheet = Image.new("RGB", (2 * column + 3 * gap, height), "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(16)
-    for k, label in enumerate(("photo", "render")):
-        draw.text((gap + k * (column + gap), margin / 2), label, fill="black", font=font, anchor="lm")
-    top = margin
-    for row in rows:
-        for k, image in enumerate(row):
-            sheet.paste(Image.fromarray(image), (gap + k * (column + gap), top))
-        top += max(image.shape[0] for image in row) + gap
-    with replacing(path) as file:
-        sheet.save(file, format="PNG")
-
-
-def training_curve(log: Path, path: Path) -> None:
-    """Draw a training log as a PNG: loss and held-out PSNR, and below them the number of Gaussians.
-
-    Parameters
-    ----------
-    log : Path
-        JSON objects, one per line, with iteration, num_gaussians, seconds, and loss, psnr or both. A last line
-        without its end is still being written and left out.
-    path : Path
-        The PNG.
-
-    Raises
-    ------
-    InputError
-        If the log cannot be read, has no line or a line that is no such object, or the PNG cannot be written.
-    """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    records = read_log(log)
-    figure = Figure(figsize=(8, 5.5), dpi=150, layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
-    for axes in (upper, lower):
-        axes.grid(color="0.9")
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.0f}"))
-
-    blue, orange, green = "#0072b2", "#d55e00", "#009e73"  # Okabe and Ito's: told apart with any colour vision
-    losses = np.array([(r["iteration"], r["loss"]) for r in records if "loss" in r]).reshape(-1, 2)
-    if len(losses):
-        width = max(1, len(losses) // 50)  # photos differ by more than training gains in this time
-        smooth = np.convolve(losses[:, 1], np.ones(width) / width, mode="valid")
-        first = (width - 1) // 2
-        upper.semilogy(*losses.T, color=blue, alpha=0.25, linewidth=0.8)
-        upper.semilogy(losses[first : first + len(smooth), 0], smooth, color=blue, linewidth=1.6)
-        upper.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 4, 5, 7)))
-        upper.yaxis.set_major_formatter("{x:.3g}")
-        upper.yaxis.set_minor_formatter(NullFormatter())
-    upper.set_ylabel("training loss", color=blue)
-    last = records[-1]
-    title = f"{last['iteration']:,} iterations · {last['num_gaussians']:,} Gaussians · {last['seconds']:.0f} s"
-    scores = np.array([(r["iteration"], r["psnr"]) for r in records if r.get("psnr") is not None]).reshape(-1, 2)
-    if len(scores):
-        right = upper.twinx()
-        right.plot(*scores.T, color=orange, marker="o", markersize=4)
-        right.set_ylabel("held-out PSNR (dB)", color=orange)
-        right.spines[["top", "left"]].set_visible(False)
-        title += f" · {scores[-1, 1]:.2f} dB"
-    upper.set_title(title, fontsize="medium")
-    lower.plot([r["iteration"] for r in records], [r["num_gaussians"] for r in records], color=green)
-    lower.set_ylim(bottom=0)
-    lower.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.0f}"))
-    lower.set_ylabel("Gaussians")
-    lower.set_xlabel("iteration")
-    with replacing(path) as file:
-        figure.savefig(file, format="png", metadata={"Software": None})
-
-
 def write_page(path: Path, result: dict[str, Any]) -> None:
-    """Write the page of an evaluation: figures on top, then photo, render and difference per view, worst first.
+    """Write the page of an evaluation: mean metrics, then the pictures of each view, worst view first.
 
     Parameters
     ----------
     path : Path
-        The HTML file; it links to the pictures by the relative paths in `result` and loads nothing else.
+        The HTML file. It links to the pictures by the relative paths in `result`, and loads nothing else.
     result : dict
-        What `clsplat.evaluate.evaluate` returns.
+        Result of `clsplat.evaluate.evaluate`.
     """
     views = result["views"]
     worst_first = sorted(range(len(views)), key=lambda k: _rank(views[k]))
@@ -263,7 +126,7 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
             result["device"],
         )
     )
-    steps = ", ".join(f"rgb({r} {g} {b})" for r, g, b in _palette(9))
+    steps = ", ".join(f"rgb({r} {g} {b})" for r, g, b in palette(9))
     page = PAGE.format(
         count=f"{len(views)} view{'s' if len(views) != 1 else ''}",
         facts=facts,
@@ -285,7 +148,7 @@ def _rank(view: dict[str, Any]) -> float:
 
 
 def _figure(metric: str, value: float | None) -> str:
-    """A figure with its unit; no value stands for the infinite PSNR of equal images."""
+    """A value with its unit. None stands for the infinite PSNR of equal images."""
     _, unit, decimals, _ = METRICS[metric]
     text = "∞" if value is None else f"{value:.{decimals}f}"
     return f"{text}<small> {unit}</small>" if unit else text
@@ -319,7 +182,12 @@ def _card(view: dict[str, Any], index: int) -> str:
         f"<figcaption>{caption}</figcaption></figure>"
         for kind, alt, over, caption in (
             ("truth", "Photo", "", "Photo"),
-            ("render", "Render", f'<img src="{files["truth"]}" {size} alt="">', "Render <em>point at it: photo</em>"),
+            (
+                "render",
+                "Render",
+                f'<img src="{files["truth"]}" {size} alt="">',
+                "Render <em>hover to see the photo</em>",
+            ),
             ("difference", "Difference", "", "Difference"),
         )
     )
@@ -328,36 +196,3 @@ def _card(view: dict[str, Any], index: int) -> str:
         f'<article id="view-{index}" {rank}><header><h3>{name}</h3><dl>{figures}</dl></header>'
         f"<div class=row>{pictures}</div></article>"
     )
-
-
-def read_log(path: Path) -> list[dict[str, Any]]:
-    """The records of a training log, in their order; a last line without its end is still being written and left out.
-
-    Raises
-    ------
-    InputError
-        If the log cannot be read, has no line or a line that is no record of training.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").split("\n")[:-1]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected a readable training log, found: {error}") from error
-    records = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            record = json.loads(line)
-            if not {"iteration", "num_gaussians", "seconds"} <= record.keys():
-                raise ValueError("expected iteration, num_gaussians and seconds")
-        except (ValueError, AttributeError) as error:
-            raise InputError(f"{path}, line {number}: expected a record of training, found {line[:60]!r}") from error
-        records.append(record)
-    if not records:
-        raise InputError(f"{path}: expected the records of a training run, found none")
-    return records
-
-
-def _palette(colors: int) -> NDArray[np.uint8]:
-    """`COLOR_MAP` in equal steps, (colors, 3) uint8."""
-    from matplotlib import colormaps
-
-    return colormaps[COLOR_MAP](np.linspace(0, 1, colors), bytes=True)[:, :3]

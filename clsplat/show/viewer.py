@@ -1,8 +1,9 @@
-"""The live viewer: frames by this package's own kernels, shown in a browser by viser.
+"""The live viewer: frames rendered by this package's kernels, shown in a browser by viser.
 
-One thread owns the device: the one that trains or, without training, the one that called `Viewer.hold`. viser's
-threads only note what browsers ask for; `Viewer.draw` renders it when the owner calls it, between two iterations for
-example. So neither the device nor the training needs a lock, and a training's bits do not depend on who is watching.
+One thread owns the device: the one that trains or, without a training, the one that called `Viewer.hold`. The threads
+of viser only store what browsers request. The owner renders it when it calls `Viewer.draw`, for example between two
+iterations. Therefore neither the device nor the training needs a lock, and the result of a training does not depend
+on the viewer.
 """
 
 import math
@@ -18,118 +19,44 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
-from clsplat.metrics import to_uint8
-from clsplat.reference.project import rotations
-from clsplat.renderer import Renderer, download
+from clsplat.renderer import Renderer
+from clsplat.show.browser_cameras import client_camera, whole_view, wxyz_of
 from clsplat.show.camera_paths import Viewpoint
+from clsplat.show.frames import MODES, picture
 
 if TYPE_CHECKING:
     from clsplat.scene import View
 
-MODES = ("render", "depth", "alpha", "count")
-"""What is shown: colours, the expected depth, 1 - transmittance, the number of Gaussians drawn per pixel."""
-
 FRAME_TIME = 0.1
-"""Seconds that a frame may take while the camera moves: the resolution follows from it. Below 10 frames per second a
-picture no longer seems to react to the hand (Card, Robertson and Mackinlay 1991, "immediate response")."""
+"""Time of a frame while the camera moves, s. The resolution is chosen to keep it. Below 10 frames per second a
+picture no longer seems to react immediately (Card, Robertson and Mackinlay 1991, "immediate response")."""
 
 STILL_AFTER = 0.25
-"""Seconds without a movement after which frames are refined, up to the size of the window."""
+"""Time without a movement after which frames are refined, up to the size of the window, s."""
 
 SMALLEST_SHARE = 1 / 8
-"""Of the window's edges: the coarsest a frame becomes while the camera moves."""
+"""Smallest resolution of a frame while the camera moves, as a fraction of the window's edges."""
 
 TRAINING_SHARE = 0.1
-"""Of the time that frames nobody moved for may take from training."""
+"""Largest fraction of a training's time that frames take while the camera stands still, 0 to 1."""
 
 JPEG_QUALITY = 90
-"""Of frames: 75, viser's default, shows blocks in smooth depths."""
+"""JPEG quality of frames. viser's default of 75 shows blocks in smooth depths."""
 
 FRUSTUM_SHARE = 0.025
-"""Size of a camera's frustum, in mean distances of the cameras from what they look at: some fifty do not hide it."""
+"""Size of a camera's frustum, as a fraction of the cameras' mean distance from the focus. Some fifty frusta of this
+size do not hide the scene."""
 
 TEXT_EVERY = 0.25
-"""Seconds between two updates of the panel's text."""
-
-
-def client_camera(wxyz: Any, position: Any, fov: float, width: int, height: int) -> Camera:
-    """The camera of a browser's window.
-
-    Parameters
-    ----------
-    wxyz, position : (4,), (3,)
-        Camera to world, OpenCV axes, as viser reports them.
-    fov : float
-        Vertical field of view, radians.
-    width, height : int
-        Size of the window in pixels.
-    """
-    viewmat = np.eye(4)
-    quat = np.asarray(wxyz, dtype=np.float64)
-    viewmat[:3, :3] = rotations(quat / np.linalg.norm(quat)).T
-    viewmat[:3, 3] = -viewmat[:3, :3] @ np.asarray(position, dtype=np.float64)
-    f = height / 2 / math.tan(fov / 2)
-    return Camera(viewmat, f, f, width / 2, height / 2, width, height)
-
-
-def wxyz_of(camera: Camera) -> NDArray[np.float64]:
-    """Orientation of a camera, camera to world, as viser takes it, (4,)."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(np.roll(Rotation.from_matrix(camera.viewmat[:3, :3].T).as_quat(), 1))
-
-
-def whole_view(camera: Camera, aspect: float) -> float:
-    """Vertical field of view, radians, in which a window of `aspect` (width over height) shows all of a camera's."""
-    return 2 * math.atan(max(camera.height / camera.fy, camera.width / camera.fx / aspect) / 2)
-
-
-def picture(renderer: Renderer, gaussians: Gaussians, camera: Camera, mode: str) -> tuple[NDArray[np.uint8], str]:
-    """Render one frame.
-
-    Parameters
-    ----------
-    renderer : Renderer
-    gaussians : Gaussians
-        On the host or on the renderer's device.
-    camera : Camera
-    mode : str
-        One of `MODES`.
-
-    Returns
-    -------
-    frame : (H, W, 3) uint8
-    legend : str
-        Meaning of its colours; empty for the render.
-    """
-    run = renderer.forward(gaussians, camera, depth=mode == "depth", gradients=False)
-    if mode == "count":
-        count = download(renderer.stages.count_pairs(run.splats, run.bins)[1])
-        most = max(int(count.max()), 1)
-        return _colored(count / most), f"dark 0, bright {most} Gaussians per pixel; mean {count.mean():.1f}"
-    image, alpha = download(run.image.rgb), download(run.image.alpha)
-    if mode == "alpha":
-        return to_uint8(np.repeat(alpha[:, :, None], 3, axis=2)), "black transparent, white opaque"
-    if mode == "depth":
-        solid = alpha > 0.5
-        if not solid.any():
-            return np.zeros((*alpha.shape, 3), np.uint8), "nothing opaque in view"
-        depth = image[:, :, 3] / np.where(solid, alpha, 1)
-        near, far = np.percentile(depth[solid], [2, 98])
-        frame = _colored(1 - (depth - near) / max(far - near, 1e-12))
-        return np.where(solid[:, :, None], frame, 0).astype(np.uint8), f"bright {near:.3g}, dark {far:.3g} units away"
-    return to_uint8(image), ""
-
-
-def _colored(values: NDArray[Any]) -> NDArray[np.uint8]:
-    from matplotlib import colormaps
-
-    return np.asarray(colormaps["inferno"](np.clip(values, 0, 1), bytes=True)[:, :, :3])
+"""Time between two updates of the panel's text, s."""
 
 
 class _Shown(NamedTuple):
-    """What a browser shows: the camera and mode it asked for, at what share of its window's edges, the state of the
-    scene, when it was done and the seconds it took."""
+    """The frame that a browser shows.
+
+    `camera` and `mode` are those it requested, `share` is the resolution as a fraction of the window's edges,
+    `version` the state of the scene, `at` the time of completion, s, and `seconds` the time it took.
+    """
 
     camera: Camera
     mode: str
@@ -145,7 +72,8 @@ class _Client:
     camera: Camera | None = None
     moved: float = 0.0
     share: float = 0.25
-    """Of the window's edges, at which a frame takes `FRAME_TIME`: found while frames are drawn."""
+    """Resolution at which a frame takes `FRAME_TIME`, as a fraction of the window's edges. Adapted with each
+    frame."""
     shown: _Shown | None = None
 
 
@@ -156,18 +84,19 @@ class Viewer:
     ----------
     renderer : Renderer
     start : Viewpoint
-        Where browsers start. The mouse turns around the point on a camera's axis that is beside the focus.
+        First view of each browser. The mouse turns the view around the point of the camera's axis nearest to the
+        focus.
     views : list of View
-        Photos whose cameras are shown; a click on one goes there.
+        Photos whose cameras are shown as frusta. A click on a frustum moves the view to that camera.
     host : str
-        Address to listen at.
+        Address that the server listens on.
     port : int
-        The first one tried; the next free one is taken.
+        First port to try. If it is taken, the next free one is used.
 
     Raises
     ------
     InputError
-        If the package viser is missing.
+        If the package viser is not installed.
     """
 
     def __init__(
@@ -209,7 +138,7 @@ class Viewer:
         self._server.scene.set_up_direction(tuple(start.up))
         first, initial = start.camera, self._server.initial_camera
         initial.position, initial.look_at = tuple(first.position), tuple(self._target(first))
-        # Up without its part to the right looks as the photo does, and tilts the mouse's axis no more than needed.
+        # Without its component to the right, the up vector reproduces the photo and tilts the mouse's axis least.
         right = first.viewmat[0, :3]
         initial.up = tuple(start.up - (start.up @ right) * right)
         initial.fov = whole_view(first, first.width / first.height)
@@ -217,7 +146,7 @@ class Viewer:
         self._server.on_client_disconnect(self._disconnect)
 
     def _add_cameras(self, views: "list[View]") -> None:
-        """A frustum each, and a box to tick: those that stand nearest hide the scene."""
+        """Add a frustum per camera, and a checkbox to hide them: near ones can cover the scene."""
         parent = self._server.scene.add_frame("/cameras", show_axes=False)
         shown = self._server.gui.add_checkbox("Cameras", True)
         centres = np.array([view.camera.position for view in views])
@@ -229,7 +158,7 @@ class Viewer:
             parent.visible = shown.value
 
     def _target(self, camera: Camera) -> NDArray[np.float64]:
-        """The point on a camera's axis beside the focus; or as far ahead as that is behind."""
+        """The point of a camera's axis nearest to the focus, mirrored to the front if it is behind the camera."""
         axis = camera.viewmat[2, :3]
         distance = abs(float((self._focus - camera.position) @ axis))
         return np.asarray(camera.position + max(distance, 1e-3) * axis)
@@ -253,7 +182,7 @@ class Viewer:
             self._jump(event.client, camera)
 
     def _jump(self, client: Any, camera: Camera) -> None:
-        """Bring a browser to a camera."""
+        """Move a browser's view to a camera."""
         with client.atomic():
             client.camera.position = camera.position
             client.camera.look_at = self._target(camera)
@@ -278,7 +207,7 @@ class Viewer:
         self._clients.pop(handle.client_id, None)
 
     def draw(self, gaussians: Gaussians) -> bool:
-        """Render for every browser that waits for it, one frame each, on the thread that owns the device.
+        """Render one frame for each browser that waits for one. Call it on the thread that owns the device.
 
         Parameters
         ----------
@@ -288,7 +217,7 @@ class Viewer:
         Returns
         -------
         bool
-            Whether there was anything to render.
+            True if a frame was rendered.
         """
         due = [(c, self._share_due(c, time.perf_counter())) for c in list(self._clients.values())]
         due = [(client, share) for client, share in due if share]
@@ -300,7 +229,7 @@ class Viewer:
         return bool(due)
 
     def _share_due(self, client: _Client, now: float) -> float:
-        """The share of the window's edges at which the next frame is due; 0: none."""
+        """Resolution of the next frame, as a fraction of the window's edges; 0 if no frame is due."""
         shown = client.shown
         if client.camera is None:
             return 0.0
@@ -308,7 +237,7 @@ class Viewer:
             return client.share
         if now - client.moved < STILL_AFTER:
             return 0.0
-        if shown.share < 1:  # by steps, so that a movement never waits longer than for one of them
+        if shown.share < 1:  # in steps, so that a movement waits for one of them at most
             return min(1.0, 2 * shown.share)
         stale = shown.version != self._version and now - shown.at > shown.seconds / TRAINING_SHARE
         return 1.0 if stale else 0.0
@@ -319,10 +248,10 @@ class Viewer:
         small = camera.resized(*(max(1, round(share * edge)) for edge in (camera.width, camera.height)))
         try:
             frame, legend = picture(self._renderer, gaussians, small, mode)
-        except DeviceError as error:  # a training goes on without a picture
+        except DeviceError as error:  # must not end a training
             frame, legend = np.zeros((1, 1, 3), np.uint8), str(error)
         if not any(c is client for c in self._clients.values()):
-            return  # the browser has been closed in the meantime
+            return  # the browser was closed in the meantime
         client.handle.scene.set_background_image(frame, format="jpeg", jpeg_quality=JPEG_QUALITY)
         now = time.perf_counter()
         if share == client.share:
@@ -337,14 +266,14 @@ class Viewer:
             self._text.content, self._written = text, now
 
     def hold(self, gaussians: Gaussians, until: Callable[[], bool] = lambda: False) -> None:
-        """Show Gaussians that do not change, until `until` says so or Ctrl-C is pressed.
+        """Show Gaussians that do not change, until `until` returns True or Ctrl-C is pressed.
 
         Parameters
         ----------
         gaussians : Gaussians
             On the device or the host.
         until : callable
-            Asked some ten times a second.
+            Called about ten times a second.
         """
         gaussians = self._renderer.place(gaussians)
         self._version += 1
@@ -354,19 +283,21 @@ class Viewer:
                 self._asked.wait(STILL_AFTER / 2)
 
     def tell(self, facts: dict[str, str]) -> None:
-        """What the panel says of the scene, below the modes: lines of name and value."""
+        """Set the facts about the scene that the panel shows below the modes, by name."""
         self._facts = "  \n".join(f"**{name}** {value}" for name, value in facts.items())
         self._write()
 
     def follow(self, gaussians: Gaussians, interrupted: Callable[[], bool]) -> None:
-        """Between two iterations of training: draw what browsers ask for; wait while training is paused.
+        """Draw the frames that browsers request, and wait while the training is paused.
+
+        A training calls this between two iterations.
 
         Parameters
         ----------
         gaussians : Gaussians
-            As they are now, on the device or the host.
+            Current state, on the device or the host.
         interrupted : callable
-            Whether the user has asked for the end, which ends a pause as well.
+            Returns True when the user has interrupted the training, which also ends a pause.
         """
         if self._pause is None:
             self._pause = self._server.gui.add_button("Pause training")

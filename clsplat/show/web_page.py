@@ -1,7 +1,7 @@
-"""A scene as one HTML file that shows itself in any browser with WebGL2, without a network.
+"""A scene as one HTML file, which any browser with WebGL2 shows without a network.
 
-The page is PlayCanvas' SuperSplat Viewer (MIT; clsplat/show/vendor/README.md) with the scene, as SOG, and a first
-camera in the block that its `renderViewerHtml` leaves for them.
+The page is PlayCanvas' SuperSplat Viewer (MIT; clsplat/show/vendor/README.md). Its `renderViewerHtml` leaves a block
+for the content, into which the scene, as SOG, and the first camera are written.
 """
 
 import base64
@@ -32,11 +32,13 @@ TITLE = "<title>SuperSplat Viewer</title>"
 BOOTSTRAP = '<script type="application/json" id="sse-bootstrap">\n            null\n'
 STILL = "noanim: url.searchParams.has('noanim')"
 ANTIALIASED = "aa: url.searchParams.has('aa')"
-"""Where the viewer's page says its own name, expects what it is to show, and chooses whether the camera stands still
-at first (else it circles, and soon shows what no photo did) and whether opacities are Mip-Splatting's."""
+"""Parts of the viewer's page that are replaced: its title, its content, whether the camera stands still at first
+(otherwise it circles, and soon leaves the directions of the photos), and whether opacities are those of
+Mip-Splatting."""
 
 SAMPLES = 64
-"""Random directions at which spherical harmonics are compared: more than the 16 coefficients of degree 3."""
+"""Number of random directions at which spherical harmonics are compared. It must exceed the 16 coefficients of degree
+3."""
 
 
 def save_page(path: str | Path, gaussians: Gaussians, mode: Mode, start: Viewpoint, background: Background) -> None:
@@ -45,14 +47,14 @@ def save_page(path: str | Path, gaussians: Gaussians, mode: Mode, start: Viewpoi
     Parameters
     ----------
     path : str or Path
-        The file; its folder must exist.
+        The file. Its folder must exist.
     gaussians : Gaussians
         At least one, finite.
     mode : {"classic", "antialiased"}
-        The rendering mode they were trained for.
+        The rendering mode that they were trained for.
     start : Viewpoint
-        What is shown first. The viewer keeps its horizon level: a roll of the camera is lost, and the scene is turned
-        so that `start.up` is upright.
+        The first view. The viewer keeps its horizon level: the scene is turned so that `start.up` is upright, and a
+        roll of the camera is lost.
     background : {"black", "white"}
 
     Raises
@@ -68,38 +70,19 @@ def save_page(path: str | Path, gaussians: Gaussians, mode: Mode, start: Viewpoi
         data = base64.b64encode(scene.read_bytes()).decode()
     axis = camera.viewmat[2, :3]
     target = camera.position + max(abs(float((start.focus - camera.position) @ axis)), 1e-3) * axis
+    # Contrary to the viewer's documentation, this is the field of view across the window's longer edge.
+    fov = math.degrees(2 * math.atan(max(camera.width / camera.fx, camera.height / camera.fy) / 2))
     shown = {
         "contentUrl": f"data:application/octet-stream;base64,{data}",
         "contentFilename": "scene.sog",
-        "settings": {
-            "version": 2,
-            "tonemapping": "none",
-            "highPrecisionRendering": False,
-            "background": {"color": list(BACKGROUNDS[background])},
-            "postEffectSettings": POST_EFFECTS,
-            "animTracks": [],
-            "cameras": [
-                {
-                    "initial": {
-                        "position": _viewer_axes(turn @ camera.position),
-                        "target": _viewer_axes(turn @ target),
-                        # It becomes that of the window's longer edge, whatever the viewer's documentation says.
-                        "fov": math.degrees(
-                            2 * math.atan(max(camera.width / camera.fx, camera.height / camera.fy) / 2)
-                        ),
-                    }
-                }
-            ],
-            "annotations": [],
-            "startMode": "default",
-        },
+        "settings": _settings(turn @ camera.position, turn @ target, fov, background),
     }
     licence = (VENDOR / "supersplat-viewer.LICENSE").read_text(encoding="utf-8")
     notice = f"<!--\nShown by SuperSplat Viewer, https://github.com/playcanvas/supersplat-viewer\n\n{licence}-->\n"
     page = gzip.decompress((VENDOR / "supersplat-viewer.html.gz").read_bytes()).decode()
     for place, content in (
         (TITLE, f"<title>{html.escape(path.stem)}</title>"),
-        # No "<" may stand in a script, where "</script>" would end it.
+        # A script must not contain "<": "</script>" would end it.
         (BOOTSTRAP, BOOTSTRAP.replace("null", json.dumps(shown).replace("<", "\\u003c"))),
         (STILL, "noanim: true"),
         (ANTIALIASED, f"aa: {'true' if mode == 'antialiased' else 'false'}"),
@@ -111,6 +94,22 @@ def save_page(path: str | Path, gaussians: Gaussians, mode: Mode, start: Viewpoi
         file.write(page.encode())
 
 
+def _settings(position: Array, target: Array, fov: float, background: Background) -> dict[str, Any]:
+    """Settings of the viewer: background and first camera, everything else off."""
+    camera = {"position": _viewer_axes(position), "target": _viewer_axes(target), "fov": fov}
+    return {
+        "version": 2,
+        "tonemapping": "none",
+        "highPrecisionRendering": False,
+        "background": {"color": list(BACKGROUNDS[background])},
+        "postEffectSettings": POST_EFFECTS,
+        "animTracks": [],
+        "cameras": [{"initial": camera}],
+        "annotations": [],
+        "startMode": "default",
+    }
+
+
 POST_EFFECTS: dict[str, dict[str, Any]] = {
     "sharpness": {"enabled": False, "amount": 0},
     "bloom": {"enabled": False, "intensity": 0.1, "blurLevel": 2},
@@ -118,16 +117,16 @@ POST_EFFECTS: dict[str, dict[str, Any]] = {
     "vignette": {"enabled": False, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
     "fringing": {"enabled": False, "intensity": 0.5},
 }
-"""The viewer's defaults, all off; it wants them spelled out."""
+"""The viewer's defaults, all off. The viewer requires each of them."""
 
 
 def _viewer_axes(point: Array) -> list[float]:
-    """A point of a scene with y down in the viewer's world, y up: it turns scenes by 180 degrees about z."""
+    """Convert a point of a scene, y down, to the viewer's world, y up, which is turned by 180 degrees about z."""
     return [-float(point[0]), -float(point[1]), float(point[2])]
 
 
 def upright(up: Array) -> Array:
-    """The smallest rotation, (3, 3), that brings `up` (3,) to -y."""
+    """The smallest rotation (3, 3) that turns `up` (3,) to -y."""
     from scipy.spatial.transform import Rotation
 
     if np.allclose(up / np.linalg.norm(up), [0, -1, 0], atol=1e-6):
@@ -136,10 +135,10 @@ def upright(up: Array) -> Array:
 
 
 def rotated(gaussians: Gaussians, rotation: Array) -> Gaussians:
-    """The Gaussians in a world turned by `rotation` (3, 3), view dependence included.
+    """The Gaussians in a world turned by `rotation` (3, 3), including their view dependence.
 
-    The turned colour is c'(d) = c(R^T d) for every direction d. The basis of each degree is closed under rotations:
-    the least squares over directions, by which the new coefficients are found, have no residual.
+    The turned colour is c'(d) = c(R^T d) for every direction d. A least-squares fit over directions finds the new
+    coefficients. The fit is exact, because the basis of each degree is closed under rotations.
     """
     from scipy.spatial.transform import Rotation
 

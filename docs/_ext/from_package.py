@@ -6,7 +6,7 @@
 ``{presets}``: settings of each preset.
 ``{bench_kernels} FILE [WORKLOAD]``: results of ``clsplat bench kernels -o FILE``, or the stages of one workload.
 ``{bench_knobs} FILE``: table of ``clsplat bench knobs -o FILE``.
-``{bench_stability} FILE``: rows and charts that ``clsplat bench stability`` wrote to the folder of FILE.
+``{bench_stability} FILE``: rows and charts that ``make bench-stability`` wrote to the folder of FILE.
 ``{bench_quality} FILE [COST]``: place and date at which ``clsplat bench quality`` measured the records in FILE, or
 charts and table of one cost.
 ``{published_quality}``: chart and table of the original paper.
@@ -27,14 +27,14 @@ from typing import Any
 
 from docutils import nodes
 from matplotlib.figure import Figure
+from scene_experiments import ALL_EXPERIMENTS
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from clsplat import cli, config, constants
-from clsplat.bench import charts, results, summary
+from clsplat.bench import charts, quality_summary, results
 from clsplat.bench import kernel_report as report
 from clsplat.bench.knob_report import knobs_text
-from clsplat.bench.stability import EXPERIMENTS
 from clsplat.bench.stability import stability_report as stability
 from clsplat.training import presets
 
@@ -234,10 +234,10 @@ class BenchStability(SphinxDirective):
         relative, path = self.env.relfn2path(self.arguments[0])
         self.env.note_dependency(relative)
         results = json.loads(Path(path).read_text())
-        parts = [stability.table(results), "Measured on", stability.origin(results)]
+        parts = [stability.table(results, ALL_EXPERIMENTS), "Measured on", stability.origin(results, ALL_EXPERIMENTS)]
         folder = self.arguments[0].rpartition("/")[0]
-        for name in stability.charts(results):
-            failure = EXPERIMENTS[name].failure
+        for name in stability.charts(results, ALL_EXPERIMENTS):
+            failure = ALL_EXPERIMENTS[name].failure
             parts.append(f"![{failure}: results without and with the remedy]({folder}/{stability.chart_file(name)})")
         return self.parse_text_to_nodes("\n\n".join(parts))
 
@@ -268,20 +268,21 @@ class BenchQuality(Charts):
         relative, path = self.env.relfn2path(self.arguments[0])
         self.env.note_dependency(relative)
         records = results.read_records(Path(path))
-        finished = summary.runs(records)
+        finished = quality_summary.runs(records)
         if len(self.arguments) == 1:
-            parts = [self.list(summary.origins(records))]
-            if failed := summary.failures(records):
+            parts = [self.list(quality_summary.origins(records))]
+            if failed := quality_summary.failures(records):
                 parts.append(self.table([["failed", "reason"], *map(list, failed)]))
             return self.parse_text_to_nodes("\n\n".join(parts))
         cost, parts = self.arguments[1], []
-        metrics = summary.measured_metrics(finished)
-        for metric in metrics if cost == "seconds" else metrics[:1]:  # the table has all metrics
-            axes = f"{summary.METRICS[metric].name} against {summary.COSTS[cost].name}"
+        metrics = quality_summary.measured_metrics(finished)
+        for metric in metrics if cost == "seconds" else metrics[:1]:  # the table has them all
+            names = quality_summary.METRICS[metric].name, quality_summary.COSTS[cost].name
+            text = f"{names[0]} against {names[1]}; the table below has the figures"
             figure = charts.quality_chart(finished, cost, metric)
-            parts += [self.chart(figure, f"{Path(path).stem}-{cost}-{metric}", f"{axes}; see the table below")]
-            parts += [self.list(summary.verdict(finished, cost, metric))]
-        return self.parse_text_to_nodes("\n\n".join([*parts, self.table(summary.table(finished, cost))]))
+            parts += [self.chart(figure, f"{Path(path).stem}-{cost}-{metric}", text)]
+            parts += [self.list(quality_summary.verdict(finished, cost, metric))]
+        return self.parse_text_to_nodes("\n\n".join([*parts, self.table(quality_summary.table(finished, cost))]))
 
     def list(self, sentences: list[str]) -> str:
         return "\n".join(f"* {_prose(sentence)}" for sentence in sentences)

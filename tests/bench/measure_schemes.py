@@ -1,4 +1,4 @@
-"""Times both schemes of the stage bin: the table of docs/stages/bin.md."""
+"""Time both schemes of the stage bin, for the table of docs/stages/bin.md."""
 
 import time
 
@@ -15,7 +15,7 @@ ROUNDS = 15
 
 
 def measure(device, splats, width, height):
-    """Medians of alternated runs by (scheme, gradients): wall time and processor time over the cores, ms."""
+    """Medians of alternating runs by (scheme, gradients): wall time, and processor time per core, ms."""
     kinds = [(scheme, gradients) for scheme in ("global", "per_tile") for gradients in (True, False)]
     cores = device.cl_device.max_compute_units if device.is_cpu else 1
     times = {kind: [] for kind in kinds}

@@ -1,4 +1,4 @@
-"""The charts of `clsplat bench quality`: fronts by brute force, means by hand, labels that can be read, one page."""
+"""Charts of `clsplat bench quality`: Pareto fronts, means, positions of labels, and the page."""
 
 import json
 import re
@@ -11,7 +11,7 @@ from matplotlib.text import Text
 from clsplat.bench import charts
 from clsplat.bench import charts_page as page
 from clsplat.bench.charts import published_chart, published_table, quality_chart, read_published
-from clsplat.bench.summary import (
+from clsplat.bench.quality_summary import (
     COSTS,
     MEAN,
     METRICS,
@@ -62,7 +62,7 @@ def training(scene, method, cap, seconds, psnr, gaussians=1000, fps=30.0, iterat
 
 @pytest.fixture
 def records():
-    """Two methods, one of them with two caps, on two scenes; one training that failed, one that has not ended."""
+    """Two methods, one of them with two caps, on two scenes; a training that failed, and one that is not finished."""
     found = []
     for scene, shift in zip(SCENES, (0, 2), strict=True):
         found += training(scene, "paper-7k", None, 100, 28 + shift, 4000, fps=10)
@@ -73,7 +73,7 @@ def records():
     return found + training("fox:downscale=2", "mcmc", 7, 1, 99)[:-1]
 
 
-def test_the_front_is_what_nobody_beats():
+def test_the_front_is_what_no_point_dominates():
     rng = np.random.default_rng(0)
     for _ in range(50):
         points = [tuple(map(float, p)) for p in rng.integers(0, 6, (8, 2))]
@@ -85,7 +85,7 @@ def test_the_front_is_what_nobody_beats():
     assert front([]) == []
 
 
-def test_what_has_not_ended_is_no_result(records):
+def test_unfinished_trainings_are_not_results(records):
     found = runs(records)
     assert len(found) == 8
     assert not any(run.method == "mcmc" for run in found)
@@ -94,7 +94,7 @@ def test_what_has_not_ended_is_no_result(records):
     assert failures(records) == [("two, fast · 8 it", "two: expected 3 photos, found 2")]
 
 
-def test_methods_say_on_which_device(records):
+def test_names_of_methods_include_the_device(records):
     records += training("fox:downscale=2", "fast", 500, 3, 26, device="there")
     assert {"fast (here)", "fast (there)"} <= {run.method for run in runs(records)}
 
@@ -129,9 +129,9 @@ def test_the_front_in_words(records, cost, expected):
     assert [run.setting for run in best_settings(panels(found)[MEAN], cost, "psnr")] == expected
     sentences = verdict(found, cost, "psnr")
     assert len(sentences) == 3
-    assert sentences[0].startswith("On the mean, ")
+    assert sentences[0].startswith("Mean over scenes, ")
     assert sentences[1].startswith("fox, ")
-    assert all(f": {', '.join(expected)}; beaten: bad · 8 it." in sentence for sentence in sentences)
+    assert all(f": {', '.join(expected)}; dominated: bad · 8 it." in sentence for sentence in sentences)
 
 
 def test_the_table_has_every_figure(records):
@@ -147,7 +147,7 @@ def test_origins(records):
     (line,) = origins(records + later)
     assert line.startswith("here, 2 compute units, driver 3; clsplat 1, commit abc; 2026-11-21 to 2026-11-22, load")
     assert line.endswith(" 2.0")
-    assert "times do not count" in origins([records[0] | {"load": 2.1}])[0]
+    assert "times are not valid" in origins([records[0] | {"load": 2.1}])[0]
     assert len(origins([*records, records[0] | {"commit": "def"}])) == 2
 
 
@@ -157,10 +157,10 @@ def test_short_numbers():
 
 
 def readable(figure, axes, texts):
-    """Whether each text is there once, none lies on another, and all are within the axes."""
+    """Whether each text occurs once, no two overlap, and all are within the axes."""
     figure.draw_without_rendering()
     assert sorted(t.get_text() for t in axes.texts) == sorted(texts)
-    # Of an annotation, its line included.
+    # The extent of an annotation would include its line.
     found, frame = [Text.get_window_extent(t) for t in axes.texts], axes.get_window_extent()
     for i, a in enumerate(found):
         assert frame.x0 <= a.x0 and a.x1 <= frame.x1 and frame.y0 <= a.y0 and a.y1 <= frame.y1, texts
@@ -215,7 +215,7 @@ def test_published_figures():
 
 @pytest.fixture
 def empty_charts(monkeypatch):
-    """What is drawn is tested above, and takes seconds."""
+    """Replace charts by empty ones: other tests check the drawing, which takes seconds."""
     for name in ("quality_chart", "published_chart"):
         monkeypatch.setattr(page, name, lambda *_: Figure(figsize=(1, 1)))
 
@@ -226,7 +226,13 @@ def test_the_page_stands_alone(records, tmp_path, empty_charts):
     assert not re.findall(r"(?:src|href)=\"(?!data:|#)", text)
     assert "url(" not in text and "@import" not in text
     assert text.count("data:image/svg+xml;base64,") == 2 * (len(COSTS) + 1)
-    for expected in ("expected 3 photos, found 2", "fast · ≤500 · 8 it", "other hardware", "On the mean", "commit a"):
+    for expected in (
+        "expected 3 photos, found 2",
+        "fast · ≤500 · 8 it",
+        "other hardware",
+        "Mean over scenes",
+        "commit a",
+    ):
         assert expected in text, expected
     kinds = ("time", "processor-time", "gaussians", "bytes", "memory", "speed", "published")
     drawn = {f"{kind}-{metric}" for kind in kinds for metric in ("psnr", "ssim")}
@@ -234,7 +240,7 @@ def test_the_page_stands_alone(records, tmp_path, empty_charts):
     assert {path.name for path in tmp_path.iterdir()} == files | {"index.html"}
 
 
-def test_a_bench_where_all_failed_has_a_page(tmp_path):
+def test_a_bench_in_which_all_trainings_failed_has_a_page(tmp_path):
     page.write_charts([record(failed="why <not>")], tmp_path)
     assert "why &lt;not&gt;" in (tmp_path / "index.html").read_text()
 

@@ -1,5 +1,7 @@
-"""`clsplat bench`: what the micro-benchmarks compute, and that every figure shown is the one
-measured. Nothing here depends on how fast anything is."""
+"""`clsplat bench kernels`: the micro-benchmarks compute what they claim, and reports show the measured figures.
+
+No test depends on the speed of the machine.
+"""
 
 import json
 import math
@@ -41,18 +43,18 @@ def quick_roof(monkeypatch):
 
 @pytest.fixture(scope="module")
 def results(device):
-    """Of two tiny workloads."""
+    """Results of two tiny workloads."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"SECONDS": 1e-4, "RUNS": 1, "LAUNCHES": 5, "BUFFER_BYTES": 2**20}.items():
             patch.setattr(roof, name, value)
         return bench_kernels([synthetic("300-40x32"), synthetic("200-56x24")], RenderConfig(), device, 3)
 
 
-def test_the_reference_workload_is_what_the_figures_are_about(device):
+def test_the_reference_workload_has_the_documented_counts(device):
     workload = synthetic("100k-640x480")
     run = Renderer(device).forward(workload.gaussians, workload.view.camera, 0)
     accepted = ops.count_pairs(device, run.splats, run.bins)[1].get()
-    # Rounding moves single pairs; the scene was tuned to 62.0 pairs per pixel and 0.365 M intersections.
+    # The scene was tuned to 62.0 pairs per pixel and 0.365 M intersections. Rounding changes single pairs.
     assert accepted.mean() == pytest.approx(62.0, abs=0.2)
     assert run.bins.gauss_ids.shape[0] == pytest.approx(365_000, rel=2e-3)
 
@@ -87,7 +89,7 @@ class TestRoof:
         assert 0.5 < measured["buffer_mib"] <= 1
 
     def test_rates_are_work_over_time(self, device, monkeypatch):
-        monkeypatch.setattr(roof, "_best", lambda device, run, runs: 2.0)  # seconds, whatever is run
+        monkeypatch.setattr(roof, "_best", lambda device, run, runs: 2.0)  # every run takes 2 s
         measured = roof.measure_roof(device)
         items = (
             4 * device.cl_device.max_compute_units * 16
@@ -179,14 +181,14 @@ class TestResults:
             both = stages["composite_fwd"]["median_ms"] + stages["composite_bwd"]["median_ms"]
             assert workload["step_over_compositing"] == pytest.approx(workload["step"]["median_ms"] / both)
 
-    def test_what_belongs_beside_figures(self, results, device):
+    def test_results_describe_their_environment(self, results, device):
         assert results["device"]["label"] == device.label
         assert results["device"]["driver"] and results["device"]["opencl"].startswith("OpenCL ")
         assert results["settings"] == {"repeats": 3, **asdict(RenderConfig())}
         assert json.loads(json.dumps(results)) == results
 
     def test_bytes_of_a_gaussian(self):
-        # By hand: 59 parameters; Adam reads and writes them and two moments and reads a gradient.
+        # 59 parameters. Adam reads and writes them and two moments, and reads a gradient.
         assert stage_bytes(10, 3, 0, 0)["project_bwd_adam"] == 10 * 4 * (59 * 6 + 17)
         assert stage_bytes(10, 0, 0, 0)["project_fwd"] == 10 * 4 * (14 + 12)
         assert stage_bytes(0, 3, 100, 0)["l1_ssim"] == 100 * 27
@@ -297,7 +299,7 @@ class TestCommand:
         main(["bench", "kernels", *files, "--repeats", "1"])
         assert re.search(r"a: 1.png: 20 Gaussians .*SH degree 3, classic", capsys.readouterr().out)
 
-    def test_bad_input_is_a_sentence(self, tmp_path, capsys):
+    def test_invalid_input_is_refused(self, tmp_path, capsys):
         assert "--repeats: expected 1 or more, found 0" in self.fails(capsys, "--repeats", 0)
         assert "--scene and --cameras: expected both" in self.fails(capsys, "--scene", "a.ply")
         assert "expected a number of Gaussians" in self.fails(capsys, "--workloads", "huge")
@@ -319,9 +321,9 @@ def page(project):
 
 
 class TestPage:
-    """docs/benchmarks.md shows what the files beside it hold: tables are made from them while the page is built."""
+    """docs/benchmarks.md shows the content of docs/results: its tables are made from these files."""
 
-    def test_results_are_whole(self, measured, results):
+    def test_results_are_complete(self, measured, results):
         assert set(measured) == set(results)
         assert set(measured["roof"]) == set(results["roof"])
         assert {w["name"] for w in measured["workloads"]} == {*DEFAULT, *scaling_names()}

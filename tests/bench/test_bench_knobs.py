@@ -1,5 +1,8 @@
-"""`clsplat bench knobs`: each setting turns one knob, errors are against the float64 twin, and every figure shown is
-the one measured. Nothing here depends on how fast anything is."""
+"""`clsplat bench knobs`: each setting changes one knob, errors are relative to the float64 twin, and reports show the
+measured figures.
+
+No test depends on the speed of the machine.
+"""
 
 import itertools
 import json
@@ -45,7 +48,7 @@ class TestModelOfADevice:
 
     @pytest.fixture
     def scene(self):
-        """One Gaussian in the middle, four times as opaque as what is skipped."""
+        """One Gaussian in the middle, four times as opaque as the threshold."""
         gaussians = synthetic_scene(1, seed=0)[0]
         gaussians.means[:] = [0, 0, 2]
         gaussians.log_scales[:] = np.log(0.5)
@@ -58,12 +61,12 @@ class TestModelOfADevice:
         for factor, empty in ((3.9, False), (4.1, True)):
             changed = Device(device.cl_device, model={"ALPHA_MIN": factor * ALPHA_MIN})
             assert (render(*scene, device=changed).rgb.max() == 0) == empty
-        # Only the pixels near the middle are drawn; this is of the compositing kernel, which compares exponents.
+        # Only pixels near the middle are drawn. The compositing kernel, which compares exponents, decides this.
         shown = render(*scene, device=Device(device.cl_device, model={"ALPHA_MIN": 2 * ALPHA_MIN})).alpha
         assert shown[shown > 0].min() >= 2 * ALPHA_MIN * (1 - 1e-5)
         assert shown.min() == 0
 
-    def test_other_devices_keep_theirs(self, scene, device):
+    def test_other_devices_keep_their_constants(self, scene, device):
         before = render(*scene, device=device).rgb
         render(*scene, device=Device(device.cl_device, model={"ALPHA_MIN": 8 * ALPHA_MIN}))
         np.testing.assert_array_equal(render(*scene, device=Device(device.cl_device)).rgb, before)
@@ -74,7 +77,7 @@ class TestModelOfADevice:
 
 
 class TestSettings:
-    def test_each_turns_one_knob(self, device):
+    def test_each_setting_changes_one_knob(self, device):
         default, *others = settings(RenderConfig(), 3, device)
         assert default == Setting("default", "", RenderConfig())
         for setting in others:
@@ -108,13 +111,13 @@ def test_errors_are_those_of_the_formulas():
 
 
 class TestResults:
-    def test_what_leaves_the_image_as_it_is(self, results):
+    def test_knobs_without_an_effect_on_the_image(self, results):
         for knob in ("default", "tile_size", "sort", "compositor", "optimizer"):
             for value, result in found(results, knob).items():
                 if value != "pixel":  # another order of the splats
                     assert 1e-9 < result["error"]["rms"] < 1e-5  # float32
 
-    def test_what_costs_accuracy(self, results):
+    def test_knobs_that_reduce_accuracy(self, results):
         alphas = found(results, "ALPHA_MIN")
         assert 1e-4 < alphas["2 x"]["error"]["rms"] < alphas["8 x"]["error"]["rms"]
         assert found(results, "TRANSMITTANCE_MIN")["100 x"]["error"]["max_abs"] > 1e-3
@@ -142,7 +145,7 @@ class TestResults:
         assert measured["rms"] == pytest.approx(np.sqrt(np.mean((image - truth) ** 2)))
 
     def test_ratios_are_of_neighbouring_runs(self, monkeypatch):
-        """The clock ticks as if the machine became twice as slow from run to run: the ratio stays."""
+        """If each run takes twice the time of the one before, the ratio stays the same."""
         readings, now, speed = [], np.zeros(2), 1.0
         for _ in range(4):
             readings.append(now)
@@ -153,7 +156,7 @@ class TestResults:
         monkeypatch.setattr(knobs, "clock", iter(readings).__next__)
         timed = knobs._paired(lambda: None, lambda: None, 3, None)
         assert timed["ratio"] == 3
-        assert timed["median_ms"] == 1e3 * 30 * 4  # of 2, 4 and 8: the first run warms up
+        assert timed["median_ms"] == 1e3 * 30 * 4  # median of 2, 4 and 8: the first run is not timed
 
 
 class TestReport:
@@ -201,7 +204,7 @@ class TestCommand:
         assert knobs_text(results) in capsys.readouterr().out
         assert chart.read_bytes().startswith(b"\x89PNG")
 
-    def test_bad_input_is_a_sentence(self, tmp_path, capsys):
+    def test_invalid_input_is_refused(self, tmp_path, capsys):
         for arguments, message in (
             (["--repeats", "0"], "--repeats: expected 1 or more, found 0"),
             (["--scene", "a.ply"], "--scene and --cameras: expected both"),
@@ -216,7 +219,7 @@ class TestCommand:
 
 
 class TestPage:
-    """docs/benchmarks.md shows what the files beside it hold: the table is made from them while the page is built."""
+    """docs/benchmarks.md shows the content of docs/results: its table is made from these files."""
 
     def test_table_and_chart_are_of_these_results(self, project, results):
         page = (project / "docs" / "benchmarks.md").read_text()

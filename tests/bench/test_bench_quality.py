@@ -1,4 +1,4 @@
-"""`clsplat bench quality`: what is trained and recorded, and what survives interruption and failure."""
+"""`clsplat bench quality`: trainings, their records, interruptions and failures."""
 
 import json
 from dataclasses import replace
@@ -10,18 +10,10 @@ import pytest
 from test_cli import fails, run, write_dataset
 
 from clsplat.bench import quality
-from clsplat.bench.quality import (
-    differences,
-    make_cells,
-    parse_budget,
-    parse_method,
-    parse_source,
-    run_cell,
-    run_cells,
-    sample_iterations,
-)
+from clsplat.bench.cells import Cell, differences, make_cells, parse_budget, parse_method, parse_source
+from clsplat.bench.quality import run_cell, run_cells, sample_iterations
+from clsplat.bench.quality_summary import COSTS
 from clsplat.bench.results import append_record, read_records, write_records
-from clsplat.bench.summary import COSTS
 from clsplat.config import AdcConfig, DataConfig, InitConfig, TrainConfig
 from clsplat.dataset import load_scene
 from clsplat.errors import InputError
@@ -46,12 +38,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def cells_of(data: Path, *methods: str, scenes: tuple[str, ...] = ("one",)) -> list[quality.Cell]:
+def cells_of(data: Path, *methods: str, scenes: tuple[str, ...] = ("one",)) -> list[Cell]:
     return make_cells([str(data / s) for s in scenes], [str(data / f"{m}.json") for m in methods], ["own"], [])
 
 
 class TestCells:
-    def test_a_dataset_may_say_how_its_photos_are_read(self):
+    def test_a_dataset_may_have_options_for_its_photos(self):
         source = parse_source("some/where/lego:background=white:test_every=4")
         assert (source.name, source.path) == ("lego:background=white:test_every=4", Path("some/where/lego"))
         assert source.data == DataConfig(background="white", test_every=4)
@@ -65,7 +57,7 @@ class TestCells:
             ("a:downscale=3", "downscale: expected 1, 2, 4, 8"),
         ],
     )
-    def test_options_that_are_none(self, text, expected):
+    def test_invalid_options_are_refused(self, text, expected):
         with pytest.raises(InputError, match=expected):
             parse_source(text)
 
@@ -83,7 +75,7 @@ class TestCells:
         assert parse_budget(text, own) == cap
 
     @pytest.mark.parametrize("text", ["", "x", "x0", "-3", "0", "0.5", "x-1", "1e5", "owner"])
-    def test_budgets_that_are_none(self, text):
+    def test_invalid_budgets_are_refused(self, text):
         with pytest.raises(InputError, match="--budgets: expected own"):
             parse_budget(text, 5)
 
@@ -92,7 +84,7 @@ class TestCells:
         cap = load_preset("fast").max_gaussians
         assert cap is not None
         found = {(c.source.name, c.method, c.config.max_gaussians, c.config.iterations) for c in cells}
-        # Half of no cap is no cap: that training runs once.
+        # Half of no cap is no cap, so this training runs once.
         caps = {"paper-7k": (None, 1000), "fast": (cap, cap // 2, 1000)}
         expected = {(s, m, n, i) for s in ("a:downscale=2", "b") for m in caps for n in caps[m] for i in (10, 20)}
         assert found == expected
@@ -104,23 +96,23 @@ class TestCells:
         (cell,) = make_cells(["a"], ["paper-30k"], ["own"], [])
         assert cell.config.iterations == 30_000
 
-    def test_names_that_would_be_one(self, tmp_path):
+    def test_equal_names_are_refused(self, tmp_path):
         for folder in ("a", "b"):
             (tmp_path / folder).mkdir()
             (tmp_path / folder / "m.json").write_text("{}")
-        with pytest.raises(InputError, match="data: expected names that differ, found scene 2 times"):
+        with pytest.raises(InputError, match="data: expected different names, found scene 2 times"):
             make_cells(["a/scene", "b/scene"], ["fast"], ["own"], [])
-        with pytest.raises(InputError, match="--methods: expected names that differ, found m 2 times"):
+        with pytest.raises(InputError, match="--methods: expected different names, found m 2 times"):
             make_cells(["a"], [str(tmp_path / "a" / "m.json"), str(tmp_path / "b" / "m.json")], ["own"], [])
         with pytest.raises(InputError, match="--iterations: expected 1 or more, found 0"):
             make_cells(["a"], ["fast"], ["own"], [0])
 
-    def test_settings_are_what_differs(self):
+    def test_settings_are_those_that_differ_from_the_defaults(self):
         config = TrainConfig(seed=3, adc=AdcConfig(every=7), init=InitConfig(opacity=0.5))
         assert differences(config) == {"seed": 3, "adc": {"every": 7}, "init": {"opacity": 0.5}}
         assert with_settings(TrainConfig(), differences(config), "") == config
 
-    def test_samples_at_equal_factors(self):
+    def test_samples_form_a_geometric_sequence(self):
         assert sample_iterations(7000)[0] == 140
         assert sample_iterations(7000)[-1] == 7000
         assert len(sample_iterations(7000)) == quality.SAMPLES
@@ -130,7 +122,7 @@ class TestCells:
 
 @pytest.fixture(scope="module")
 def trained(data, device):
-    """A cell with its records, and the Gaussians that each was taken of."""
+    """A cell with its records, and the Gaussians of each record."""
     (cell,) = cells_of(data, "plain")
     scene = load_scene(cell.source.path, cell.source.data)
     records, states = [], []
@@ -176,7 +168,7 @@ class TestOneTraining:
         assert all(r["memory_bytes"] > 3 * parameters + photos for r in records)
         assert [r["memory_bytes"] for r in records] == sorted(r["memory_bytes"] for r in records)
 
-    def test_time_stands_still_while_it_is_evaluated(self, trained, device, monkeypatch):
+    def test_evaluations_do_not_count_as_time(self, trained, device, monkeypatch):
         cell, scene, _, _ = trained
         clock = SimpleNamespace(now=100.0)
         monkeypatch.setattr(
@@ -187,7 +179,7 @@ class TestOneTraining:
 
         def training(scene, config, device, out, *, evaluate=None, evaluate_after=(), progress=None):
             for iteration in range(1, config.iterations + 1):
-                clock.now += 2  # an iteration takes two seconds
+                clock.now += 2  # an iteration takes 2 s
                 if evaluate and iteration in evaluate_after:
                     evaluate(some)
             return some
@@ -225,7 +217,7 @@ class TestBench:
         run_cells(cells_of(data, *methods, scenes=scenes), device, path, said.append)
         return read_records(path), said
 
-    def test_what_is_there_is_not_trained_again(self, data, device, tmp_path, monkeypatch):
+    def test_finished_trainings_are_not_repeated(self, data, device, tmp_path, monkeypatch):
         path = tmp_path / "results.jsonl"
         records, _ = self.start(data, device, path, "plain")
         assert {r["device"] for r in records} == {device.label}
@@ -235,13 +227,13 @@ class TestBench:
         monkeypatch.setattr(quality, "run_cell", lambda *_: pytest.fail("trained again"))
         assert self.start(data, device, path, "plain")[0] == records
         assert path.read_bytes() == before
-        # Nor does another cell's failure take its records.
+        # A failure of another cell keeps its records, too.
         monkeypatch.setattr(quality, "run_cell", lambda *_: 1 / 0)
         again, _ = self.start(data, device, path, "plain", "capped")
         assert again[:-1] == records
         assert again[-1]["failed"] == "ZeroDivisionError: division by zero"
 
-    def test_what_was_interrupted_runs_anew(self, data, device, tmp_path):
+    def test_interrupted_trainings_run_again(self, data, device, tmp_path):
         path = tmp_path / "results.jsonl"
         records, _ = self.start(data, device, path, "plain", "capped")
         cut = path.read_text().rindex("\n", 0, -1)
@@ -253,7 +245,7 @@ class TestBench:
         assert again[:first] == records[:first]
         assert [r["psnr"] for r in again] == [r["psnr"] for r in records], "runs repeat to the bit"
 
-    def test_other_settings_take_the_place(self, data, device, tmp_path):
+    def test_other_settings_replace_the_records(self, data, device, tmp_path):
         path = tmp_path / "results.jsonl"
         records, _ = self.start(data, device, path, "plain")
         (cell,) = cells_of(data, "plain")
@@ -293,7 +285,7 @@ class TestBench:
         assert ["held-out" in r["failed"] for r in by_scene["one:test_every=0"]] == [True, True]
         assert sum("fps" in r for r in by_scene["one"]) == 2
 
-    def test_memory_that_does_not_suffice_is_a_result(self, data, device, tmp_path):
+    def test_insufficient_memory_is_a_result(self, data, device, tmp_path):
         cells = make_cells([str(data / "one")], [str(data / "plain.json")], ["own"], [], memory_limit="0.1MB")
         run_cells(cells, device, tmp_path / "results.jsonl", lambda _: None)
         (record,) = read_records(tmp_path / "results.jsonl")
@@ -324,7 +316,7 @@ def test_the_file_of_results(tmp_path):
 
 
 def test_the_command(data, tmp_path, capsys, monkeypatch):
-    # A chart takes a second: of one cost is enough.
+    # A chart takes a second, so only one cost is drawn.
     monkeypatch.setattr("clsplat.bench.charts_page.COSTS", {"seconds": COSTS["seconds"]})
     run("bench", "quality", data / "one", "--methods", data / "plain.json", "-o", tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}

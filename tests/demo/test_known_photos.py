@@ -1,4 +1,4 @@
-"""The demo's photos against their true cameras, and the cameras themselves."""
+"""The demo's photos against their true cameras, and the positions of the cameras."""
 
 from functools import partial
 
@@ -9,14 +9,15 @@ from scipy.ndimage import map_coordinates
 
 from clsplat.camera import Camera
 from clsplat.demo import known_photos as demo
-from clsplat.demo.ray_tracer import Solid, Square, bake, camera_rays, radiance, trace
+from clsplat.demo.ray_tracer import Solid, bake, camera_rays, radiance, trace
+from clsplat.demo.shapes import Square
 from clsplat.demo.still_life import still_life
 from clsplat.errors import InputError
 
 
 @pytest.fixture(scope="module")
 def solids():
-    """The still life under a coarse light: a photo's other properties do not depend on the number of rays."""
+    """The still life with coarse light. The other properties of a photo do not depend on the number of rays."""
     scene = still_life()
     bake(scene, sun_rays=2, sky_rays=8)
     return scene
@@ -70,14 +71,14 @@ def test_photos_agree_where_they_show_the_same_points(photos, cameras, solids):
     seen_by_a, seen_by_b = look_up(photos[15], x, y), look_up(photos[16], u, v)
     same = np.abs(seen_by_a - seen_by_b)
     other = np.abs(seen_by_a - np.roll(seen_by_b, 17, axis=1))
-    # At a third of the size textures blur differently from view to view: 0.011 here, 0.17 for other points.
+    # At a third of the size, textures blur differently in each view: 0.011 for the same points, 0.17 for others.
     assert np.median(same) < 0.02
     assert np.median(other) > 8 * np.median(same)
 
 
 @pytest.mark.parametrize("offset", [-0.2, 0.2])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_pixels_lie_where_the_camera_has_them(axis, offset):
+def test_pixels_lie_where_the_camera_projects_them(axis, offset):
     edge = 5 + offset * 2 / 10  # pixels times distance by focal length
     board = Solid(Square(), lambda p: np.full_like(p, 0.5), np.array([[0, edge, 0], [edge, 0, 0]])[axis], 5)
     camera = Camera.look_at((0, 0, 2), (0, 0, 0), (0, -1, 0), 10.0, 12, 8)
@@ -99,7 +100,7 @@ def test_photos_are_exposed_and_detailed_everywhere(photos):
         luma = photo @ [0.299, 0.587, 0.114]
         gradient = np.hypot(*np.gradient(luma))
         blocks = gradient.reshape(6, 20, 8, 20).mean(axis=(1, 3))
-        # A flat surface under the sensor's noise would show 0.005: matching needs a multiple of it everywhere.
+        # The sensor's noise on a flat surface yields 0.005. Matching needs a multiple of it everywhere.
         assert blocks.min() > 0.02
         assert gradient.mean() > 0.04
 
@@ -134,7 +135,7 @@ def test_a_seed_repeats_the_photos(tmp_path, monkeypatch):
         pixels = np.asarray(photo) / 255
     solids = still_life()
     demo.bake(solids)
-    # The noise of the sensor and the rounding of the JPEG, mean 0.012; another camera's photo differs by 0.22.
+    # The sensor's noise and the rounding of the JPEG differ by 0.012 on average; another camera's photo by 0.22.
     assert np.abs(demo.take_photo(made["a"][1], solids) - pixels).mean() < 0.02
     assert made["a"][1].fx == pytest.approx(focal * np.hypot(48, 36) / np.hypot(36, 24))
 
@@ -156,7 +157,7 @@ def test_poses_are_recovered_from_the_photos_alone(tmp_path):
     cameras = demo.make_photos(tmp_path / "images")
     model = pycolmap.Reconstruction(reconstruct(tmp_path, SfmConfig()))
     assert model.num_reg_images() == len(cameras)
-    assert model.compute_mean_reprojection_error() < 0.5  # pixels: 0.3 was seen
+    assert model.compute_mean_reprojection_error() < 0.5  # px; measured: 0.3
     poses = {int(image.name[:3]): image.cam_from_world().matrix() for image in model.images.values()}
     found = np.array([-poses[k][:, :3].T @ poses[k][:, 3] for k in range(len(cameras))])
     true = np.array([camera.position for camera in cameras])
@@ -167,17 +168,17 @@ def test_poses_are_recovered_from_the_photos_alone(tmp_path):
     rotation = u * sign @ vt
     found = (s @ sign) / (found**2).sum() * found @ rotation.T
     radius = np.linalg.norm(true, axis=1).mean()
-    assert np.linalg.norm(found - true, axis=1).max() < 0.005 * radius  # 0.0012 was seen
+    assert np.linalg.norm(found - true, axis=1).max() < 0.005 * radius  # measured: 0.0012
     for k, camera in enumerate(cameras):
         turn = poses[k][:, :3] @ rotation.T @ camera.viewmat[:3, :3].T
-        assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 0.2  # 0.06 was seen
+        assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 0.2  # measured: 0.06
 
 
-def test_the_known_scene_knows_its_cameras_and_points():
+def test_the_known_scene_has_true_cameras_and_points():
     scene = demo.known_scene(9, 64, 48, points=300)
     assert [v.name for v in scene.test] == ["000.png", "008.png"] and len(scene.train) == 7
     assert 200 < len(scene.points) <= 300 and scene.colors.shape == scene.points.shape
-    # Each point was seen by one photo: of those that have it in the image, one has its colour there, to the bit.
+    # Each point comes from one photo: of those that contain it, one has exactly its colour there.
     matched = np.zeros(len(scene.points), bool)
     for view in scene.train:
         p = scene.points @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
@@ -185,12 +186,12 @@ def test_the_known_scene_knows_its_cameras_and_points():
         inside = (p[:, 2] > 0) & (x >= 0) & (x < 64) & (y >= 0) & (y < 48)
         rows = np.flatnonzero(inside)
         matched[rows] |= (view.image[y[rows].astype(int), x[rows].astype(int)] == scene.colors[rows]).all(axis=1)
-    # A ray within rounding of a pixel's edge may fall into the neighbour.
+    # By rounding, a ray at a pixel's edge may fall into the neighbouring pixel.
     assert matched.mean() > 0.99
     again = demo.known_scene(9, 64, 48, points=300)
     assert (again.points == scene.points).all() and (again.train[3].image == scene.train[3].image).all()
 
 
-def test_the_known_scene_wants_photos():
+def test_a_known_scene_without_training_photos_is_refused():
     with pytest.raises(InputError, match="expected at least 2, 1, 1 and 1, found 1, 64, 48, 10"):
         demo.known_scene(1, 64, 48, points=10)

@@ -1,4 +1,4 @@
-"""Rays, hits and light of the demo's ray tracer against closed forms."""
+"""Rays, hits and light of the demo's ray tracer, compared with closed forms."""
 
 import numpy as np
 import pytest
@@ -8,11 +8,7 @@ from clsplat.demo.ray_tracer import (
     SKY_LIGHT,
     SUN,
     SUN_LIGHT,
-    Cube,
-    Lathe,
     Solid,
-    Sphere,
-    Square,
     bake,
     camera_rays,
     fibonacci,
@@ -20,9 +16,10 @@ from clsplat.demo.ray_tracer import (
     sunlight,
     trace,
 )
+from clsplat.demo.shapes import Cube, Lathe, Sphere, Square
 from clsplat.demo.still_life import still_life
 
-# What remains of float64 after a few dozen operations on numbers around 1.
+# Tolerance of float64 after a few dozen operations on numbers around 1.
 EXACT = 1e-9
 
 CYLINDER = Lathe((0, -1), (0.5, -1), (0.5, 1), (0, 1), rounds=0)
@@ -39,7 +36,7 @@ def grey(p):
 
 
 def rays_into(rng, n, radius=3.0):
-    """Rays from a sphere of the given radius to points around the origin."""
+    """Random rays from a sphere of the given radius to points around the origin."""
     o = rng.normal(size=(3, n))
     o *= radius / np.linalg.norm(o, axis=0)
     d = rng.uniform(-1, 1, (3, n)) - o
@@ -84,7 +81,7 @@ def test_rays_pass_through_their_pixels(rng):
         (CYLINDER, (3, 0, 1.1), (-1, 0, 0), np.inf),
         # The cone r = 1 - z, entered at r = 0.5.
         (Lathe((0, 0), (1, 0), (0, 1), rounds=0), (2, 0, 0.5), (-1, 0, 0), 1.5),
-        # Into a cup: past its rim, onto its floor.
+        # Into a cup, past its rim, onto its bottom.
         (Lathe((0, 0), (1, 0), (1, 1), (0.9, 1), (0.9, 0.2), (0, 0.2), rounds=0), (0.5, 0, 3), (0, 0, -1), 2.8),
     ],
 )
@@ -99,11 +96,11 @@ def test_a_finely_turned_lathe_is_a_sphere(rng):
     normals /= np.linalg.norm(normals, axis=0)
     np.testing.assert_allclose(points, normals, atol=1e-5)  # the height of an arc of 1/127 rad is 8e-6
     o, d = rays_into(rng, 500)
-    # Rays that come within 1e-3 of a tangent are left out: there the distance is a root of the polyline's error.
+    # Nearly tangential rays are left out: their distance depends on the square root of the polyline's error.
     clear = np.abs(np.linalg.norm(np.cross(o.T, d.T), axis=1) - 1) > 1e-3
     true, found = Sphere().hit(o, d)[clear], lathe.hit(o, d)[clear]
     assert np.isfinite(true).any() and np.isinf(true).any()
-    # Chords of 1/127 rad lie 8e-6 below the sphere; obliquely hit that is up to 20 times as far along the ray.
+    # Chords of 1/127 rad lie 8e-6 below the sphere. Along an oblique ray this is up to 20 times as far.
     np.testing.assert_allclose(found, true, atol=2e-4)
 
 
@@ -122,8 +119,8 @@ def test_hits_lie_on_the_surface_and_face_the_ray(name, rng):
     face, u, v = shape.chart(p)
     assert min(u.min(), v.min()) >= -EXACT and max(u.max(), v.max()) <= 1 + EXACT
     again, normals = shape.surface(face, u, v)
-    np.testing.assert_allclose(again, p, atol=1e-7)  # arccos near a pole halves the digits
-    if not isinstance(shape, Lathe):  # whose rounded normals may turn away from a grazing ray
+    np.testing.assert_allclose(again, p, atol=1e-7)  # near a pole, arccos loses half of the digits
+    if not isinstance(shape, Lathe):  # its rounded normals may point away from a grazing ray
         assert ((normals * d[:, met]).sum(0) < 0).all()
 
 
@@ -136,7 +133,7 @@ def test_normals_are_perpendicular_to_the_surface(shape, rng):
     h = 1e-6
     for du, dv in ((h, 0), (0, h)):
         a, b = (shape.surface(face, u + s * du, v + s * dv)[0] for s in (-1, 1))
-        # The rounding of the difference, 1e-16 / 1e-6, is all that is left of the tangent along the normal.
+        # The component of the tangent along the normal is only rounding, 1e-16 / 1e-6.
         np.testing.assert_allclose(((b - a) * normals).sum(0) / (2 * h), 0, atol=1e-8)
 
 
@@ -163,7 +160,7 @@ def test_light_maps_are_read_where_they_were_written(name, rng):
     solid.light = solid.texel_surface()[0].reshape(solid.light.shape)
     own, _ = shape.surface(rng.integers(0, shape.faces, 200), *rng.uniform(0, 1, (2, 200)))
     points = solid.turn @ (own * solid.size[:, None]) + solid.centre[:, None]
-    # Between texels a twentieth apart the chords of a circle and the corners of a profile are cut.
+    # Interpolation between texels a twentieth apart replaces arcs by chords and cuts corners.
     np.testing.assert_allclose(solid.lit(points), points, atol=0.03)
 
 
@@ -184,7 +181,7 @@ def test_bounding_spheres_lose_no_hit(bundle, rng):
     np.testing.assert_allclose(t, every.min(0), atol=EXACT)
     hit = np.flatnonzero(np.isfinite(t))
     assert (np.delete(which, hit) == -1).all()
-    # Where two surfaces meet, rounding decides which comes first: the one taken must be no farther.
+    # Where two surfaces meet, rounding decides which one is nearer: the chosen one must not be farther.
     np.testing.assert_allclose(every[which[hit], hit], every.min(0)[hit], atol=EXACT)
     assert len(np.unique(which)) > 5
 
@@ -200,7 +197,7 @@ def test_open_ground_gets_the_whole_sun_and_sky():
     far = [Solid(Sphere(), grey, (0, 0, -99), 1)]
     up = column(0, 0, 1)
     np.testing.assert_allclose(np.linalg.norm(SUN), 1, atol=EXACT)
-    # The disc's radius of 0.035 rad moves the mean of its cosines by at most 0.035^2.
+    # The disc's radius of 0.035 rad changes the mean cosine by at most 0.035^2.
     np.testing.assert_allclose(sunlight(0 * up, up, far, 10)[:, 0], SUN_LIGHT * SUN[2], rtol=2e-3)
     # Mean of 0.6 + 0.4 cos over a hemisphere weighted by cos: 0.6 + 0.4 * 2/3; 500 rays integrate it to 1 %.
     np.testing.assert_allclose(skylight(0 * up, up, far, 500)[:, 0], SKY_LIGHT * (0.6 + 0.8 / 3), rtol=0.01)

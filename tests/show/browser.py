@@ -1,4 +1,4 @@
-"""Headless Chromium for tests of what a browser shows, driven through its DevTools protocol."""
+"""Headless Chromium for tests that need a browser, driven through its DevTools protocol."""
 
 import base64
 import io
@@ -18,11 +18,11 @@ from PIL import Image
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 PATIENCE = 90
-"""Seconds until a page that does not become what is waited for counts as broken: WebGL without a GPU is slow."""
+"""Longest time that a test waits for the page, s. WebGL without a GPU is slow."""
 
 
 class Page:
-    """One page of the browser; `requests` are the addresses it asked for."""
+    """One page of the browser. `requests` are the addresses that it requested."""
 
     def __init__(self, socket: Any):
         self._socket, self._last, self.requests = socket, 0, []
@@ -51,7 +51,7 @@ class Page:
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
     def screenshot(self) -> np.ndarray:
-        """What is seen, (H, W, 3) uint8."""
+        """Picture of the page, (H, W, 3) uint8."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
@@ -59,17 +59,17 @@ class Page:
         """Press and release the left button."""
         where = {"x": x, "y": y, "button": "left", "clickCount": 1}
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-        time.sleep(0.3)  # what is under the pointer is found out between two frames
+        time.sleep(0.3)  # the page determines what is under the pointer between two frames
         self.call("Input.dispatchMouseEvent", type="mousePressed", **where)
         self.call("Input.dispatchMouseEvent", type="mouseReleased", **where)
 
 
 @contextmanager
 def browser(profile: Path, url: str, width: int, height: int) -> Iterator[Page]:
-    """A page in a new headless Chromium that reaches nothing but this machine."""
+    """A page in a new headless Chromium that can only reach this machine."""
     connect = pytest.importorskip("websockets.sync.client", reason="websockets, which comes with viser").connect
     if CHROMIUM is None:
-        pytest.skip("chromium is missing: install it to see what a browser shows")
+        pytest.skip("chromium is missing: install it to run the tests with a browser")
     flags = ["--headless", "--no-sandbox", "--remote-debugging-port=0", "--hide-scrollbars", "--mute-audio"]
     flags += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
     flags += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
@@ -89,7 +89,7 @@ def browser(profile: Path, url: str, width: int, height: int) -> Iterator[Page]:
             page.call("Emulation.setDeviceMetricsOverride", **size)
             page.loaded = False
             page.call("Page.navigate", url=url)
-            # Until then there is nothing to take a picture of. Any call takes in what has happened.
+            # A screenshot needs a loaded page. Any call receives the pending events.
             wait_for(lambda: page.call("Browser.getVersion") and page.loaded, "the page")
             yield page
     finally:
@@ -98,7 +98,7 @@ def browser(profile: Path, url: str, width: int, height: int) -> Iterator[Page]:
 
 
 def wait_for(condition: Any, what: str) -> None:
-    """Ask until the answer is yes."""
+    """Wait until the condition holds."""
     end = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < end, f"waited {PATIENCE} s for {what}"

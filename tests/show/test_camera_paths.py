@@ -1,4 +1,4 @@
-"""The point the cameras look at, and the path around it."""
+"""The point that the cameras look at, the path around it, and viewpoints of scenes without cameras."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ EAST = np.array([1.0, 0.0, 0.0])
 
 
 def ring(angles, radius=5.0, height=2.0):
-    """Cameras around TARGET, their upper edges towards UP."""
+    """Cameras on a ring around TARGET. Their up direction is UP."""
     north = np.cross(UP, EAST)
     arms = [radius * (np.cos(a) * EAST + np.sin(a) * north) + height * UP for a in angles]
     return [Camera.look_at(TARGET + arm, TARGET, UP, 500.0, 640, 480) for arm in arms]
@@ -47,7 +47,8 @@ def test_focus_minimises_the_distances_from_the_axes():
 def test_focus_without_an_intersection_in_front():
     parallel = [Camera.look_at([x, 0, 0], [x, 0, 9], UP, 500.0, 640, 480) for x in (-3, 0, 3)]
     np.testing.assert_allclose(focus_point(parallel), [0, 0, 3], atol=1e-12)
-    # Half a degree between the axes is no intersection either: at 300 units, where 3 are between the cameras.
+    # Half a degree between the axes does not count as an intersection: at 300 units, with 3 units between the
+    # cameras.
     nearly = [Camera.look_at([x, 0, 0], [0, 0, 300], UP, 500.0, 640, 480) for x in (-3, 0, 3)]
     np.testing.assert_allclose(focus_point(nearly), [0, 0, 3], atol=1e-3)
     outwards = [
@@ -74,7 +75,7 @@ def test_a_full_ring_gives_a_full_circle():
         assert camera.viewmat[1, :3] @ UP < 0, "y points down"
 
 
-def test_an_arc_is_swung_over_and_never_left():
+def test_the_path_swings_over_an_arc_and_never_leaves_it():
     arc = np.array([2.9, 3.3, 3.0, 3.5, 4.0])  # across the seam of arctan2
     path = orbit(ring(arc, height=0.0), 40, 320, 240)
     arms = np.array([c.position for c in path]) - TARGET
@@ -110,26 +111,26 @@ def test_radius_and_height_are_means():
     assert np.linalg.norm(centre) == pytest.approx((8 + 16 + 9) / 17, rel=0.02)
 
 
-def test_what_has_no_orbit():
+def test_cameras_without_an_orbit_are_refused():
     with pytest.raises(InputError, match="frames"):
         orbit(ring([0, 1]), 0, 64, 48)
     turn = np.linspace(0, 2 * np.pi, 6, endpoint=False)
     panorama = [Camera.look_at([0, 0, 0], [np.cos(a), np.sin(a), 0], [0, 0, 1], 500.0, 640, 480) for a in turn]
-    with pytest.raises(InputError, match="found none beside it"):
+    with pytest.raises(InputError, match="found all of them in one place"):
         orbit(panorama, 4, 64, 48)
 
 
 def test_cameras_upside_down_to_each_other():
     cameras = [Camera.look_at(TARGET + x * EAST, TARGET, x * UP, 500.0, 640, 480) for x in (4, -4)]
     path = np.array([frame.position for frame in orbit(cameras, 4, 64, 48)])
-    # Half a circle between the two: over the top or through the side, but at their distance.
+    # Half a circle between the two, over the top or through the side, at their distance.
     np.testing.assert_allclose(np.linalg.norm(path - TARGET, axis=1), 4, atol=1e-9)
     np.testing.assert_allclose(np.sort((path - TARGET) @ EAST), [-4, 0, 0, 4], atol=1e-9)
 
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", ["fox_pinhole", "bonsai", "fern", "sceaux", "castle_p30"])
-def test_real_scenes_are_seen_from_the_orbit(shared, name):
+def test_real_scenes_are_visible_from_the_orbit(shared, name):
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction(shared / "data" / name / "sparse" / "0")
@@ -147,12 +148,12 @@ def test_real_scenes_are_seen_from_the_orbit(shared, name):
 
     path = orbit(cameras, 12, intrinsics.width, intrinsics.height)
     photos = np.mean([share_seen(camera) for camera in cameras])
-    # Half of what a photo sees: a path that looks elsewhere sees a tenth.
+    # At least half of the points that a photo sees. A path that looks elsewhere sees a tenth.
     assert np.mean([share_seen(camera) for camera in path]) > 0.5 * photos
 
 
-def test_surround_stands_around_what_is_there():
-    """Evenly in all directions, whatever lies far away: the radius is the median distance."""
+def test_surround_stands_around_the_scene():
+    """Evenly in all directions, unaffected by a far background: the radius is the median distance."""
     gaussians = synthetic_scene(4000, 1)[0]
     rng = np.random.default_rng(0)
     arms = rng.normal(size=(4000, 3))
@@ -184,7 +185,7 @@ def test_overview_has_the_scene_in_the_middle_upright_from_above():
     rng = np.random.default_rng(2)
     gaussians, _ = synthetic_scene(400, seed=1)
     gaussians.means[:] = rng.normal([3, -1, 7], 0.5, (400, 3))
-    gaussians.means[:40] = rng.normal(0, 500, (40, 3))  # a background far away moves nothing
+    gaussians.means[:40] = rng.normal(0, 500, (40, 3))  # a far background must not move the viewpoint
     camera, focus, up = overview(gaussians)
     np.testing.assert_allclose(focus, [3, -1, 7], atol=0.15)
     np.testing.assert_array_equal(up, [0, -1, 0])
@@ -198,7 +199,7 @@ def test_overview_has_the_scene_in_the_middle_upright_from_above():
     assert camera.viewmat[1, 1] > 0.9, "y down is down in the image"
 
 
-def test_first_photo_is_the_first_and_up_is_what_the_photos_agree_on():
+def test_first_photo_is_the_first_camera_with_the_mean_up_direction():
     up = np.array([0.2, -1.0, 0.1])
     cameras = [
         Camera.look_at(

@@ -1,4 +1,4 @@
-"""The viewer: cameras to and fro, frames as our renders, training undisturbed, and a browser that shows them."""
+"""The viewer: conversion of cameras, frames, trainings with a viewer, and a browser that shows the frames."""
 
 import math
 import sys
@@ -20,8 +20,10 @@ from clsplat.ops import count_pairs
 from clsplat.render import render
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
+from clsplat.show.browser_cameras import client_camera, whole_view, wxyz_of
 from clsplat.show.camera_paths import first_photo
-from clsplat.show.viewer import FRAME_TIME, MODES, STILL_AFTER, Viewer, client_camera, picture, whole_view, wxyz_of
+from clsplat.show.frames import MODES, picture
+from clsplat.show.viewer import FRAME_TIME, STILL_AFTER, Viewer
 from clsplat.testing import synthetic_scene
 from clsplat.training.loop import train
 
@@ -29,7 +31,7 @@ SIZE = (320, 240)
 
 
 def cameras(count=5, tilt=0.2):
-    """Around what `synthetic_scene` shows, tilted to either side, principal points in the middle."""
+    """Gaussians of `synthetic_scene`, and cameras around them, tilted to alternating sides."""
     gaussians, camera = synthetic_scene(300, seed=5)
     centre = gaussians.means.mean(axis=0)
     distance = np.linalg.norm(camera.position - centre)
@@ -46,7 +48,7 @@ def views_of(cams):
     return [View(f"{i}.png", c, np.zeros((c.height, c.width, 3), np.uint8)) for i, c in enumerate(cams)]
 
 
-def test_a_camera_survives_the_way_to_the_browser_and_back():
+def test_a_camera_is_the_same_after_the_conversion_to_the_browser_and_back():
     for camera in cameras()[1]:
         found = client_camera(3 * wxyz_of(camera), camera.position, whole_view(camera, 4 / 3), *SIZE)
         np.testing.assert_allclose(found.viewmat, camera.viewmat, atol=1e-12)
@@ -63,14 +65,14 @@ def test_a_window_shows_the_whole_photo(window):
 
 
 class TestPicture:
-    def test_render_is_ours(self, device):
+    def test_render_is_the_image_of_render(self, device):
         gaussians, (camera, *_) = cameras()
         frame, legend = picture(Renderer(device, background=(1.0, 0.0, 0.5)), gaussians, camera, "render")
         ours = render(gaussians, camera, device=device, background=(1.0, 0.0, 0.5))
         np.testing.assert_array_equal(frame, to_uint8(ours.rgb))
         assert legend == ""
 
-    def test_depth_alpha_and_count_say_what_they_show(self, device):
+    def test_depth_alpha_and_count_and_their_legends(self, device):
         gaussians, (camera, *_) = cameras()
         gaussians.logit_opacities[:] = 4
         ours = render(gaussians, camera, device=device, depth=True)
@@ -101,7 +103,7 @@ class TestPicture:
         assert legend == "nothing opaque in view"
 
 
-def test_without_viser_it_says_how_to_get_it(device, monkeypatch):
+def test_without_viser_the_message_names_the_extra(device, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     cams = cameras()[1]
     with pytest.raises(InputError, match=r"pip install 'clsplat\[viewer\]'"):
@@ -110,7 +112,7 @@ def test_without_viser_it_says_how_to_get_it(device, monkeypatch):
 
 @pytest.fixture
 def viewer(device):
-    """Of five cameras; its clients are what a test makes of it."""
+    """A viewer of five cameras. A test adds its clients."""
     pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
     cams = cameras()[1]
     result = Viewer(Renderer(device), first_photo(cams), views_of(cams), port=18080)
@@ -119,7 +121,7 @@ def viewer(device):
 
 
 class Clock:
-    """The viewer's time: a millisecond for each look at it, and what a test adds."""
+    """The viewer's clock: each reading takes a millisecond, and a test can add time."""
 
     def __init__(self):
         self.now = 0.0
@@ -153,7 +155,7 @@ class TestResolution:
         client = FakeClient(viewer, cams[1])
         assert viewer.draw(gaussians)
         assert client.frames[0].shape[1] == SIZE[0] / 4
-        assert not viewer.draw(gaussians), "nothing is due while the camera may move on"
+        assert not viewer.draw(gaussians), "nothing is due while the camera may still be moving"
         clock.now += STILL_AFTER
         while viewer.draw(gaussians):
             pass
@@ -162,7 +164,7 @@ class TestResolution:
         assert not viewer.draw(gaussians), "and nothing more"
 
     def test_a_movement_is_drawn_at_once_and_in_time(self, viewer, monkeypatch, clock):
-        """Frames whose time goes with their pixels come to take FRAME_TIME."""
+        """If the time of a frame is proportional to its pixels, frames converge to FRAME_TIME."""
         gaussians, cams = cameras()
 
         def slow(device, gaussians, camera, *_):
@@ -177,21 +179,21 @@ class TestResolution:
             assert viewer.draw(gaussians)
         assert clock.now - before == pytest.approx(FRAME_TIME, rel=0.1)
 
-    def test_training_is_shown_anew_but_not_all_the_time(self, viewer, clock):
+    def test_the_frames_of_a_training_take_a_limited_share_of_its_time(self, viewer, clock):
         gaussians, cams = cameras()
         client = FakeClient(viewer, cams[0])
         clock.now += STILL_AFTER
         while viewer.draw(gaussians):
             pass
         client.state.shown = shown = client.state.shown._replace(seconds=1.0)
-        clock.now = shown.at + 9  # a frame of a second may come every ten
+        clock.now = shown.at + 9  # a frame that takes 1 s is due every 10 s
         viewer.follow(gaussians, lambda: False)
         assert client.state.shown is shown
         clock.now = shown.at + 10
         viewer.follow(gaussians, lambda: False)
         assert client.state.shown is not shown and client.state.shown.share == 1
 
-    def test_memory_that_is_short_does_not_end_the_training(self, viewer, monkeypatch):
+    def test_a_lack_of_memory_does_not_end_the_training(self, viewer, monkeypatch):
         gaussians, cams = cameras()
 
         def fails(*_):
@@ -252,10 +254,10 @@ def test_a_pause_holds_the_training_until_it_is_resumed_or_interrupted(viewer, d
     assert resumed == [3]
     assert len(reached) == 12
     viewer._toggle(None)
-    viewer.follow(cameras()[0], lambda: True)  # would wait for ever, were it not interrupted
+    viewer.follow(cameras()[0], lambda: True)  # without the interruption it would wait forever
 
 
-# What the panel has: a field with the mode, and the last box that can be ticked.
+# Elements of the panel: the field with the mode, and the last checkbox.
 CLICK_CAMERAS = "[...document.querySelectorAll('input[type=checkbox]')].at(-1).click()"
 MODE_BOX = """(() => {
     const box = [...document.querySelectorAll('input')].find(i => i.value == 'render').getBoundingClientRect();
@@ -268,15 +270,18 @@ CHOOSE_ALPHA = """(() => {
 })()"""
 
 
-def test_a_browser_shows_our_render_and_jumps_to_a_clicked_camera(viewer, device, tmp_path):
+def test_a_browser_shows_the_render_and_moves_to_a_clicked_camera(viewer, device, tmp_path):
     gaussians, cams = cameras()
     stop = threading.Event()
     owner = threading.Thread(target=viewer.hold, args=(gaussians, stop.is_set))
     owner.start()
 
     def seen(page):
-        """The camera whose render the part below the panel shows, if it shows one: with 20 dB or more, where the
-        right one has 24 to 27 (a frame is a JPEG, and frusta are drawn over it) and others up to 15."""
+        """Index of the camera whose render the page shows below the panel, or None.
+
+        The threshold is 20 dB: the right camera reaches 24 to 27 dB (a frame is a JPEG with frusta drawn over it),
+        others up to 15 dB.
+        """
         shot = page.screenshot()[200:]
         scores = [psnr(shot, to_uint8(render(gaussians, c, device=device).rgb)[200:]) for c in whole]
         return int(np.argmax(scores)) if max(scores) > 20 else None
@@ -294,7 +299,7 @@ def test_a_browser_shows_our_render_and_jumps_to_a_clicked_camera(viewer, device
 
                 def arrived(where=where, there=there):
                     if np.abs(client.camera.viewmat - cams[there].viewmat).max() > 1e-3:
-                        page.click(*where)  # again, should the page have been busy
+                        page.click(*where)  # again, in case the page was busy
                         time.sleep(1)
                     return seen(page) == there
 
@@ -305,7 +310,7 @@ def test_a_browser_shows_our_render_and_jumps_to_a_clicked_camera(viewer, device
             wait_for(lambda: page.evaluate(CHOOSE_ALPHA), "the list of modes")
             wait_for(lambda: client.shown.mode == "alpha" and client.shown.share == 1, "a frame of another mode")
             alpha = picture(Renderer(device, background=(0.0, 0.0, 0.0)), gaussians, whole[1], "alpha")[0]
-            # 25 dB: a JPEG; without the frusta, that hide nothing any more.
+            # A JPEG reaches 25 dB once the frusta no longer cover it.
             wait_for(lambda: psnr(page.screenshot()[200:], alpha[200:]) > 25, "alpha")
     finally:
         stop.set()

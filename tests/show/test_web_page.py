@@ -1,4 +1,4 @@
-"""A page that shows a scene: turned Gaussians look turned, it holds all it needs, a browser shows our render."""
+"""The web page of a scene: rotation of Gaussians, content of the page, and its picture in a browser."""
 
 import base64
 import hashlib
@@ -26,7 +26,7 @@ WINDOW = (480, 360)
 
 
 def scene(degree=3):
-    """Opaque enough that right and wrong views differ."""
+    """A scene opaque enough that right and wrong views differ."""
     gaussians, _ = synthetic_scene(200, seed=4)
     gaussians.logit_opacities[:] += 2
     return replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])
@@ -54,7 +54,7 @@ def test_upright(up):
     assert np.linalg.det(turn) > 0
 
 
-def test_the_viewer_is_the_one_that_is_named():
+def test_the_viewer_has_the_hash_that_its_readme_names():
     text = (VENDOR / "README.md").read_text()
     assert hashlib.sha256((VENDOR / "supersplat-viewer.html.gz").read_bytes()).hexdigest() in text
 
@@ -72,13 +72,13 @@ class TestExport:
         assert len(load_gaussians(tmp_path / "inside.sog")[0]) == len(gaussians)
 
     @pytest.mark.parametrize("arguments", [[], ["a.spz", "-o", "b.spz"]])
-    def test_wants_one_file(self, tmp_path, capsys, arguments):
+    def test_requires_one_file(self, tmp_path, capsys, arguments):
         save_gaussians(tmp_path / "scene.ply", scene())
         with pytest.raises(SystemExit):
             main(["export", str(tmp_path / "scene.ply"), *arguments])
         assert "expected one file to write" in capsys.readouterr().err
 
-    def test_o_is_the_same(self, tmp_path):
+    def test_o_is_the_same_as_a_positional_argument(self, tmp_path):
         save_gaussians(tmp_path / "scene.ply", scene())
         main(["export", str(tmp_path / "scene.ply"), str(tmp_path / "a.sog")])
         main(["export", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "b.sog")])
@@ -90,15 +90,15 @@ class TestExport:
     [((0, -1, 0), "classic"), ((0.5, -0.2, 0.7), "antialiased")],
     ids=["y down", "tilted world, antialiased"],
 )
-def test_a_browser_without_a_network_shows_our_render(device, tmp_path: Path, up, mode):
+def test_a_browser_without_a_network_shows_the_render(device, tmp_path: Path, up, mode):
     gaussians = scene()
-    gaussians.log_scales[::2] -= 3  # smaller than pixels: the modes differ there
+    gaussians.log_scales[::2] -= 3  # smaller than a pixel, where the modes differ
     gaussians.logit_opacities[::2] += 3
     centre, up = overview(gaussians).focus, np.array(up) / np.linalg.norm(up)
     beside = np.cross(up, [1.0, 2.0, 3.0])
     camera = Camera.look_at(centre + 3 * beside / np.linalg.norm(beside) + 0.8 * up, centre, up, 400, *WINDOW)
     save_page(tmp_path / "scene.html", gaussians, mode, Viewpoint(camera, centre, up), "black")
-    save_gaussians(tmp_path / "scene.sog", gaussians)  # the page shows what this format keeps
+    save_gaussians(tmp_path / "scene.sog", gaussians)  # the page shows the scene as quantised by this format
     stored = load_gaussians(tmp_path / "scene.sog")[0]
     ours, other = (
         to_uint8(render(stored, camera, RenderConfig(mode=m), device).rgb)
@@ -106,8 +106,8 @@ def test_a_browser_without_a_network_shows_our_render(device, tmp_path: Path, up
     )
     url = (tmp_path / "scene.html").as_uri() + "?noui&webgl"
     with browser(tmp_path / "profile", url, *WINDOW) as page:
-        # 30 dB: mirrored, turned or upside down it has less than 20; the two blend with different roundings.
-        wait_for(lambda: psnr(page.screenshot(), ours) > 30, "the scene as we render it")
+        # Mirrored, turned or upside down it has less than 20 dB. The two renderers round differently.
+        wait_for(lambda: psnr(page.screenshot(), ours) > 30, "the scene as clsplat renders it")
         shot = page.screenshot()
         apart = np.abs(ours.astype(int) - other) > 20
         away_from = [np.abs(shot.astype(int) - image)[apart].mean() for image in (ours, other)]

@@ -1,4 +1,4 @@
-"""The count of fuzzed cases, said at the end of a run."""
+"""The number of fuzzed cases, reported at the end of a run."""
 
 from collections import Counter
 
@@ -9,7 +9,7 @@ CASES: Counter[str] = Counter()
 
 @pytest.fixture(scope="session")
 def cases():
-    """Number of cases per kind; tests add what they try."""
+    """Number of cases per kind. Tests add theirs."""
     return CASES
 
 

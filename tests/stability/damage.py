@@ -1,4 +1,5 @@
-"""How tests damage files: bytes cut, flipped, spliced and overwritten, numbers replaced, parts of JSON exchanged."""
+"""Damage to files for tests: cut, flipped, spliced and overwritten bytes, other numbers, and changed parts of
+JSON."""
 
 import json
 import re
@@ -35,7 +36,7 @@ ANY = st.one_of(BINARY, TEXT)
 
 
 def damaged(content, changes):
-    """The bytes after changes of the kinds above; places count modulo what is there."""
+    """Apply changes of the kinds above to bytes. Positions are taken modulo the length."""
     for kind, *at in changes:
         if not content:
             break
@@ -57,7 +58,7 @@ def damaged(content, changes):
 
 
 def changed(value, place, new):
-    """A JSON value with one of its parts, of any depth, replaced or removed (where `new` is ...)."""
+    """Replace a part of a JSON value, at any depth, by `new`, or remove it if `new` is Ellipsis."""
     paths = []
 
     def walk(part, path):

@@ -1,4 +1,4 @@
-"""Dark areas turn transparent: black Gaussians and a black background look alike (Brush #250)."""
+"""Dark areas turn transparent, because black Gaussians look like a black background (Brush #250)."""
 
 from dataclasses import replace
 
@@ -24,15 +24,15 @@ def test_black_objects_stay_opaque(device, tmp_path, cut_out):
     if not cut_out:
         scene = replace(scene, train=[replace(view, clear=None) for view in scene.train])
     for data in (DataConfig(), RANDOM):
-        gaussians = train(scene, replace(CONFIG, data=data), tmp_path, device)
+        gaussians = train(scene, replace(CONFIG, data=data), device, tmp_path)
         alphas = [render(gaussians, view.camera, device=device).alpha for view in scene.test]
         opacity[data.random_background] = np.mean([a[s].mean() for a, s in zip(alphas, solid, strict=True)])
-    # Measured: nothing is left of it (0.00) before black, 0.99 and 1.00 before random colours.
+    # Measured opacity: 0.00 with a black background, 0.99 and 1.00 with random ones.
     assert opacity[False] < 0.1
     assert opacity[True] > 0.95
 
 
-def test_transparency_is_loaded_where_it_is_needed(tmp_path):
+def test_transparency_is_loaded_if_needed(tmp_path):
     write_colmap(tmp_path)
     rgba = np.random.default_rng(0).integers(0, 256, (12, 16, 4), dtype=np.uint8)
     Image.fromarray(rgba).save(tmp_path / "images" / "00.png")

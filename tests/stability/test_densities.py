@@ -1,10 +1,10 @@
-"""Gaussians that vanish, or that stay though nobody sees them."""
+"""Transparent Gaussians: all of a scene's Gaussians, and single ones that no pixel shows."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from clsplat.bench.stability.densities import left_by_pruning
+from clsplat.bench.stability.everything_pruned import left_by_pruning
 from clsplat.bench.stability.small import CONFIG, small_scene
 from clsplat.constants import ALPHA_MIN
 from clsplat.gaussians import logit
@@ -15,7 +15,7 @@ from clsplat.training.loop import train
 
 
 def test_training_goes_on_where_everything_has_become_transparent(device, tmp_path):
-    """INRIA #472, #482: photos as black as the background leave nothing opaque, and then nothing at all."""
+    """INRIA #472, #482: if photos are as black as the background, all Gaussians become transparent and are pruned."""
     assert left_by_pruning(0) == 0 and left_by_pruning(16) == 16
     scene = small_scene(device)
     dark = replace(scene, train=[replace(view, image=np.zeros_like(view.image)) for view in scene.train])
@@ -26,7 +26,7 @@ def test_training_goes_on_where_everything_has_become_transparent(device, tmp_pa
 
 
 def test_what_no_pixel_shows_is_not_saved(device):
-    """gsplat #822: MCMC leaves dead Gaussians. Without those below ALPHA_MIN every image has the same bits."""
+    """gsplat #822: MCMC leaves dead Gaussians. Without those below ALPHA_MIN, every image has the same bits."""
     gaussians, camera = synthetic_scene(300, seed=1)
     gaussians = gaussians.astype(np.float32)
     gaussians.logit_opacities[::3] = logit(np.float32(ALPHA_MIN * 0.999))
@@ -38,4 +38,4 @@ def test_what_no_pixel_shows_is_not_saved(device):
     ):
         np.testing.assert_array_equal(one, other)
     gaussians.logit_opacities[:] = -9
-    assert len(without_invisible(gaussians)) == 1, "formats hold at least one"
+    assert len(without_invisible(gaussians)) == 1, "formats require at least one"

@@ -1,6 +1,7 @@
-"""Every known failure has an experiment, and so a row on the page Stability, which is open where nothing helps."""
+"""Every known failure has an experiment, and thus a row on the page Stability. It is open if there is no remedy."""
 
 import pytest
+from scene_experiments import ALL_EXPERIMENTS, SCENE_EXPERIMENTS
 
 from clsplat.bench.stability import EXPERIMENTS
 
@@ -28,17 +29,22 @@ FAILURES = {
     "floaters near cameras": ["floaters"],
     "images of mixed size, orientation, EXIF rotation, 16-bit, grey, RGBA, CMYK, corrupt": ["images"],
 }
-"""Known from papers and issue threads -> what measures it."""
+"""Failures known from papers and issue threads, with the experiments that measure them."""
 
 OPEN = {"wide-angle"}
-"""Without a remedy."""
+"""Experiments on failures without a remedy."""
 
 
 @pytest.mark.parametrize("failure", FAILURES)
 def test_a_failure_is_measured(failure):
-    assert set(FAILURES[failure]) <= set(EXPERIMENTS)
+    assert set(FAILURES[failure]) <= set(ALL_EXPERIMENTS)
 
 
-def test_nothing_else_is_measured_and_what_is_open_is_known():
-    assert {name for names in FAILURES.values() for name in names} == set(EXPERIMENTS)
-    assert {name for name, experiment in EXPERIMENTS.items() if experiment.remedy is None} == OPEN
+def test_the_lists_of_failures_and_of_open_ones_are_complete():
+    assert {name for names in FAILURES.values() for name in names} == set(ALL_EXPERIMENTS)
+    assert {name for name, experiment in ALL_EXPERIMENTS.items() if experiment.remedy is None} == OPEN
+
+
+def test_the_page_shows_the_packaged_experiments_and_those_on_real_scenes():
+    assert not set(EXPERIMENTS) & set(SCENE_EXPERIMENTS)
+    assert set(ALL_EXPERIMENTS) == set(EXPERIMENTS) | set(SCENE_EXPERIMENTS)

@@ -1,4 +1,4 @@
-"""Few photos, which many arrangements of Gaussians explain alike (Park et al. 2025, "DropGaussian")."""
+"""Few photos, which many arrangements of Gaussians explain equally well (Park et al. 2025, "DropGaussian")."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def noisy(view, rng):
 
 @pytest.fixture(scope="module")
 def scene(device):
-    """A third of the circle in three photos whose noise no two share, and points that are not where the scene is."""
+    """Three noisy photos of a third of the circle, and points away from the scene."""
     scene, rng = with_train(small_scene(device), noisy), np.random.default_rng(1)
     points = rng.uniform(-0.8, 0.8, (150, 3))
     colors = rng.integers(0, 256, points.shape, dtype=np.uint8)
@@ -27,26 +27,26 @@ def scene(device):
 
 
 def test_three_photos_are_not_learned_by_heart(scene, device, tmp_path):
-    """Without the measures Gaussians are added until they show the noise of each photo."""
+    """Without the remedy, Gaussians are added until they show the noise of each photo."""
     psnr = {}
     plain = replace(CONFIG, iterations=400, max_gaussians=1000)
     for config in (plain, few_views.adapted(plain, scene)):
-        psnr[config != plain] = mean_metrics(train(scene, config, tmp_path, device), scene.test, device=device)[
+        psnr[config != plain] = mean_metrics(train(scene, config, tmp_path, device), scene.test, Renderer(device))[
             "psnr"
         ]
     # Measured: 20.5 dB and 26.2 dB.
     assert psnr[True] > psnr[False] + 3
 
 
-def test_what_changes_where_photos_are_few(scene):
+def test_settings_for_few_photos(scene):
     config = replace(CONFIG, max_gaussians=None)
     few = few_views.adapted(config, scene)
     assert (few.init.sh_degree, few.max_gaussians, few.dropout) == (1, 2 * len(scene.points), 0.2)
     assert few_views.adapted(few, scene) == few, "a resumed run, and one from its config.json, continue"
     assert few_views.adapted(replace(config, max_gaussians=7), scene).max_gaussians == 7
     sought = few_views.adapted(replace(config, strategy="error", size="auto"), scene)
-    assert sought == few, "there are too few photos to seek the size by"
-    # A random start grows as it is told.
+    assert sought == few, "there are too few photos to search for the size"
+    # A random start has the cap of the configuration.
     assert few_views.adapted(config, replace(scene, points=scene.points[:0])).max_gaussians is None
     assert few_views.adapted(config, replace(scene, train=scene.train * 3)) == config
 

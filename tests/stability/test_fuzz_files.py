@@ -1,8 +1,8 @@
-"""Damaged files of every kind: they are read, or refused by an error that names the file, and no memory is taken that
-they are not worth.
+"""Damaged files of every kind are read, or refused by an error that names the file, and take a bounded amount of
+memory.
 
-A file is made as a program writes it, then cut, flipped, spliced, and given extreme numbers where it has numbers;
-inside its compression too. `make fuzz` runs the same tests with many more cases.
+A file is written correctly. Then bytes are cut, flipped and spliced, and numbers are replaced by extreme ones, also
+inside its compressed parts. `make fuzz` runs the same tests with many more cases.
 """
 
 import gzip
@@ -33,19 +33,19 @@ from clsplat.training.checkpoint import load_state, save_state
 from clsplat.training.loop import initial_state
 
 MEMORY_MAX = 3 * EXPANSION_FREE
-"""Bytes that reading a file of some kB may allocate: what files unfold to at most, and float copies of it."""
+"""Largest memory for reading a file of a few kB, bytes: the limit on decompressed data, and float copies of it."""
 
 PHOTO_MEMORY_MAX = 8 * 2 * Image.MAX_IMAGE_PIXELS
-"""The same for photos: a mask of one colour takes a byte of PNG for a thousand pixels, so that nothing but the number
-of pixels bounds them. Pillow refuses twice MAX_IMAGE_PIXELS; two copies of their colours, and a byte."""
+"""The same for photos, bytes. A PNG of one colour takes a byte per thousand pixels, so that only the number of pixels
+is bounded: Pillow refuses more than twice MAX_IMAGE_PIXELS. A pixel takes two copies of its colour, and a byte."""
 
 
 def read(load, name, memory=MEMORY_MAX):
-    """What `load` returns, or None where it refuses the file by `name`; anything else is a failure."""
+    """Result of `load`, or None if it refuses the file by `name`. Everything else is a failure."""
     tracemalloc.start()
     try:
         with warnings.catch_warnings():
-            # Words to the user, and Pillow's about large images; NumPy's would mean that something went unchecked.
+            # Ignore warnings for the user, and Pillow's on large images. NumPy's would reveal unchecked values.
             warnings.simplefilter("ignore", UserWarning)
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             return load()
@@ -75,7 +75,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def originals(folder):
-    """A whole file of each format, and the ASCII kind of PLY."""
+    """An undamaged file of each format, and an ASCII PLY."""
     scene = synthetic_scene(9, sh_degree=1)[0].astype(np.float32)
     files = {}
     for suffix in FORMATS:
@@ -95,7 +95,7 @@ def originals(folder):
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_damaged_files_of_gaussians(folder, originals, cases, suffix):
-    """Bytes of the file as it is: headers, counts, compressed streams."""
+    """Damage to the bytes of the file: headers, counts, compressed streams."""
 
     @given(ANY)
     def check(changes):
@@ -156,7 +156,7 @@ def test_damaged_colmap_models(folder, cases, ending, name):
     def check(changes):
         path.write_bytes(damaged(whole, changes))
         cases["COLMAP models"] += 1
-        # A camera that is missing is missed by the photos, which name both files.
+        # The error on a missing camera comes from the photos, and names both files.
         found = read(lambda: colmap.read_model(model), f"{model.name}/")
         if found is not None:
             _, images, points, _ = found
@@ -180,7 +180,7 @@ NAMES = st.one_of(
 
 @pytest.mark.parametrize("kind", ["bin", "txt", "transforms"])
 def test_names_of_photos_stay_in_the_folder(folder, cases, kind):
-    """What lies outside of the dataset is not read, whatever path leads there."""
+    """Files outside of the dataset are not read, regardless of the path."""
     outside = folder / kind
     root = outside / "inner" / "data"
     photos = [("a.png", 1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0))]
@@ -206,7 +206,7 @@ def test_names_of_photos_stay_in_the_folder(folder, cases, kind):
 
 
 def test_damaged_transforms(folder, cases):
-    """Any value of any kind in any place of the JSON, and damage to its text."""
+    """Arbitrary values at arbitrary positions of the JSON, and damage to its text."""
     root = folder / "transforms"
     write_transforms(root, ["images/a.png", "images/b.png"])
     path = root / "transforms.json"
@@ -274,7 +274,7 @@ def test_damaged_photos(folder, cases, ending):
 
 
 def test_damaged_checkpoints(folder, cases):
-    """Bytes of the file, and of the arrays in it: their headers say how much memory to take."""
+    """Damage to the bytes of the file and of its arrays, whose headers determine the size of the memory."""
     _, camera = synthetic_scene(1)
     photo = np.zeros((camera.height, camera.width, 3), np.uint8)
     scene = Scene(
@@ -308,7 +308,8 @@ def test_damaged_checkpoints(folder, cases):
 
 
 def each_flaw(content):
-    """Every cut and every flipped bit of a file, or as many of them, evenly spread, as the profile has cases for."""
+    """Yield every cut and every flipped bit of a file, or an even selection as large as the profile's number of
+    cases."""
     total = 9 * len(content)
     for at in range(0, total, max(1, total // settings.default.max_examples)):
         place, bit = divmod(at, 9)

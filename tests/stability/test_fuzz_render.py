@@ -1,7 +1,7 @@
-"""Scenes and cameras of extreme magnitudes: an image and gradients that are finite, or an InputError, never a crash.
+"""Scenes and cameras with extreme values: images and gradients are finite, or there is an InputError, but no crash.
 
-A random scene has some of its values, or whole fields, replaced by what a diverged training, a converter or an
-attacker may leave there (Brush's fuzz tests; Faster-GS). `make fuzz` runs the same test with many more cases.
+Single values or whole fields of a random scene are replaced by values that a diverged training, a converter or an
+attacker may produce (Brush's fuzz tests; Faster-GS). `make fuzz` runs the same test with many more cases.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ VALUES = [
     *(1e19, -1e19, 1e10, 1e-10, 1e-19, 1e-30, 1 / 255, 20.0, -20.0, 88.0, -88.0, 100.0, -104.0, 0.0099, 0.01, 1e4),
 ]
 SIZES = [(1, 1), (4099, 3), (2, 257), (16, 16), (37, 29), (8, 1)]
-# So many pixels that they are drawn in few cases only.
+# The second size has so many pixels that only few cases draw it.
 MOST = st.sampled_from([*SIZES[:1], *SIZES[2:]])
 FIELDS = ("means", "log_scales", "quats", "logit_opacities", "sh")
 
@@ -89,8 +89,8 @@ def test_images_and_gradients_are_finite(device, cases, mode, sort):
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_the_others_are_drawn_as_before(device, cases, mode):
-    """A Gaussian with a value that is no number is not drawn, and no other pixel changes."""
+def test_the_other_gaussians_are_drawn_as_before(device, cases, mode):
+    """A Gaussian with a NaN is not drawn, and no other pixel changes."""
 
     @given(
         st.integers(0, 99),

@@ -1,23 +1,16 @@
-"""Densification: resets of opacities, photos that nothing explains, starts without points."""
+"""Densification: resets of opacities, photos of noise, and starts without points."""
 
 from dataclasses import replace
 
 import pytest
+from random_start import LONGER, points_lost
 
-from clsplat.bench.stability.growth import (
-    LONGER,
-    RESET_CONFIG,
-    around_reset,
-    checkerboard,
-    largest_number,
-    noise,
-    points_lost,
-)
+from clsplat.bench.stability.growth import RESET_CONFIG, around_reset, checkerboard, largest_number, noise
 from clsplat.bench.stability.small import CONFIG, small_scene, with_train
 
 
 def test_opacities_that_decay_make_no_dip(device):
-    """gsplat #1011, #1012: after a reset to 0.01 the image is gone, and comes back over many iterations."""
+    """gsplat #1011, #1012: a reset to 0.01 removes the image, which takes many iterations to come back."""
     scene = small_scene(device)
     dip = {}
     for decay in (0.0, 0.05):
@@ -29,7 +22,7 @@ def test_opacities_that_decay_make_no_dip(device):
 
 @pytest.mark.parametrize("photos", [noise, checkerboard])
 def test_photos_that_nothing_explains_stay_under_the_cap(device, photos):
-    """poison-splat (Lu et al. 2024): every iteration's gradients ask for more Gaussians."""
+    """poison-splat (Lu et al. 2024): the gradients of each iteration cause more Gaussians."""
     scene = with_train(small_scene(device), photos)
     config = replace(CONFIG, iterations=150, adc=replace(CONFIG.adc, every=25))
     assert largest_number(scene, replace(config, max_gaussians=100), device) <= 100

@@ -1,4 +1,4 @@
-"""Depths that are equal and sums that are rounded: the same input gives the same bits."""
+"""Equal depths and rounded sums: the same input gives the same bits."""
 
 from dataclasses import replace
 
@@ -13,22 +13,24 @@ from clsplat.testing import synthetic_scene
 
 @pytest.mark.parametrize("sort", ["global", "per_tile"])
 def test_ties_have_one_order(configured_device, sort):
-    """A sort that is not stable shows whichever of two splats at one depth comes first: the one of lower index here,
-    which the twin composites in that order."""
+    """Of two splats at the same depth, the one with the lower index is in front, as in the twin.
+
+    With a sort that is not stable, the order of the two would be arbitrary.
+    """
     gaussians, camera = _wall(300)
     config = RenderConfig(sort=sort)
     scene = gaussians.astype(np.float32)
     found = render(scene, camera, config, configured_device, gradients=False).rgb
     twin = render(scene, camera, config, gradients=False, device="reference").rgb
     turned = render(scene.take(np.arange(300)[::-1]), camera, config, gradients=False, device="reference").rgb
-    # Two orders of the ties are far apart, and the device takes that of the twin.
+    # Two orders of the ties give different images, and the device uses the order of the twin.
     assert np.abs(turned - twin).max() > 0.1
     assert np.abs(found - twin).max() < 0.01
     np.testing.assert_array_equal(render(scene, camera, config, configured_device, gradients=False).rgb, found)
 
 
 def test_rows_in_another_order_change_nothing(device):
-    """Where no depths are equal, the order of the file must not show: sums go by depth."""
+    """If no depths are equal, the order of the rows does not matter: sums are ordered by depth."""
     gaussians, camera = synthetic_scene(500, seed=1)
     scene = gaussians.astype(np.float32)
     rows = np.random.default_rng(0).permutation(500)

@@ -1,4 +1,4 @@
-"""Gaussians that cross, while the camera moves: the image must not jump where the order of two centres changes."""
+"""Intersecting Gaussians and a moving camera: the image must not jump when the order of two centres changes."""
 
 import numpy as np
 import pytest
@@ -9,8 +9,11 @@ from clsplat.config import RenderConfig
 
 @pytest.mark.parametrize("path", ["turn", "move"])
 def test_nothing_pops(device, path):
-    """Popping (StopThePop, Radl et al. 2024): when two centres swap, all that both Gaussians cover changes at once; a
-    line between them that moves on changes next to nothing."""
+    """Popping (StopThePop, Radl et al. 2024).
+
+    When two centres swap, all pixels that both Gaussians cover change at once. With an order per pixel, only the line
+    between the Gaussians moves, which changes little.
+    """
     worst = {}
     for sort in ("global", "pixel"):
         config = RenderConfig(sort=sort)

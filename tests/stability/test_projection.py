@@ -1,4 +1,4 @@
-"""Projection where it fails: parameters that are no numbers, needles, the edge of the frustum, wide angles."""
+"""Difficult cases of projection: invalid parameters, needles, the edge of the frustum, and wide angles."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from clsplat.testing import synthetic_scene
 
 @pytest.mark.parametrize("field", Gaussians.__dataclass_fields__)
 def test_a_poison_harms_nobody_else(device, field):
-    """One NaN spreads through its tile, and with the gradient through the scene (Brush's fuzz tests)."""
+    """One NaN spreads through its tile, and through the gradients to the whole scene (Brush's fuzz tests)."""
     for k, value in enumerate(POISONS):
         mode = ("classic", "antialiased")[k % 2]
         for sort in ("auto", "pixel"):
@@ -26,7 +26,7 @@ def test_a_poison_harms_nobody_else(device, field):
 
 
 def test_needles_keep_their_determinant(device):
-    """xx yy - xy^2 cancels: in float32 a needle of 1000 px has no determinant left, or a negative one."""
+    """xx yy - xy^2 cancels: in float32, the determinant of a needle of 1000 px is 0 or negative."""
     gaussians, camera = synthetic_scene(200, width=97, height=61)
     rng = np.random.default_rng(0)
     gaussians.means[:] = rng.uniform(-0.3, 0.3, (200, 3))
@@ -41,8 +41,10 @@ def test_needles_keep_their_determinant(device):
 
 
 def test_extents_stay_bounded_beside_the_image(any_device):
-    """Beyond the frustum the affine approximation grows without bound (diff-gaussian-rasterization #75): slopes are
-    clamped to the enlarged image, also just above the near plane."""
+    """Outside of the frustum, the affine approximation is unbounded (diff-gaussian-rasterization #75).
+
+    Slopes are clamped to the enlarged image, also just behind the near plane.
+    """
     camera = Camera(np.eye(4), 50, 50, 50, 50, 100, 100)
     gaussians = replace(synthetic_scene(3)[0], means=np.array([[0, 0, 1.0], [2, 0, 1], [40, 0, 1]]) * 0.0105)
     gaussians.log_scales[:] = np.log(0.5)
@@ -55,10 +57,10 @@ def test_extents_stay_bounded_beside_the_image(any_device):
 
 
 def test_the_affine_projection_is_right_on_the_axis(device):
-    """Against Gaussians along rays: what is lost at wide angles (3DGUT) is not lost at narrow ones."""
+    """Compared with Gaussians evaluated along rays, it is accurate at narrow angles, but not at wide ones (3DGUT)."""
     scene, found = shell(150), {}
     for degrees in (40, 140):
         camera = wide_camera(degrees, width=60)
         rgb = render(scene.astype(np.float32), camera, device=device, gradients=False).rgb
-        found[degrees] = _psnr(rgb, ray_image(scene, camera).image)
+        found[degrees] = _psnr(rgb, ray_image(scene, camera).rgb)
     assert found[40] > 30 > 25 > found[140]

@@ -1,9 +1,9 @@
-"""Scenes at other scales than that of their photos."""
+"""Scenes rendered at other scales than that of their photos."""
 
 import numpy as np
 import pytest
+from other_scales import SCALES, scales
 
-from clsplat.bench.stability.scales import SCALES, _scales
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.render import render
@@ -11,8 +11,10 @@ from clsplat.testing import synthetic_scene
 
 
 def test_seen_from_afar(device):
-    """The dilation by 0.3 px^2 makes everything fat that is smaller than a pixel (Mip-Splatting): with the opacity
-    compensated, what an image shows in total stays."""
+    """The dilation by 0.3 px^2 enlarges everything that is smaller than a pixel (Mip-Splatting).
+
+    With compensated opacity, the mean alpha of the image stays about the same.
+    """
     rng = np.random.default_rng(0)
     gaussians = synthetic_scene(200, sh_degree=0)[0]
     gaussians.means[:] = rng.uniform(-1, 1, (200, 3)) * [1, 1, 0.1]
@@ -33,11 +35,11 @@ def test_seen_from_afar(device):
 @pytest.mark.slow
 @pytest.mark.shared
 def test_photos_of_one_scale_make_a_scene_for_others(device, shared):
-    """A quarter of the scale: at least 3 dB that the dilation costs come back; nearer, nothing is lost.
+    """At a quarter of the scale, the filters gain at least 3 dB. At larger scales, they lose nothing.
 
-    At the photos' own scale the 3D filter costs 1.0 dB of short trainings, the 2D one 0.3.
+    At the scale of the photos, the 3D filter costs 1.0 dB in short trainings, and the 2D filter 0.3 dB.
     """
-    series = {label: dict(points) for label, points in _scales(device, shared / "data").plot.series.items()}
+    series = {label: dict(points) for label, points in scales(device, shared / "data").plot.series.items()}
     for label, cost in (("2D filter", 0.5), ("2D and 3D filter", 1.2)):
         assert series[label][0.25] > series["classic"][0.25] + 3
         for scale in SCALES:

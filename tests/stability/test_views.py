@@ -1,9 +1,10 @@
-"""What no photo shows: colours from other directions, needles."""
+"""Directions without a photo: colours from other sides, needles, and Gaussians next to a camera."""
 
 import numpy as np
 import pytest
+from needles_and_floaters import effective_rank
 
-from clsplat.bench.stability.views import _effective_rank, unseen_side
+from clsplat.bench.stability.sh_extrapolation import unseen_side
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.render import render
@@ -11,21 +12,23 @@ from clsplat.testing import synthetic_scene
 
 
 def test_unseen_sides_keep_their_colour(device):
-    """Bands that four photos do not constrain take any colour on the other side."""
+    """Bands that four photos do not constrain have arbitrary colours on the other side."""
     assert unseen_side(0, device) > unseen_side(3, device) + 0.6  # measured: 22.6 and 21.4 dB
 
 
 @pytest.mark.slow
 @pytest.mark.shared
 def test_the_regulariser_leaves_fewer_needles(device, shared):
-    """Effective rank, Hyung et al. 2024."""
-    plain, regular, *_ = (figure.value for figure in _effective_rank(device, shared / "data").figures)
+    """Regulariser of the effective rank (Hyung et al. 2024)."""
+    plain, regular, *_ = (figure.value for figure in effective_rank(device, shared / "data").figures)
     assert plain > 2 * regular
 
 
 def test_what_a_camera_nearly_touches_stays_out_of_the_image(any_device):
-    """A ball of 0.1 beside the camera, 0.1 in front of its plane and 50 degrees above its axis: as found on
-    castle_p30, where it covered a held-out photo. The affine projection does not hold there."""
+    """A ball of 0.1 next to the camera, 0.1 in front of its plane and 50 degrees above its axis.
+
+    Such a Gaussian covered a held-out photo of castle_p30. The affine projection is not valid there.
+    """
     camera = Camera(np.eye(4), 95, 95, 48, 32, 96, 64)
     ball = synthetic_scene(1, sh_degree=0)[0]
     ball.means[:], ball.log_scales[:], ball.logit_opacities[:] = [0, -0.12, 0.1], np.log(0.1), 3

@@ -1,17 +1,20 @@
-"""How much the method's known failures cost without their remedies and with them: `clsplat bench stability`."""
+"""Experiments on the known failures of the method, for `clsplat bench stability`.
+
+Belongs here: experiments that need only a device, each without its remedy and with it, how they are run, and the
+report. Does not belong here: experiments that train on real scenes (``tests/stability/scenes``), and the remedies.
+"""
 
 from clsplat.bench.stability import (
     coordinates,
-    densities,
+    dark_areas,
+    everything_pruned,
     gradients,
     growth,
     images,
     order,
-    photos,
     popping,
     projection,
-    scales,
-    views,
+    sh_extrapolation,
 )
 from clsplat.bench.stability.experiment import Experiment
 
@@ -22,22 +25,14 @@ EXPERIMENTS: dict[str, Experiment] = {
     "popping": popping.POPPING,
     "poisoning": projection.POISONING,
     "needles": projection.NEEDLES,
-    "effective-rank": views.EFFECTIVE_RANK,
     "jacobian": projection.JACOBIAN,
     "wide-angle": projection.WIDE_ANGLE,
-    "scales": scales.SCALE,
-    "exposure": photos.EXPOSURE,
-    "poses": photos.POSES,
-    "few-views": photos.FEW_VIEWS,
-    "floaters": views.FLOATERS,
-    "dark-areas": photos.DARK_AREAS,
+    "dark-areas": dark_areas.DARK_AREAS,
     "constants": gradients.CONSTANTS,
-    "everything-pruned": densities.ALL_PRUNED,
+    "everything-pruned": everything_pruned.ALL_PRUNED,
     "opacity-reset": growth.OPACITY_RESET,
     "blow-up": growth.BLOW_UP,
-    "random-start": growth.RANDOM_START,
-    "sh-extrapolation": views.EXTRAPOLATION,
-    "dead-gaussians": densities.DEAD,
+    "sh-extrapolation": sh_extrapolation.EXTRAPOLATION,
     "images": images.KINDS,
 }
-"""In the order of docs/stability.md; a line enrols an experiment in the command, the page and the tests."""
+"""Experiments by name. One line here adds an experiment to the command and its report."""

@@ -1,7 +1,6 @@
-"""Experiments on where the world's origin lies."""
+"""Experiment: a scene far from the origin of the world."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -11,13 +10,13 @@ from clsplat.render import render
 from clsplat.testing import synthetic_scene
 
 OFFSETS = 10.0 ** np.arange(0, 8)
-"""World units along each axis, in a scene of 3 units; UTM coordinates reach 5e6."""
+"""Offsets along each axis, world units. The scene measures 3 units. UTM coordinates reach 5e6."""
 
 FLOOR = 2.0**-24
-"""Shown for images that are the same: half a step of float32 below 1."""
+"""Smallest difference on the logarithmic chart: half a step of float32 below 1. Equal images are shown here."""
 
 
-def _world_offset(device: Device, data: Path | None) -> Found:
+def _world_offset(device: Device) -> Found:
     gaussians, camera = synthetic_scene(2000, width=160, height=120)
     here = render(gaussians.astype(np.float32), camera, device=device, gradients=False).rgb
     series: dict[str, list[tuple[float, float | None]]] = {"float32 in the world": [], "origin moved in float64": []}
@@ -45,7 +44,7 @@ def _world_offset(device: Device, data: Path | None) -> Found:
 WORLD_OFFSET = Experiment(
     failure="geo-referenced coordinates",
     source="float32 at 5e6 has steps of 0.5",
-    remedy="the origin moves to the cameras in float64 when a dataset is loaded, and back at export",
+    remedy="the origin is moved to the cameras in float64 when a dataset is loaded, and back at export",
     test="tests/stability/test_coordinates.py::test_the_same_image_in_coordinates_of_the_world",
     measure=_world_offset,
     figure="largest difference of a colour (of 0 to 1), world shifted by 1e6",

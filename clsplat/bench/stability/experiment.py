@@ -1,15 +1,12 @@
-"""What an experiment on stability is, and what it finds."""
+"""The types of an experiment on stability and of its results."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, NamedTuple
-
-from clsplat.device import Device
 
 
 class Figure(NamedTuple):
-    """One number: what it was measured with (without the remedy, with it, with another), and its unit."""
+    """One number. The label names the variant: without the remedy, with it, or with an alternative."""
 
     label: str
     value: float
@@ -17,7 +14,7 @@ class Figure(NamedTuple):
 
 
 class Plot(NamedTuple):
-    """A chart: per series its points (x, y), where a y of None leaves a gap; `log` names the logarithmic axes."""
+    """A chart: axis labels, points (x, y) by series (a y of None leaves a gap), and the logarithmic axes."""
 
     x: str
     y: str
@@ -26,7 +23,7 @@ class Plot(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What an experiment measured: the figure without the remedy first, then with it and with what competes."""
+    """Results of an experiment: first the figure without the remedy, then with it and with alternatives."""
 
     figures: list[Figure]
     plot: Plot | None = None
@@ -34,30 +31,27 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class Experiment:
-    """A way in which the method fails, and how that is measured without and with the remedy.
+    """A known failure of the method, and how it is measured without and with the remedy.
 
     Parameters
     ----------
     failure : str
-        In words, as on docs/stability.md.
+        Name of the failure, as on docs/stability.md.
     source : str
-        Where it is known from: paper, issue.
+        Paper or issue that describes it.
     remedy : str or None
-        What holds it off, with the name of its option where there is one; None where the row is open.
+        The remedy, with its option where there is one. None if there is no remedy yet.
     test : str
-        What fails without the remedy, as tests/stability/FILE.py::NAME.
+        A test that fails without the remedy, as tests/stability/FILE.py::NAME.
     measure : callable
-        From the device and the folder of real scenes (None where there is none) to what was found.
+        Runs the experiment on a `Device` and returns a `Found`.
     figure : str
-        What the figures count, in words.
-    needs_data : bool
-        The experiment does not run without real scenes.
+        Description of the figures.
     """
 
     failure: str
     source: str
     remedy: str | None
     test: str
-    measure: Callable[[Device, Path | None], Found]
+    measure: Callable[..., Found]
     figure: str
-    needs_data: bool = False

@@ -1,6 +1,4 @@
-"""Experiments on gradients that do not belong to the image."""
-
-from pathlib import Path
+"""Experiment: gradients that do not match the image."""
 
 import numpy as np
 
@@ -13,14 +11,14 @@ from clsplat.render import render
 from clsplat.testing import synthetic_scene
 
 OTHER_ALPHA_MAX = 0.999
-"""Where OpenSplat's forward pass clamps alpha; its backward pass clamps at 0.99."""
+"""Largest alpha of OpenSplat's forward pass. That of its backward pass is 0.99."""
 
 STEP = 1e-6
-"""Of central differences in double precision: their error is about its square."""
+"""Step of central differences in float64. Their error is about the square of the step."""
 
 
 def saturated(n: int = 30) -> tuple[Gaussians, Camera]:
-    """Large Gaussians of opacities about ALPHA_MAX, which clamps many of their pixels."""
+    """Large Gaussians with opacities around ALPHA_MAX, so that alpha is clamped in many pixels."""
     gaussians, camera = synthetic_scene(n, seed=2)
     gaussians.logit_opacities[:] = np.linspace(4, 6, n)  # 0.982 to 0.998
     gaussians.log_scales += 1
@@ -28,7 +26,7 @@ def saturated(n: int = 30) -> tuple[Gaussians, Camera]:
 
 
 def mismatch(forward: Device, backward: Device) -> float:
-    """Error of one device's derivatives by the opacities, relative to differences of another device's images."""
+    """Relative error of one device's derivatives by the opacities, compared with differences of another's images."""
     gaussians, camera = saturated()
     rng = np.random.default_rng(0)
     weights = rng.normal(size=(camera.height, camera.width, 3))
@@ -43,7 +41,7 @@ def mismatch(forward: Device, backward: Device) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
-def _constants(device: Device, data: Path | None) -> Found:
+def _constants(device: Device) -> Found:
     ours = Device(device.cl_device, real=np.float64)
     other = Device(device.cl_device, real=np.float64, model={"ALPHA_MAX": OTHER_ALPHA_MAX})
     return Found(
@@ -59,8 +57,8 @@ def _constants(device: Device, data: Path | None) -> Found:
 CONSTANTS = Experiment(
     failure="forward/backward constants differ, saturated alpha",
     source="OpenSplat: 0.999 and 0.99",
-    remedy="one module of constants feeds all kernels; the gradient stops where alpha is clamped",
+    remedy="one module of constants feeds all kernels; the gradient is 0 where alpha is clamped",
     test="tests/stability/test_gradients.py::test_gradients_are_those_of_the_image_where_alpha_saturates",
     measure=_constants,
-    figure="error of the derivatives by the opacity of opaque Gaussians, against differences of the images",
+    figure="relative error of the derivatives by the opacity of opaque Gaussians, from differences of images",
 )

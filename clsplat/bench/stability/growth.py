@@ -1,18 +1,16 @@
-"""Experiments on densification: resets of opacities, photos that nothing explains, starts without points."""
+"""Experiments on densification: resets of opacities, and photos of noise that make the number of Gaussians grow."""
 
 from dataclasses import replace
-from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
 from clsplat.bench.stability.small import CONFIG, small_scene, with_train
-from clsplat.bench.stability.trained import SHORT, held_out, load, trained
-from clsplat.config import AdcConfig, DataConfig, TrainConfig
-from clsplat.dataset import with_points
+from clsplat.config import AdcConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.evaluate import mean_metrics
+from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
 from clsplat.training.loop import train
 
@@ -20,33 +18,28 @@ RESET_CONFIG = replace(
     CONFIG, iterations=400, adc=replace(CONFIG.adc, every=25, reset_every=150, start=50, stop_fraction=0.8)
 )
 AFTER = (-1, 0, 5, 10, 20, 40)
-"""Iterations from a reset at which the held-out photos are looked at; the rounds lie between 0 and 40."""
+"""Iterations, counted from a reset, after which held-out photos are evaluated. Rounds of densification lie between 0
+and 40."""
 
 CAP = 300
-"""Of Gaussians, for photos that nothing explains."""
-
-START_CAP = 6000
-"""Of Gaussians, for starts without points."""
-
-LONGER = replace(SHORT, strategy="error", size="auto", iterations=2000, data=DataConfig(downscale=4))
-"""What users get by default, in a fifteenth of the paper's iterations."""
+"""Maximal number of Gaussians in the experiment on photos of noise."""
 
 
 def around_reset(adc: AdcConfig, scene: Scene, device: Device) -> tuple[list[float], float]:
-    """PSNR of held-out photos at `AFTER` from the second reset, and at the end, dB."""
+    """PSNR of held-out photos at the iterations `AFTER` the second reset, and at the end, dB."""
     config, found = replace(RESET_CONFIG, adc=adc), []
 
-    def look(gaussians: object) -> dict[str, float]:
-        found.append(mean_metrics(gaussians, scene.test, config.render, device)["psnr"])  # type: ignore[arg-type]
+    def evaluate(gaussians: object) -> dict[str, float]:
+        found.append(mean_metrics(gaussians, scene.test, Renderer(device, config.render))["psnr"])  # type: ignore[arg-type]
         return {}
 
     marks = [2 * RESET_CONFIG.adc.reset_every + after for after in AFTER]
     with TemporaryDirectory() as out:
-        train(scene, config, device, Path(out), evaluate=look, evaluate_after=[*marks, config.iterations])
+        train(scene, config, out, device, evaluate=evaluate, evaluate_after=[*marks, config.iterations])
     return found[:-1], found[-1]
 
 
-def _reset(device: Device, data: Path | None) -> Found:
+def _reset(device: Device) -> Found:
     scene, adc = small_scene(device), RESET_CONFIG.adc
     variants = {
         "reset": adc,
@@ -64,19 +57,19 @@ def _reset(device: Device, data: Path | None) -> Found:
 
 
 def noise(view: View, rng: np.random.Generator) -> View:
-    """Each pixel another colour, in each photo anew."""
+    """Replace a photo by random colours per pixel."""
     return replace(view, image=rng.integers(0, 256, view.image.shape, dtype=np.uint8))
 
 
 def checkerboard(view: View, rng: np.random.Generator) -> View:
-    """Black and white squares of two pixels, moved in each photo."""
+    """Replace a photo by black and white squares of 2 px, shifted at random."""
     y, x = np.indices(view.image.shape[:2]) + rng.integers(0, 4, 2)[:, None, None]
     white = (x // 2 + y // 2) % 2 == 0
     return replace(view, image=np.where(white[:, :, None], np.uint8(255), np.uint8(0)).repeat(3, axis=2))
 
 
 def largest_number(scene: Scene, config: TrainConfig, device: Device) -> int:
-    """The most Gaussians that there are in any iteration."""
+    """Largest number of Gaussians in any iteration of a training."""
     most = 0
 
     def watch(record: dict[str, object]) -> None:
@@ -84,11 +77,11 @@ def largest_number(scene: Scene, config: TrainConfig, device: Device) -> int:
         most = max(most, int(record["num_gaussians"]))  # type: ignore[call-overload]
 
     with TemporaryDirectory() as out:
-        train(scene, config, device, Path(out), progress=watch)
+        train(scene, config, out, device, progress=watch)
     return most
 
 
-def _blow_up(device: Device, data: Path | None) -> Found:
+def _blow_up(device: Device) -> Found:
     scene, figures = small_scene(device), []
     config = replace(CONFIG, iterations=400, adc=replace(CONFIG.adc, every=25))
     for label, photos in {
@@ -101,84 +94,24 @@ def _blow_up(device: Device, data: Path | None) -> Found:
             figures.append(
                 Figure(f"{label}, {f'cap {cap}' if cap else 'no cap'}", largest_number(photos, asked, device))
             )
-    # Without the remedy first: what noise makes of no cap.
+    # First without the remedy: noise without a cap.
     return Found([figures[2], *figures[:2], *figures[3:]])
-
-
-def points_lost(
-    data: Path | None, name: str, config: TrainConfig, device: Device, boxes: tuple[int, ...] = (1,)
-) -> dict[str, float]:
-    """What it costs held-out photos, in dB, to start without the points of structure from motion.
-
-    Parameters
-    ----------
-    data : Path
-        Folder of the scene `name`.
-    config : TrainConfig
-    device : Device
-    boxes : tuple of int
-        Of the random points: their edges, in edges of that which `config` asks for.
-
-    Returns
-    -------
-    dict
-        ``triangulated``: from points found by the photos and their poses; ``random``, ``random, box 3x`` and so on:
-        from random points.
-    """
-    scene, _ = load(data, name, config)
-    none = replace(scene, points=scene.points[:0], colors=scene.colors[:0])
-    assert data is not None  # or `load` would have refused
-
-    def reached(start: Scene, config: TrainConfig) -> float:
-        return held_out(trained(start, config, device), scene, config, device)
-
-    best = reached(scene, config)
-    lost = {}
-    for box in boxes:
-        wide = replace(config, init=replace(config.init, random_extent=box * config.init.random_extent))
-        lost["random" if box == 1 else f"random, box {box}x"] = best - reached(none, wide)
-    return lost | {"triangulated": best - reached(with_points(none, data / name, config.data), config)}
-
-
-def _random_start(device: Device, data: Path | None) -> Found:
-    figures = []
-    for name in ("fox_pinhole", "fern"):
-        for start, lost in points_lost(data, name, LONGER, device).items():
-            figures.append(Figure(f"{name}, {start}", lost, "dB"))
-    for strategy in ("adc", "mcmc", "error"):
-        config = replace(SHORT, strategy=strategy, max_gaussians=START_CAP)
-        config = replace(config, init=replace(config.init, random_points=START_CAP // 2))
-        for start, lost in points_lost(data, "fox_pinhole", config, device, boxes=(1, 3)).items():
-            figures.append(Figure(f"{strategy}, {start}", lost, "dB"))
-    return Found(figures)
 
 
 OPACITY_RESET = Experiment(
     failure="opacity reset",
     source="gsplat #1011, #1012: dips of 2.7 to 7.6 dB",
-    remedy="a fraction of the opacities taken in each round instead (`--adc.opacity-decay`)",
+    remedy="instead, each round reduces opacities by a fraction (`--adc.opacity-decay`)",
     test="tests/stability/test_growth.py::test_opacities_that_decay_make_no_dip",
     measure=_reset,
-    figure="PSNR of held-out photos before a reset, less the lowest in the 40 iterations after it; 40 balls, 40x32",
+    figure="PSNR of held-out photos before a reset minus the lowest within 40 iterations after it; 40 balls, 40x32",
 )
 
 BLOW_UP = Experiment(
     failure="densification blow-up",
     source="poison-splat, Lu et al. 2024: 1.7 to 4 times the Gaussians",
-    remedy="a hard cap, the largest gradients first (`--max-gaussians`); memory is foretold (`--memory-limit`)",
+    remedy="a hard cap, largest gradients first (`--max-gaussians`); a prediction of the memory (`--memory-limit`)",
     test="tests/stability/test_growth.py::test_photos_that_nothing_explains_stay_under_the_cap",
     measure=_blow_up,
-    figure="the most Gaussians in any of 400 iterations, from 40 points",
-)
-
-RANDOM_START = Experiment(
-    failure="no points (random start)",
-    source="Kheradmand et al. 2024: 3DGS loses 5 dB, MCMC 0.1 dB",
-    remedy="points triangulated from the photos by their poses (`--init.triangulate`)",
-    test="tests/stability/test_growth.py::test_points_found_by_the_poses_are_as_good_as_given_ones",
-    measure=_random_start,
-    figure=f"what held-out photos lose without the scene's own points; {LONGER.iterations} iterations, size chosen, "
-    f"134x240 and 240x180; by strategy: fox_pinhole at 67x120, {SHORT.iterations} iterations, at most {START_CAP} "
-    "Gaussians",
-    needs_data=True,
+    figure="largest number of Gaussians in 400 iterations, from 40 points",
 )

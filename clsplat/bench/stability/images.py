@@ -1,4 +1,4 @@
-"""The experiment on photos of all kinds of files."""
+"""Experiment: image files of many kinds."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +17,7 @@ RGB = np.stack([GREY, GREY[::-1], GREY[:, ::-1]], axis=2).astype(np.uint8)
 
 
 def write_kinds(folder: Path) -> dict[str, Any]:
-    """A photo of each kind; per file name its upright RGB on black, or None where it must be refused."""
+    """Write an image file of each kind. Returns by name its upright RGB on black, or None if it must be refused."""
     image = Image.fromarray(RGB)
     turned = Image.Exif()
     turned[0x0112] = 3
@@ -49,7 +49,7 @@ def _right(path: Path, expected: Any, read: Any) -> bool:
         found = read(path)
     except InputError as error:
         return expected is None and path.name in str(error)
-    except Exception:  # a decoder's own words name no file and no remedy
+    except Exception:  # a message of the decoder names neither the file nor a remedy
         return False
     if expected is None or found.shape != expected.shape:
         return False
@@ -57,24 +57,24 @@ def _right(path: Path, expected: Any, read: Any) -> bool:
 
 
 def right_kinds(read: Any) -> tuple[int, int]:
-    """How many kinds a reader reads to one level, or refuses by name where it must; and how many there are."""
+    """Number of kinds that a reader reads correctly to one level, or refuses by name if it must; and their total."""
     with TemporaryDirectory() as folder:
         kinds = write_kinds(Path(folder))
         return sum(_right(Path(folder) / name, expected, read) for name, expected in kinds.items()), len(kinds)
 
 
 def plain(path: Path) -> Any:
-    """What a line of Pillow makes of a photo."""
+    """Read an image with one line of Pillow."""
     with Image.open(path) as image:
         return np.asarray(image.convert("RGB"))
 
 
 def ours(path: Path) -> Any:
-    """What clsplat makes of it."""
+    """Read an image with clsplat."""
     return read_photo(path, (0.0, 0.0, 0.0), upright=True)
 
 
-def _kinds(device: Device, data: Path | None) -> Found:
+def _kinds(device: Device) -> Found:
     (without, total), (remedied, _) = right_kinds(plain), right_kinds(ours)
     return Found([Figure("Pillow's convert", without, f"of {total}"), Figure("clsplat", remedied, f"of {total}")])
 
@@ -82,8 +82,8 @@ def _kinds(device: Device, data: Path | None) -> Found:
 KINDS = Experiment(
     failure="images of mixed size, orientation, EXIF rotation, 16-bit, grey, RGBA, CMYK, corrupt",
     source="issues of every implementation",
-    remedy="each kind has its rule, and what is left is refused by the file's name",
+    remedy="each kind has a rule, and all others are refused, naming the file",
     test="tests/stability/test_images.py::test_each_kind_is_read_right_or_refused_by_name",
     measure=_kinds,
-    figure="kinds of files that are read right, or refused by name where they must be",
+    figure="kinds of files that are read correctly, or refused by name if they must be",
 )

@@ -1,7 +1,6 @@
-"""Experiments on order: of depths that are equal, and of sums that are rounded."""
+"""Experiments on order: Gaussians of equal depths, and sums in different orders."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from clsplat.render import render
 from clsplat.testing import synthetic_scene
 
 RUNS = 5
+"""Number of repeated runs."""
 
 
 def _wall(n: int) -> tuple[Gaussians, Camera]:
@@ -20,18 +20,18 @@ def _wall(n: int) -> tuple[Gaussians, Camera]:
     gaussians, camera = synthetic_scene(n, width=160, height=120)
     flat = gaussians.means @ camera.viewmat[:3, :3].T
     flat[:, 2] = 0
-    # Viewed along z from the origin's front: depths are exactly 4 in any precision.
+    # The camera looks along z from a distance of 4, so that all depths are exactly 4 in any precision.
     viewmat = np.eye(4)
     viewmat[2, 3] = 4
     return replace(gaussians, means=flat), replace(camera, viewmat=viewmat)
 
 
-def _equal_depths(device: Device, data: Path | None) -> Found:
+def _equal_depths(device: Device) -> Found:
     gaussians, camera = _wall(2000)
     wall = gaussians.astype(np.float32)
     first = render(wall, camera, device=device, gradients=False).rgb
     again = [render(wall, camera, device=device, gradients=False).rgb for _ in range(RUNS)]
-    # What an order of the ties that is left to scheduling may do: any permutation of them is one of its outcomes.
+    # If scheduling decides the order of ties, any permutation of them may occur.
     rng = np.random.default_rng(0)
     shuffled = [
         render(wall.take(rng.permutation(len(wall))), camera, device=device, gradients=False).rgb for _ in range(RUNS)
@@ -44,7 +44,7 @@ def _equal_depths(device: Device, data: Path | None) -> Found:
     )
 
 
-def _repeated_runs(device: Device, data: Path | None) -> Found:
+def _repeated_runs(device: Device) -> Found:
     gaussians, camera = synthetic_scene(2000, width=160, height=120)
     scene = gaussians.astype(np.float32)
 
@@ -54,7 +54,7 @@ def _repeated_runs(device: Device, data: Path | None) -> Found:
 
     first = gradient()
     differing = sum(int((gradient() != first).sum()) for _ in range(RUNS))
-    # What float atomics do: sums of the same terms in the order in which work-items happen to arrive.
+    # Float atomics add the same terms in the order in which work-items happen to arrive.
     terms = np.random.default_rng(0).normal(size=(1000, 256)).astype(np.float32)
     order = np.random.default_rng(1).permutation(256)
     sums = [np.add.accumulate(part, axis=1)[:, -1] for part in (terms, terms[:, order])]

@@ -1,7 +1,6 @@
-"""Experiment on order again: of Gaussians that cross, while the camera moves."""
+"""Experiment: Gaussians that intersect pop when the camera moves."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -14,12 +13,14 @@ from clsplat.render import render_views
 from clsplat.testing import synthetic_scene
 
 FRAMES = 200
+"""Number of frames of a path."""
+
 STEP = 5e-4
-"""Radians, or fractions of the distance to the scene, from one frame to the next: a twelfth of a pixel."""
+"""Step from one frame to the next, radians or fractions of the distance to the scene. It is a twelfth of a pixel."""
 
 
 def crossing_discs(n: int) -> Gaussians:
-    """Discs that pierce each other: their centres say little about which is in front."""
+    """Discs that intersect each other, so that the order of their centres is not the order along most rays."""
     gaussians = synthetic_scene(n, sh_degree=0)[0]
     rng = np.random.default_rng(0)
     gaussians.means[:] = rng.uniform(-1, 1, (n, 3))
@@ -30,7 +31,7 @@ def crossing_discs(n: int) -> Gaussians:
 
 
 def frames(path: str, count: int, step: float, width: int = 160) -> list[Camera]:
-    """Cameras that `turn` in place or `move` sideways, at a distance of 4."""
+    """Cameras at a distance of 4 from the origin that `turn` in place or `move` sideways."""
     distance, height = 4, width * 3 // 4
     cameras = []
     for at in step * (np.arange(count) - count / 2):
@@ -48,7 +49,7 @@ def frames(path: str, count: int, step: float, width: int = 160) -> list[Camera]
 def frame_differences(
     device: Device | None, gaussians: Gaussians, cameras: list[Camera], config: RenderConfig
 ) -> np.ndarray:
-    """Mean difference of a colour between one frame and the next, (frames - 1,)."""
+    """Mean absolute difference of the colours between each frame and the next, (frames - 1,)."""
     images = (r.rgb for r in render_views(gaussians, cameras, config, device))
     before, differences = next(images), []
     for image in images:
@@ -57,7 +58,7 @@ def frame_differences(
     return np.array(differences)
 
 
-def _popping(device: Device, data: Path | None) -> Found:
+def _popping(device: Device) -> Found:
     gaussians = crossing_discs(60)
     figures: list[Figure] = []
     series: dict[str, list[tuple[float, float | None]]] = {}
@@ -69,7 +70,7 @@ def _popping(device: Device, data: Path | None) -> Found:
             if path == "move":
                 series[label] = [(float(i), float(v)) for i, v in enumerate(found)]
         figures += [Figure(f"{label}, camera turns", worst[0]), Figure(f"{label}, camera moves", worst[1])]
-    # Without the remedy first: the worse of its two paths.
+    # The worse of the two paths, first without the remedy.
     plain, sorted_ = max(figures[:2], key=lambda f: f.value), max(figures[2:], key=lambda f: f.value)
     return Found([plain, sorted_], Plot("frame", "mean difference from the frame before", series))
 
@@ -77,8 +78,8 @@ def _popping(device: Device, data: Path | None) -> Found:
 POPPING = Experiment(
     failure="popping when the camera turns or moves",
     source="StopThePop, Radl et al. 2024",
-    remedy="each pixel sorts its Gaussians by where its ray meets them: `--sort pixel`",
+    remedy="each pixel sorts its Gaussians by depth along its ray (`--sort pixel`)",
     test="tests/stability/test_popping.py::test_nothing_pops",
     measure=_popping,
-    figure="largest difference between two frames, in multiples of the median; 60 discs that cross",
+    figure="largest difference between two frames, in multiples of the median; 60 discs that intersect",
 )

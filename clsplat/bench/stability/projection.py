@@ -1,6 +1,5 @@
-"""Experiments on projection: parameters that are no numbers, needles, and wide angles."""
+"""Experiments on projection: invalid parameters, needles, and wide angles."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,18 +20,19 @@ from clsplat.testing import synthetic_scene
 Array = NDArray[np.float64]
 
 POISONS = (np.nan, np.inf, -np.inf, 0.0, 1e-40, 1e38, -1e38, 1e-38, 1 / 255)
+"""Values that a bad step, a damaged file or a division can leave in a parameter."""
 
 FIELDS_OF_VIEW = (20, 40, 60, 80, 100, 120, 140)
-"""Degrees across the image."""
+"""Fields of view across the image, degrees."""
 
 
 def poisons() -> list[tuple[str, float]]:
-    """Every field of Gaussians with every value that an unlucky step, file or division can leave there."""
+    """All combinations of a field of Gaussians and a value of `POISONS`."""
     return [(field, value) for field in Gaussians.__dataclass_fields__ for value in POISONS]
 
 
 def poisoned(field: str, value: float) -> tuple[Gaussians, Camera]:
-    """A scene whose Gaussian 0, in the middle of the image, has the value in the field's first component."""
+    """A scene in which Gaussian 0, in the middle of the image, has the value in the first component of the field."""
     gaussians, camera = synthetic_scene(30, 1, width=48, height=32)
     gaussians.means[0] = 0
     scene = gaussians.astype(np.float32)
@@ -41,7 +41,7 @@ def poisoned(field: str, value: float) -> tuple[Gaussians, Camera]:
 
 
 def harm(device: Device | None, field: str, value: float, config: RenderConfig) -> str:
-    """What a poison does beyond its own Gaussian; nothing if the string is empty."""
+    """Describe the effect of a poison outside its own Gaussian; an empty string if there is none."""
     scene, camera = poisoned(field, value)
     rendering = render(scene, camera, config, device, depth=True)
     v_rgb = np.random.default_rng(0).normal(size=rendering.rgb.shape)
@@ -54,17 +54,17 @@ def harm(device: Device | None, field: str, value: float, config: RenderConfig) 
     alone = render(scene.take(np.array([0])), camera, config, device, gradients=False).alpha > 0
     others = render(scene.take(np.arange(1, 30)), camera, config, device, depth=True)
     if not np.array_equal(others.rgb[~alone], rendering.rgb[~alone]):
-        return "pixels change where it is not seen"
+        return "pixels outside the Gaussian change"
     if not alone.any():
         clean = others.backward(v_rgb).gaussians
         for name, array in clean.arrays().items():
             if not np.array_equal(array, getattr(gradients.gaussians, name)[1:]):
-                return f"v_{name} of others changes"
+                return f"v_{name} of other Gaussians changes"
     return ""
 
 
 def _naive(field: str, value: float) -> bool:
-    """Whether equations 5 and 6 of the paper, as they stand, yield anything that is not finite in float32."""
+    """Whether equations 5 and 6 of the paper, implemented literally in float32, yield a value that is not finite."""
     scene, camera = poisoned(field, value)
     with np.errstate(all="ignore"):
         g = scene.take(np.array([0]))
@@ -78,7 +78,7 @@ def _naive(field: str, value: float) -> bool:
     return not np.isfinite(outputs).all()
 
 
-def _poisoning(device: Device, data: Path | None) -> Found:
+def _poisoning(device: Device) -> Found:
     configs = RenderConfig(), RenderConfig(mode="antialiased"), RenderConfig(sort="pixel")
     harmed = {(f, v) for f, v in poisons() for c in configs if harm(device, f, v, c)}
     return Found(
@@ -89,8 +89,8 @@ def _poisoning(device: Device, data: Path | None) -> Found:
     )
 
 
-def _determinants(device: Device, data: Path | None) -> Found:
-    """Covariances of needles from the two vectors that make them, in float32."""
+def _determinants(device: Device) -> Found:
+    """Determinants of needles' covariances in float32, as xx yy - xy^2 and as a sum of positive terms."""
     rng = np.random.default_rng(0)
     lengths = 10.0 ** np.arange(0, 6)
     series: dict[str, list[tuple[float, float | None]]] = {"xx yy - xy^2": [], "|b0 x b1|^2 + blur": []}
@@ -114,9 +114,11 @@ def _determinants(device: Device, data: Path | None) -> Found:
     return Found(figures, Plot("length of the needle, px", "determinants off by more than 1 %, %", series, "x"))
 
 
-def _jacobian(device: Device, data: Path | None) -> Found:
-    """Extents of a ball of 0.5 just above the near plane, 40 half fields of view beside the image, against those of
-    the same ball on the axis."""
+def _jacobian(device: Device) -> Found:
+    """Extents of a ball far outside the image, relative to those of the same ball on the axis.
+
+    The ball measures 0.5 and lies just behind the near plane, at a slope x/z of 40, which is 40 half fields of view.
+    """
     camera = Camera(np.eye(4), 50, 50, 50, 50, 100, 100)
     balls = synthetic_scene(2)[0]
     balls.means[:] = np.array([[0, 0, 1.0], [40, 0, 1]]) * 1.05 * NEAR
@@ -130,7 +132,7 @@ def _jacobian(device: Device, data: Path | None) -> Found:
 
 
 def shell(n: int) -> Gaussians:
-    """Gaussians in all directions at distances of 2 to 6, about a tenth of their distance in size."""
+    """Gaussians in all directions at distances of 2 to 6. Their size is about a tenth of their distance."""
     rng = np.random.default_rng(0)
     gaussians = synthetic_scene(n, sh_degree=0)[0]
     directions = rng.normal(size=(n, 3))
@@ -142,15 +144,15 @@ def shell(n: int) -> Gaussians:
 
 
 def wide_camera(degrees: float, width: int = 120) -> Camera:
-    """Looks along z from the origin."""
+    """A camera at the origin that looks along z, with the given field of view across the image."""
     focal = 0.5 * width / np.tan(0.5 * np.radians(degrees))
     return Camera(np.eye(4), focal, focal, width / 2, width / 3, width, width * 2 // 3)
 
 
 def ray_image(gaussians: Gaussians, camera: Camera) -> Image:
-    """Each Gaussian where the ray of a pixel finds it densest, without a projection, in the order of splats.
+    """Render Gaussians by their maxima along the rays of pixels, without a projection, in the order of splats.
 
-    Its alpha is opacity exp(-D^2/2), where D is the ray's least distance from the centre in standard deviations.
+    Alpha is opacity exp(-D^2/2), where D is the smallest distance of the ray from the centre, in standard deviations.
     """
     g = gaussians.astype(np.float64)
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
@@ -160,7 +162,7 @@ def ray_image(gaussians: Gaussians, camera: Camera) -> Image:
     image, transmittance = np.zeros((camera.height, camera.width, 3)), np.ones((camera.height, camera.width))
     colors = np.maximum(0.5 + 0.28209479177387814 * g.sh[:, 0], 0)
     order = np.argsort(points[:, 2])
-    for i in order[points[order, 2] > -3 * g.scales[order].max(axis=1)]:  # the others are behind
+    for i in order[points[order, 2] > -3 * g.scales[order].max(axis=1)]:  # the others are behind the camera
         whiten = axes[i] / g.scales[i]
         ray, centre = rays @ whiten, points[i] @ whiten
         along = ray @ centre
@@ -173,12 +175,14 @@ def ray_image(gaussians: Gaussians, camera: Camera) -> Image:
 
 
 def unscented_image(gaussians: Gaussians, camera: Camera) -> Image:
-    """Splats whose centre and covariance come from seven points of each Gaussian that are projected exactly (3DGUT,
-    Wu et al. 2025, equations 5 to 9, with their weights)."""
+    """Render splats from the unscented transform: seven points of each Gaussian are projected exactly.
+
+    Centre and covariance of a splat are weighted sums over these points (3DGUT, Wu et al. 2025, equations 5 to 9).
+    """
     g = gaussians.astype(np.float64)
     axes = camera.viewmat[:3, :3] @ rotations(g.quats / np.linalg.norm(g.quats, axis=1, keepdims=True))
     points = g.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    spread = 3.0  # alpha 1, kappa 0: sqrt(3) standard deviations, weights 1/6, none for the centre
+    spread = 3.0  # alpha 1, kappa 0: sqrt(3) standard deviations, weights 1/6 and, for the centre, 0
     offsets = np.sqrt(spread) * np.swapaxes(axes * g.scales[:, None, :], 1, 2)
     sigma = np.concatenate([points[:, None] + offsets, points[:, None] - offsets], axis=1)
     seen: NDArray[np.bool_] = np.all(sigma[:, :, 2] > 0.05, axis=1)
@@ -188,7 +192,7 @@ def unscented_image(gaussians: Gaussians, camera: Camera) -> Image:
     size = np.array([camera.width, camera.height])
     seen = seen & np.all(
         (pixels > -size) & (pixels < 2 * size), axis=(1, 2)
-    )  # beyond, the points say little about the splat
+    )  # farther outside, the points do not represent the splat
     means = pixels.mean(axis=1)
     deviations = pixels - means[:, None]
     cov = np.einsum("nki,nkj->nij", deviations, deviations) / 6 + BLUR * np.eye(2)
@@ -205,14 +209,14 @@ def _psnr(image: Array, truth: Array) -> float:
     return float(-10 * np.log10(((np.clip(image, 0, 1) - np.clip(truth, 0, 1)) ** 2).mean()))
 
 
-def _wide_angle(device: Device, data: Path | None) -> Found:
+def _wide_angle(device: Device) -> Found:
     scene = shell(600)
     series: dict[str, list[tuple[float, float | None]]] = {"affine": [], "unscented": []}
     for degrees in FIELDS_OF_VIEW:
         camera = wide_camera(degrees)
-        truth = ray_image(scene, camera).image
+        truth = ray_image(scene, camera).rgb
         affine = render(scene.astype(np.float32), camera, device=device, gradients=False).rgb
-        for label, image in (("affine", affine), ("unscented", unscented_image(scene, camera).image)):
+        for label, image in (("affine", affine), ("unscented", unscented_image(scene, camera).rgb)):
             series[label].append((float(degrees), _psnr(image, truth)))
     figures = [Figure(f"{label}, 120 degrees", dict(points)[120.0] or 0.0, "dB") for label, points in series.items()]
     figures.insert(1, Figure("affine, 60 degrees", dict(series["affine"])[60.0] or 0.0, "dB"))
@@ -222,15 +226,15 @@ def _wide_angle(device: Device, data: Path | None) -> Found:
 POISONING = Experiment(
     failure="zero quaternions, NaN, infinities, denormals in any parameter",
     source="Brush's fuzz tests; one NaN spreads through a tile, its gradients through the scene",
-    remedy="what is not finite is not drawn, and passes no gradient on",
+    remedy="Gaussians with values that are not finite are not drawn, and have no gradient",
     test="tests/stability/test_projection.py::test_a_poison_harms_nobody_else",
     measure=_poisoning,
-    figure="poisons, of five fields times nine values, that reach the image, a gradient or another pixel",
+    figure="combinations of five fields and nine values that affect the image, a gradient or another pixel",
 )
 
 NEEDLES = Experiment(
     failure="singular covariance of needles",
-    source="xx yy - xy^2 cancels in float32; culling det < 1e-6 drops what should be seen",
+    source="xx yy - xy^2 cancels in float32; culling det < 1e-6 removes visible Gaussians",
     remedy="the determinant as a sum of positive terms (Lagrange's identity)",
     test="tests/stability/test_projection.py::test_needles_keep_their_determinant",
     measure=_determinants,
@@ -243,7 +247,7 @@ JACOBIAN = Experiment(
     remedy="slopes clamped to the enlarged image",
     test="tests/stability/test_projection.py::test_extents_stay_bounded_beside_the_image",
     measure=_jacobian,
-    figure="a ball's extent 40 half images beside the image, in those of one in the middle; 0: not drawn",
+    figure="extent of a ball 40 half images from the axis, relative to that of a ball on the axis; 0: not drawn",
 )
 
 WIDE_ANGLE = Experiment(

@@ -1,4 +1,4 @@
-"""Photos of known Gaussians from a ring of cameras, small enough to train on in a second."""
+"""A scene of small photos of known Gaussians, from a ring of cameras. A training on it takes about a second."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,6 +15,7 @@ from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
 
 SIZE = (40, 32)
+"""Width and height of the photos, px."""
 
 CONFIG = TrainConfig(
     strategy="adc",
@@ -24,14 +25,14 @@ CONFIG = TrainConfig(
     checkpoint_every=100,
     max_gaussians=80,
     init=InitConfig(sh_degree=1),
-    # Points are 0.05 off, 600 times the default step.
+    # The points are off by 0.05, which is 600 times the default step.
     optim=OptimConfig(means_lr=1.6e-3, means_lr_final=1e-4, sh_degree_every=2333),
     adc=AdcConfig(every=50, reset_every=1000, grad_threshold=1e-5),
 )
 
 
 def known_gaussians() -> Gaussians:
-    """What the photos show: 40 balls of all colours."""
+    """The Gaussians that the photos show: 40 balls with random colours."""
     rng = np.random.default_rng(0)
     truth = synthetic_scene(40, seed=4)[0]
     truth.means[:] = rng.uniform(-0.6, 0.6, truth.means.shape)
@@ -43,7 +44,7 @@ def known_gaussians() -> Gaussians:
 
 
 def small_scene(device: Device, photos: int = 12, held_out: int = 3) -> Scene:
-    """Training photos all around, held-out ones between them, and a point near each of the Gaussians."""
+    """Training photos in a circle, held-out photos between them, and a point near each Gaussian."""
     truth = known_gaussians()
 
     def views(angles: np.ndarray, name: str) -> list[View]:
@@ -62,13 +63,13 @@ def small_scene(device: Device, photos: int = 12, held_out: int = 3) -> Scene:
 
 
 def with_train(scene: Scene, change: Callable[[View, np.random.Generator], View]) -> Scene:
-    """The scene with other training photos: `change` of each, and of a generator of random numbers."""
+    """Replace each training photo by `change` of it and of a generator of random numbers."""
     rng = np.random.default_rng(0)
     return replace(scene, train=[change(view, rng) for view in scene.train])
 
 
 def soot(scene: Scene, device: Device) -> Scene:
-    """The scene's object black, cut out of its background."""
+    """Replace all photos by a black object on a transparent background."""
     truth = known_gaussians()
 
     def cut_out(view: View) -> View:

@@ -1,13 +1,19 @@
-"""Results of `clsplat bench stability` as Markdown and as charts."""
+"""Markdown and charts of the results of experiments on stability.
 
+Results are rows by name, as `clsplat.bench.stability.run.run_experiments` returns them.
+"""
+
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from clsplat.atomic import replacing
 from clsplat.bench.kernel_report import COLORS
 from clsplat.bench.stability import EXPERIMENTS
+from clsplat.bench.stability.experiment import Experiment
 
 Results = dict[str, Any]
+Experiments = Mapping[str, Experiment]
 
 
 def _number(value: float | None) -> str:
@@ -18,28 +24,23 @@ def _text(figure: Results) -> str:
     return f"{_number(figure['value'])} {figure['unit']}".strip()
 
 
-def _cells(name: str, results: Results) -> tuple[str, str]:
-    """What the table says without and with the remedy."""
-    row = results.get(name, {"not_run": "not measured yet"})
-    if "figures" not in row:
-        return (f"failed: {row['error']}" if "error" in row else f"not run: {row['not_run']}"), ""
+def _cells(experiment: Experiment, row: Results | None) -> tuple[str, str]:
+    """Text of the cells without and with the remedy."""
+    if row is None:
+        return "not measured yet", ""
+    if "error" in row:
+        return f"failed: {row['error']}", ""
     texts = [f"{f['label']}: {_text(f)}" for f in row["figures"]]
-    if EXPERIMENTS[name].remedy is None:
+    if experiment.remedy is None:
         return "; ".join(texts), "**open**"
     return texts[0], "; ".join(texts[1:])
 
 
-def table(results: Results) -> str:
-    """Markdown: a row for every experiment there is, measured or not.
-
-    Parameters
-    ----------
-    results : dict
-        Of `clsplat.bench.stability.run.run_experiments`.
-    """
+def table(results: Results, experiments: Experiments = EXPERIMENTS) -> str:
+    """Markdown table with a row for each experiment, measured or not."""
     lines = ["| failure | measured | without remedy | with | remedy | test |", "|---|---|---|---|---|---|"]
-    for name, experiment in EXPERIMENTS.items():
-        without, remedied = _cells(name, results)
+    for name, experiment in experiments.items():
+        without, remedied = _cells(experiment, results.get(name))
         cells = (
             f"{experiment.failure} ({experiment.source})",
             experiment.figure,
@@ -52,10 +53,10 @@ def table(results: Results) -> str:
     return "\n".join(lines)
 
 
-def origin(results: Results) -> str:
-    """A sentence on where and when the rows were measured, one for each device, date and commit."""
+def origin(results: Results, experiments: Experiments = EXPERIMENTS) -> str:
+    """Markdown list of the devices, dates and commits that the rows were measured with."""
     measured: dict[tuple[str, str, str], list[str]] = {}
-    for name in EXPERIMENTS:
+    for name in experiments:
         row = results.get(name, {})
         if "figures" in row:
             key = (row["device"], row["date"][:10], (row["commit"] or "unknown")[:8])
@@ -66,17 +67,17 @@ def origin(results: Results) -> str:
     )
 
 
-def charts(results: Results) -> list[str]:
+def charts(results: Results, experiments: Experiments = EXPERIMENTS) -> list[str]:
     """Names of the rows that have a chart."""
-    return [name for name in EXPERIMENTS if "plot" in results.get(name, {})]
+    return [name for name in experiments if "plot" in results.get(name, {})]
 
 
 def chart_file(name: str) -> str:
-    """The file of a row's chart, beside stability.json."""
+    """Name of the file with a row's chart, in the folder of stability.json."""
     return f"stability-{name}.svg"
 
 
-def save_chart(name: str, row: Results, path: Path) -> None:
+def save_chart(name: str, row: Results, path: Path, experiments: Experiments = EXPERIMENTS) -> None:
     """Draw a row's plot as an SVG file.
 
     Raises
@@ -99,11 +100,11 @@ def save_chart(name: str, row: Results, path: Path) -> None:
         axes.set_yscale("log")
     axes.set_xlabel(plot["x"])
     axes.set_ylabel(plot["y"])
-    axes.set_title(EXPERIMENTS[name].failure, fontsize=10)
+    axes.set_title(experiments[name].failure, fontsize=10)
     axes.grid(color="0.92")
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=9)
-    # A fixed salt and no date: the same figures give the same file.
+    # With a fixed salt and without a date, the same figures give the same file.
     with replacing(path) as file, rc_context({"svg.hashsalt": name}):
         figure.savefig(file, format="svg", metadata={"Title": f"{name}: {row['device']}", "Date": None})

@@ -63,7 +63,7 @@ def search_size(training: "Training", after: After, after_fork: After) -> None:
 
 
 def _decide(training: "Training", search: Search, iteration: int, after_fork: After) -> State:
-    """End the current trial, decide the next phase, and train the smaller side of its trial. Returns the new state."""
+    """End the current trial, decide the next phase, train the smaller side of its trial. Returns the new state."""
     training.state.move(None)  # one side of a trial at a time is on the device
     state, trials = replace(training.state), search.trials
     if search.small_side:

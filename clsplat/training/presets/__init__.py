@@ -1,4 +1,8 @@
-"""Whole training configurations as data: the presets, JSON files beside this one, and the config.json of a run."""
+"""Whole training configurations as data: the presets (the JSON files of this folder), and the config.json of a run.
+
+Belongs here: reading and writing configurations. Does not belong here: the meaning of a setting and its default
+(`clsplat.config`).
+"""
 
 import json
 import sys

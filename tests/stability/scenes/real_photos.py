@@ -1,33 +1,36 @@
-"""Experiments on photos that do not fit each other, or are too few."""
+"""Experiments: photos that contradict each other (exposure, poses), and photos that are too few."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from real_scenes import load, spread
 
 from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
-from clsplat.bench.stability.small import CONFIG, small_scene, soot
-from clsplat.bench.stability.trained import held_out, load, spread, trained
-from clsplat.config import BACKGROUNDS, DataConfig
+from clsplat.bench.stability.trained import held_out, trained
+from clsplat.config import BACKGROUNDS
 from clsplat.device import Device
 from clsplat.metrics import psnr_fitted
-from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
 from clsplat.training import few_views
 from clsplat.training import photo_poses as poses
 
 GAINS = (0.0, 0.1, 0.2, 0.4)
+"""Largest relative change of a photo's gain."""
+
 NOISES = (0.0, 0.2, 0.5, 1.0)
+"""Standard deviation of the rotation about each axis, degrees."""
+
 COUNTS = (3, 6, 12)
-SOLID = 25
-"""Of 255: where less shows of the background, an object counts as solid."""
+"""Numbers of training photos."""
 
 FEW_ITERATIONS = 2000
-"""Few photos are learned by heart after some hundred iterations: a short training does not show it."""
+"""Iterations with few photos. Overfitting starts after some hundred iterations: a short training does not show it."""
 
 
 def with_gains(scene: Scene, largest: float) -> Scene:
-    """Each training photo times a gain of its own, uniform between 1 - largest and 1 + largest."""
+    """Multiply each training photo by a random gain, uniform between 1 - largest and 1 + largest."""
     rng = np.random.default_rng(0)
 
     def dimmed(view: View) -> View:
@@ -38,7 +41,11 @@ def with_gains(scene: Scene, largest: float) -> Scene:
 
 
 def displaced(scene: Scene, degrees: float) -> Scene:
-    """Each training camera turned by normal angles about its axes, and moved by as many extents of the scene."""
+    """Turn each training camera by random angles about its axes, and move it by random distances along them.
+
+    Both are normally distributed. The standard deviation is `degrees` for angles, and the same angle in radians times
+    the scene's extent for distances.
+    """
     rng, extent = np.random.default_rng(0), scene.extent
 
     def moved(view: View) -> View:
@@ -48,7 +55,7 @@ def displaced(scene: Scene, degrees: float) -> Scene:
     return replace(scene, train=[moved(view) for view in scene.train])
 
 
-def _exposure(device: Device, data: Path | None) -> Found:
+def _exposure(device: Device, data: Path) -> Found:
     scene, config = load(data, "fern")
     labels = {False: "one exposure for all", True: "--exposure"}
     series: dict[str, list[tuple[float, float | None]]] = {label: [] for label in labels.values()}
@@ -72,9 +79,9 @@ def _exposure(device: Device, data: Path | None) -> Found:
     )
 
 
-def _poses(device: Device, data: Path | None) -> Found:
+def _poses(device: Device, data: Path) -> Found:
     scene, config = load(data, "fern")
-    background = BACKGROUNDS[config.data.background]
+    renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     names = {False: "poses as they are", True: "--poses"}
     series: dict[str, list[tuple[float, float | None]]] = {name: [] for name in names.values()}
     as_posed: dict[str, float] = {}
@@ -85,10 +92,7 @@ def _poses(device: Device, data: Path | None) -> Found:
             gaussians = trained(off, asked, device)
             if degrees == 0.5:
                 as_posed[name] = held_out(gaussians, scene, asked, device)
-            tests = [
-                poses.aligned(gaussians, view, scene.extent, asked.optim, asked.render, device, background)
-                for view in scene.test
-            ]
+            tests = [poses.aligned(gaussians, view, scene.extent, asked.optim, renderer) for view in scene.test]
             series[name].append((degrees, held_out(gaussians, replace(scene, test=tests), asked, device)))
     return Found(
         [
@@ -99,7 +103,7 @@ def _poses(device: Device, data: Path | None) -> Found:
     )
 
 
-def _few_views(device: Device, data: Path | None) -> Found:
+def _few_views(device: Device, data: Path) -> Found:
     scene, config = load(data, "fern")
     config = replace(config, iterations=FEW_ITERATIONS)
     variants = {
@@ -120,53 +124,29 @@ def _few_views(device: Device, data: Path | None) -> Found:
     )
 
 
-def _dark_areas(device: Device, data: Path | None) -> Found:
-    scene, figures = soot(small_scene(device), device), []
-    for label, random in (("black background", False), ("--random-background", True)):
-        gaussians = trained(scene, replace(CONFIG, data=DataConfig(random_background=random)), device)
-        alphas = []
-        for view in scene.test:
-            assert view.clear is not None
-            alphas.append(float(render(gaussians, view.camera, device=device).alpha[view.clear < SOLID].mean()))
-        figures.append(Figure(label, float(np.mean(alphas))))
-    return Found(figures)
-
-
 EXPOSURE = Experiment(
     failure="exposure changes",
     source="Rematas et al. 2022",
     remedy="an affine map of the colours per photo (`--exposure`)",
     test="tests/stability/test_photos_differ.py::test_gains_of_photos_cost_little",
     measure=_exposure,
-    figure="what gains of up to 20 % either way cost held-out photos of fern, 120x90, 500 iterations",
-    needs_data=True,
+    figure="PSNR that held-out photos of fern lose to gains of up to 20 % either way, 120x90, 500 iterations",
 )
 
 POSES = Experiment(
     failure="wrong or NaN poses, reflected rotation",
     source="Lin et al. 2021, BARF",
-    remedy="refused by name where they are none (`io`); refined where they are off (`--poses`)",
+    remedy="invalid poses are refused, naming the photo (`dataset`); inaccurate poses are refined (`--poses`)",
     test="tests/stability/test_photos_differ.py::test_poses_that_are_off_are_found",
     measure=_poses,
     figure="PSNR of held-out photos of fern, 120x90, 500 iterations, poses off by 0.5 degrees about each axis",
-    needs_data=True,
 )
 
 FEW_VIEWS = Experiment(
     failure="few views",
     source="DropGaussian: 19.4 to 20.2 dB",
-    remedy="at most twice as many Gaussians as points, no view dependence, and dropout (`--few.*`), chosen by itself",
+    remedy="at most two Gaussians per point, fewer SH bands and dropout, set automatically (`--few.*`)",
     test="tests/stability/test_few_views.py::test_three_photos_are_not_learned_by_heart",
     measure=_few_views,
     figure=f"PSNR of held-out photos of fern, 120x90, from 3 photos, {FEW_ITERATIONS} iterations",
-    needs_data=True,
-)
-
-DARK_AREAS = Experiment(
-    failure="dark areas turning transparent",
-    source="Brush #250",
-    remedy="each iteration before another colour, transparent photos too (`--random-background`)",
-    test="tests/stability/test_dark_areas.py::test_black_objects_stay_opaque",
-    measure=_dark_areas,
-    figure="mean alpha inside a black object, held-out views",
 )

@@ -1,13 +1,14 @@
-"""Experiment on scale: photos from one distance, seen from others."""
+"""Experiment: a scene rendered at other scales than that of its photos."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from real_scenes import load
 
 from clsplat.bench.stability.experiment import Experiment, Figure, Found, Plot
-from clsplat.bench.stability.trained import load, trained
+from clsplat.bench.stability.trained import trained
 from clsplat.config import DataConfig, Mode, RenderConfig
 from clsplat.dataset import load_scene
 from clsplat.device import Device
@@ -17,7 +18,7 @@ from clsplat.render import render_views
 from clsplat.scene import View
 
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""Of the focal length and the image, to those of the photos that were trained on."""
+"""Scale of the focal length and of the image, relative to those of the training photos."""
 
 VARIANTS: dict[str, tuple[Mode, bool]] = {
     "classic": ("classic", False),
@@ -29,9 +30,17 @@ VARIANTS: dict[str, tuple[Mode, bool]] = {
 def psnr_by_scale(
     gaussians: Gaussians, views: list[View], size: tuple[int, int], config: RenderConfig, device: Device
 ) -> list[float]:
-    """Mean PSNR at each of SCALES, against photos of at least the largest of them, averaged over areas.
+    """Mean PSNR, dB, at each of SCALES.
 
-    `size` is width and height at scale 1.
+    Parameters
+    ----------
+    gaussians : Gaussians
+    views : list of View
+        Photos, at least as large as the largest scale. Smaller ones are made from them by averaging over areas.
+    size : tuple of int
+        Width and height at scale 1, px.
+    config : RenderConfig
+    device : Device
     """
     result = []
     for scale in SCALES:
@@ -54,9 +63,9 @@ def psnr_by_scale(
     return result
 
 
-def _scales(device: Device, data: Path | None) -> Found:
+def scales(device: Device, data: Path) -> Found:
+    """PSNR of held-out photos at each scale, per filter."""
     scene, config = load(data, "fern")
-    assert data is not None
     large = load_scene(data / "fern", DataConfig(downscale=2)).test
     camera = scene.test[0].camera
     series: dict[str, list[tuple[float, float | None]]] = {}
@@ -70,13 +79,12 @@ def _scales(device: Device, data: Path | None) -> Found:
     return Found(figures, Plot("scale, 1 is that of the photos", "PSNR of held-out photos, dB", series, "x"))
 
 
-SCALE = Experiment(
+OTHER_SCALES = Experiment(
     failure="dilation and aliasing at other scales than the photos'",
     source="Mip-Splatting, Yu et al. 2024",
     remedy="opacity compensated for the dilation, `--mode antialiased`; no Gaussian thinner than the photos resolve, "
     "`--filter-3d`",
     test="tests/stability/test_scales.py::test_seen_from_afar",
-    measure=_scales,
+    measure=scales,
     figure="PSNR of held-out photos of fern at a quarter of the scale, trained at 120x90, 500 iterations",
-    needs_data=True,
 )

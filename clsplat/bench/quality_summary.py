@@ -1,4 +1,4 @@
-"""What results of `clsplat bench quality` say: trainings, their means over scenes, Pareto fronts, tables."""
+"""Summaries of the results of `clsplat bench quality`: trainings, means over scenes, Pareto fronts and tables."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ import numpy as np
 from clsplat.bench.results import KEYS, Record
 
 MEAN = "mean"
-"""The panel of means over scenes."""
+"""Name of the panel with the means over scenes."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of results: its name, unit, how it is written, whether less of it is better."""
+    """A column of the results: its name, its unit, the format of its values, and whether less is better."""
 
     name: str
     unit: str
@@ -22,12 +22,12 @@ class Quantity:
     less_is_better: bool = True
 
     def written(self, value: float | None) -> str:
-        """With its unit."""
+        """Text of a value with its unit."""
         return "" if value is None else f"{self.text(value)} {self.unit}".strip()
 
 
 def short(value: float) -> str:
-    """A number in three digits at most: 840, 13.6k, 1.2M."""
+    """Text of a number with at most three digits: 840, 13.6k, 1.2M."""
     for factor, suffix in ((1e6, "M"), (1e3, "k")):
         if value >= 0.9995 * factor:
             return f"{value / factor:.3g}{suffix}"
@@ -47,7 +47,7 @@ METRICS = {
     "ssim": Quantity("SSIM", "", lambda v: f"{v:.3f}", less_is_better=False),
     "flip": Quantity("FLIP", "", lambda v: f"{v:.3f}"),
 }
-"""What quality is measured by."""
+"""Measures of quality."""
 
 COSTS = {
     "seconds": Quantity("training time", "s", _two_digits),
@@ -57,15 +57,15 @@ COSTS = {
     "memory_bytes": Quantity("device memory", "MB", _megabytes),
     "fps": Quantity("rendering speed", "frames/s", _two_digits, less_is_better=False),
 }
-"""What quality is charted against."""
+"""Costs that quality is charted against."""
 
 TIMES = ("seconds", "cpu_seconds")
-"""Those that a training spends as it goes on: every sample has its own."""
+"""Costs that grow during a training. Each sample has its own value."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A training that ended: `samples` in the order of their iterations, the last one at its end."""
+    """A finished training. `samples` are in the order of their iterations; the last one is its end."""
 
     scene: str
     method: str
@@ -75,18 +75,18 @@ class Run:
 
     @property
     def setting(self) -> str:
-        """Method, cap and iterations."""
+        """Method, cap and number of iterations."""
         cap = "" if self.max_gaussians is None else f" · ≤{short(self.max_gaussians)}"
         return f"{self.method}{cap} · {short(self.iterations)} it"
 
     @property
     def last(self) -> Record:
-        """The sample at the end."""
+        """The sample at the end of the training."""
         return self.samples[-1]
 
 
 def runs(records: Iterable[Record]) -> list[Run]:
-    """The trainings that ended, in the order of the records; of several devices, methods say on which."""
+    """Finished trainings, in the order of the records. With several devices, names of methods include the device."""
     records = [record for record in records if "iteration" in record]
     several = len({record["device"] for record in records}) > 1
     groups: dict[tuple[Any, ...], list[Record]] = {}
@@ -106,7 +106,7 @@ def runs(records: Iterable[Record]) -> list[Run]:
 
 
 def failures(records: Iterable[Record]) -> list[tuple[str, str]]:
-    """Of each training that failed: what it was, and why."""
+    """Setting of each failed training, and the reason."""
     return [
         (f"{r['scene']}, {Run('', r['method'], r['max_gaussians'], r['iterations'], ()).setting}", r["failed"])
         for r in records
@@ -120,21 +120,21 @@ def scene_names(finished: Iterable[Run]) -> list[str]:
 
 
 def title(scene: str) -> str:
-    """A scene's name without how its photos were read."""
+    """Name of a scene without the options for reading its photos."""
     return scene.split(":")[0]
 
 
 def panels(finished: list[Run]) -> dict[str, list[Run]]:
-    """What is charted side by side: with several scenes the means over them, then each."""
+    """Trainings by panel: with several scenes the means over them, then each scene."""
     scenes = scene_names(finished)
     by_scene = {scene: [run for run in finished if run.scene == scene] for scene in scenes}
     return by_scene if len(scenes) < 2 else {MEAN: means(finished), **by_scene}
 
 
 def means(finished: list[Run]) -> list[Run]:
-    """The mean over scenes of each setting that ended on all of them, sample by sample.
+    """Mean over scenes of each setting that finished on all of them, sample by sample.
 
-    All quantities by the arithmetic mean but the rate of frames: the mean time of a frame counts.
+    It is the arithmetic mean, except for the rate of frames, whose harmonic mean is taken: the mean time of a frame.
     """
     scenes = scene_names(finished)
     settings: dict[str, list[Run]] = {}
@@ -159,12 +159,12 @@ def _mean_samples(group: list[Run]) -> tuple[Record, ...]:
 
 
 def front(points: list[tuple[float, float]]) -> list[int]:
-    """Indices of the points that no other one beats, by their first coordinate.
+    """Indices of the points on the Pareto front, sorted by their first coordinate.
 
     Parameters
     ----------
     points : list of (cost, loss)
-        Less of both is better. One point beats another that it equals in one of them and betters in the other.
+        Less of both is better. A point dominates another if it is not worse in both and better in at least one.
     """
     order = sorted(range(len(points)), key=lambda i: points[i])
     kept: list[int] = []
@@ -175,7 +175,7 @@ def front(points: list[tuple[float, float]]) -> list[int]:
 
 
 def coordinates(sample: Record, cost: str, metric: str) -> tuple[float, float] | None:
-    """A sample as `front` takes it; None where one of both was not measured."""
+    """A sample as a point for `front`; None if the cost or the metric was not measured."""
     x, y = sample.get(cost), sample.get(metric)
     if x is None or y is None:
         return None
@@ -183,18 +183,18 @@ def coordinates(sample: Record, cost: str, metric: str) -> tuple[float, float] |
 
 
 def best_settings(of_panel: list[Run], cost: str, metric: str) -> list[Run]:
-    """The runs whose end is on the Pareto front, the cheapest first."""
+    """Runs whose end is on the Pareto front, the cheapest first."""
     placed = [(run, point) for run in of_panel if (point := coordinates(run.last, cost, metric)) is not None]
     return [placed[i][0] for i in front([point for _, point in placed])]
 
 
 def measured_metrics(finished: Iterable[Run]) -> list[str]:
-    """The metrics that at least one run has."""
+    """Metrics that at least one run has."""
     return [name for name in METRICS if any(run.last.get(name) is not None for run in finished)]
 
 
 def table(finished: list[Run], cost: str) -> list[list[str]]:
-    """A row per setting and a column per panel: the cost, then the metrics. The first row is the header."""
+    """Table with a row per setting and a column per panel: cost and metrics. The first row is the header."""
     metrics = measured_metrics(finished)
     columns = panels(finished)
     settings = list(dict.fromkeys(run.setting for run in finished))
@@ -214,7 +214,7 @@ def table(finished: list[Run], cost: str) -> list[list[str]]:
 
 
 def verdict(finished: list[Run], cost: str, metric: str) -> list[str]:
-    """In words: which settings are on the Pareto front, a sentence per panel."""
+    """Sentences that name the settings on the Pareto front, one per panel."""
     quantity, goal = COSTS[cost], METRICS[metric].name
     sentences = []
     for panel, of_panel in panels(finished).items():
@@ -223,14 +223,14 @@ def verdict(finished: list[Run], cost: str, metric: str) -> list[str]:
             continue
         names = ", ".join(run.setting for run in best)
         beaten = [run.setting for run in of_panel if run not in best]
-        where = "On the mean" if panel == MEAN else title(panel)
-        others = f"; beaten: {', '.join(beaten)}" if beaten else "; nothing is beaten"
+        where = "Mean over scenes" if panel == MEAN else title(panel)
+        others = f"; dominated: {', '.join(beaten)}" if beaten else "; none is dominated"
         sentences.append(f"{where}, on the Pareto front of {quantity.name} and {goal}: {names}{others}.")
     return sentences
 
 
 def origins(records: Iterable[Record]) -> list[str]:
-    """A line per device, driver and commit: what was measured when on it."""
+    """Lines that name each device, driver and commit of the measurements, with their dates and load."""
     groups: dict[tuple[str, ...], list[Record]] = {}
     for record in records:
         key = (record["device"], str(record["driver"]), str(record["version"]), record["commit"] or "unknown")
@@ -240,10 +240,10 @@ def origins(records: Iterable[Record]) -> list[str]:
         dates = sorted(record["date"][:10] for record in of_key)
         when = dates[0] if dates[0] == dates[-1] else f"{dates[0]} to {dates[-1]}"
         loads = [record["load"] for record in of_key if record["load"] is not None]
-        busy = f", load of the machine before it {max(loads):.1f}" if loads else ""
+        busy = f", load average of the machine before it {max(loads):.1f}" if loads else ""
         units = of_key[0]["compute_units"]
         if loads and max(loads) > units:
-            busy += ": it was busy with other work, and times do not count"
+            busy += ": it was busy with other work, so the times are not valid"
         lines.append(
             f"{device}, {units} compute units, driver {driver}; clsplat {version}, commit {commit}; {when}{busy}"
         )

@@ -1,0 +1,183 @@
+"""Trainings of `clsplat bench quality`: datasets, methods and budgets of the command line, and their combinations."""
+
+import json
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from clsplat.bench.results import Record
+from clsplat.config import DataConfig, TrainConfig
+from clsplat.errors import InputError
+from clsplat.training.presets import YAML, load_config, load_preset, with_settings
+
+AUTO = "auto"
+"""Name of the method with default settings, which choose the number of Gaussians."""
+
+OWN = "own"
+"""Name of the budget that keeps the cap of the method's own settings."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dataset with the options for reading it. `name` identifies it in results."""
+
+    name: str
+    path: Path
+    data: DataConfig
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training: a method with a cap, on a scene."""
+
+    source: Source
+    method: str
+    config: TrainConfig
+
+    def key(self, device: str) -> Record:
+        """Entries that distinguish its records from those of other trainings."""
+        return {
+            "scene": self.source.name,
+            "method": self.method,
+            "max_gaussians": self.config.max_gaussians,
+            "iterations": self.config.iterations,
+            "device": device,
+        }
+
+    @property
+    def label(self) -> str:
+        """Description for messages."""
+        cap = self.config.max_gaussians
+        limit = "" if cap is None else f", at most {cap:,} Gaussians"
+        return f"{self.source.name}, {self.method}{limit}, {self.config.iterations:,} iterations"
+
+
+def parse_source(text: str) -> Source:
+    """Parse a dataset of the command line: FOLDER, or FOLDER:downscale=2:background=white.
+
+    Raises
+    ------
+    InputError
+        If an option is not a setting of `DataConfig`, or its value is invalid.
+    """
+    # Colons before the first option belong to the path, for example after the letter of a drive.
+    match = re.fullmatch(r"(.+?)((?::\w+=[^:]*)*)", text, flags=re.DOTALL)
+    if match is None:
+        raise InputError(f"data: expected a folder, found {text!r}")
+    options = dict(option.split("=", 1) for option in match[2].split(":")[1:])
+    data = with_settings(DataConfig(), {name: _value(value) for name, value in options.items()}, text)
+    path = Path(match[1])
+    return Source(path.resolve().name + match[2], path, data)
+
+
+def _value(text: str) -> Any:
+    """Parse JSON; other text is a string without quotes."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
+def parse_method(text: str) -> tuple[str, TrainConfig]:
+    """Name and settings of a method: a preset, `AUTO`, or a configuration file as for ``train --config``."""
+    if text == AUTO:
+        return text, TrainConfig()
+    if text.endswith((".json", *YAML)):
+        return Path(text).stem, load_config(Path(text))
+    return text, load_preset(text)
+
+
+def parse_budget(text: str, own: int | None) -> int | None:
+    """Cap on the number of Gaussians for a budget. `own` is the cap of the method's own settings.
+
+    Raises
+    ------
+    InputError
+        If the budget is neither "own", nor a factor such as x0.5, nor a number of Gaussians.
+    """
+    if text == OWN:
+        return own
+    if re.fullmatch(r"x\d*\.?\d+", text) and float(text[1:]) > 0:
+        return None if own is None else max(1, round(float(text[1:]) * own))
+    if re.fullmatch(r"[1-9]\d*", text):
+        return int(text)
+    raise InputError(
+        f"--budgets: expected {OWN}, a factor such as x0.5, or a number of Gaussians such as 40000, found {text!r}"
+    )
+
+
+def make_cells(
+    sources: Iterable[str],
+    methods: Iterable[str],
+    budgets: Iterable[str],
+    iterations: Iterable[int],
+    memory_limit: str | None = None,
+) -> list[Cell]:
+    """All combinations of scene, method, budget and number of iterations, without duplicates.
+
+    Parameters
+    ----------
+    sources : iterable of str
+        Datasets, as for `parse_source`.
+    methods : iterable of str
+        Methods, as for `parse_method`.
+    budgets : iterable of str
+        Budgets, as for `parse_budget`.
+    iterations : iterable of int
+        Numbers of iterations. If empty, the number of each method.
+    memory_limit : str, optional
+        As in `TrainConfig`.
+
+    Raises
+    ------
+    InputError
+        If an argument is invalid, or two datasets or two methods have the same name.
+    """
+    iterations, cells = list(iterations), []
+    for number in iterations:
+        if number < 1:
+            raise InputError(f"--iterations: expected 1 or more, found {number}")
+    named_sources = _distinct([parse_source(text) for text in dict.fromkeys(sources)], lambda s: s.name, "data")
+    named_methods = _distinct([parse_method(text) for text in dict.fromkeys(methods)], lambda m: m[0], "--methods")
+    for source in named_sources:
+        for method, base in named_methods:
+            for budget in budgets:
+                for number in iterations or [base.iterations]:
+                    config = replace(
+                        base,
+                        iterations=number,
+                        max_gaussians=parse_budget(budget, base.max_gaussians),
+                        data=source.data,
+                        # Checkpoints cost time: write one only at the end, which is not timed.
+                        checkpoint_every=number,
+                        device=None,
+                        memory_limit=memory_limit,
+                    )
+                    cells.append(Cell(source, method, config))
+    return list(dict.fromkeys(cells))
+
+
+def _distinct(items: list[Any], name: Callable[[Any], str], what: str) -> list[Any]:
+    """The items, if their names differ."""
+    names = [name(item) for item in items]
+    for text in names:
+        if names.count(text) > 1:
+            raise InputError(f"{what}: expected different names, found {text} {names.count(text)} times")
+    return items
+
+
+def differences(config: TrainConfig) -> Record:
+    """Settings that differ from the defaults, nested as in config.json."""
+
+    def differing(mine: Record, default: Record) -> Record:
+        found = {}
+        for name, value in mine.items():
+            if isinstance(value, dict):
+                value = differing(value, default[name])
+            if value != ({} if isinstance(value, dict) else default[name]):
+                found[name] = value
+        return found
+
+    return differing(asdict(config), asdict(TrainConfig()))
