@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> None:
             traceback.print_exc()
         if isinstance(error, ClsplatError):
             warn(f"clsplat: {error}")
-        else:  # an error without a message of ours, for example a full disk while a log is written
+        else:  # an OSError that no function has translated, such as a full disk while a log is written
             warn(f"clsplat: cannot read or write {error.filename or 'a file'}: {error.strerror or error}")
         sys.exit(2)
     except KeyboardInterrupt:

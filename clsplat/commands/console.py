@@ -1,4 +1,4 @@
-"""What commands share: messages to the user, the device, folders and files to write."""
+"""Functions that commands share: messages to the user, opening the device, writing folders and files."""
 
 import json
 import sys
@@ -72,7 +72,7 @@ def moved(gaussians: "Gaussians", by: Any) -> "Gaussians":
 
 
 def say_cameras(dataset: Path, picture: Path) -> None:
-    """Print and draw the result of our structure from motion, with warnings; nothing if the cameras are not ours."""
+    """Print and draw the result of structure from motion, with warnings, if clsplat recovered the cameras."""
     from clsplat.dataset.sfm.summary import draw_cameras, preview
 
     found = preview(dataset)
