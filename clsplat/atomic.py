@@ -1,4 +1,4 @@
-"""Files that are either written as a whole or not at all."""
+"""Atomic writing of files: a file is either complete or unchanged."""
 
 import os
 from collections.abc import Iterator
@@ -11,14 +11,15 @@ from clsplat.errors import InputError
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
-    """Open a file for writing that takes the place of `path` when the block ends without an exception.
+    """Open a file for writing that replaces `path` when the block ends without an exception.
 
-    Until then the bytes go to a hidden file beside `path`; an exception removes it and leaves `path` as it was.
+    Until then the bytes are written to a hidden file next to `path`. An exception removes the hidden file and leaves
+    `path` unchanged.
 
     Raises
     ------
     InputError
-        If the file cannot be written: no such folder, no permission, disk full.
+        If the file cannot be written, for example because the folder does not exist or the disk is full.
     """
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -27,8 +28,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
             yield file
         os.replace(part, path)
     except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"{path}: expected a place that can be written to, found: {reason}") from error
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
         with suppress(OSError):
             part.unlink()

@@ -1,4 +1,4 @@
-"""Cameras in OpenCV axes: pinhole, orthographic, fisheye, equirectangular."""
+"""Cameras in OpenCV axes: pinhole, orthographic, fisheye and equirectangular."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,38 +16,40 @@ CameraModel = Literal["pinhole", "orthographic", "fisheye", "equirectangular"]
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A camera (x right, y down, z forward; pixel centres at +0.5).
+    """A camera: x right, y down, z forward; pixel centres at +0.5.
 
-    A point (x, y, z) of its frame appears at (fx a + cx, fy b + cy), where (a, b) is
+    A point (x, y, z) in camera coordinates is projected to (fx a + cx, fy b + cy), where (a, b) is
 
     * pinhole: (x/z, y/z);
     * orthographic: (x, y);
-    * fisheye: (x, y) theta_d/rho, rho the length of (x, y), theta = atan2(rho, z) and theta_d = theta (1 + k1 theta^2
-      + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala and Brandt 2006; OpenCV's and COLMAP's OPENCV_FISHEYE);
-    * equirectangular: longitude atan2(x, z) and latitude atan2(y, length of (x, z)), down.
+    * fisheye: (x, y) theta_d/rho with rho the length of (x, y), theta = atan2(rho, z) and theta_d = theta (1 + k1
+      theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala and Brandt 2006; OpenCV's and COLMAP's OPENCV_FISHEYE);
+    * equirectangular: longitude atan2(x, z) and latitude atan2(y, length of (x, z)), positive downwards.
 
     Parameters
     ----------
     viewmat : (4, 4) float64
         World to camera, in world units.
     fx, fy : float
-        Focal lengths in pixels; orthographic: per world unit; equirectangular: per radian.
+        Focal lengths in pixels; for orthographic cameras in pixels per world unit, for equirectangular ones in pixels
+        per radian.
     cx, cy : float
         Principal point in pixels, from the upper left corner of the upper left pixel.
     width, height : int
         Image size in pixels.
     model : {"pinhole", "orthographic", "fisheye", "equirectangular"}
+        Projection.
     distortion : tuple of 4 floats
-        k1 to k4 of a fisheye; 0 for the others.
+        k1 to k4 of a fisheye; 0 for other models.
     near : float
-        Depth (distance, for a fisheye) in world units up to which nothing is drawn; positive.
+        Depth (for a fisheye, distance) in world units up to which nothing is drawn; positive.
 
     Raises
     ------
     InputError
-        If the model is none of these, another one than a fisheye has a distortion, a value is not finite as float32,
-        a focal length or a size is not positive, or the rotation is not one (not orthonormal to 1e-3, or a
-        reflection).
+        If the model is unknown, a camera other than a fisheye has a distortion, a value is not finite as float32, a
+        focal length or a size is not positive, or the upper left 3x3 of `viewmat` is not a rotation (not orthonormal
+        to 1e-3, or a reflection).
     """
 
     viewmat: NDArray[np.float64]
@@ -68,8 +70,8 @@ class Camera:
             )
         if len(self.distortion) != 4 or (any(self.distortion) and self.model != "fisheye"):
             raise InputError(
-                f"camera: expected a distortion k1, k2, k3, k4, and 0 for all but a fisheye, found {self.distortion} "
-                f"for a camera of model {self.model}"
+                "camera: expected a distortion k1, k2, k3, k4, which is 0 for models other than fisheye, found "
+                f"{self.distortion} for a camera of model {self.model}"
             )
         viewmat = np.ascontiguousarray(self.viewmat, dtype=np.float64)
         if viewmat.shape != (4, 4):
@@ -86,7 +88,7 @@ class Camera:
         if not 0 < self.near <= np.finfo(np.float32).max:
             raise InputError(f"near: expected a positive depth, found {self.near}")
         rotation = viewmat[:3, :3]
-        # 1e-3 admits poses printed with four digits; a scaled or sheared matrix would render a wrong scene silently.
+        # 1e-3 accepts poses printed with four digits. A scaled or sheared matrix would silently render a wrong scene.
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
             raise InputError(
                 "viewmat: expected a rotation in its upper left 3x3 (orthonormal, determinant +1), found determinant "
@@ -107,8 +109,8 @@ class Camera:
     def angle_max(self) -> float:
         """Largest angle from the axis, in radians, at which a fisheye draws a Gaussian.
 
-        That of the image's farthest corner and FRUSTUM_MARGIN more, but neither beyond FISHEYE_ANGLE_MAX nor where
-        the radius in the image would fall again.
+        This is the angle of the image's farthest corner, enlarged by FRUSTUM_MARGIN. It is limited to
+        FISHEYE_ANGLE_MAX and to the range in which the radius in the image grows with the angle.
         """
         k1, k2, k3, k4 = self.distortion
         turns = np.roots([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])  # d theta_d/d theta, in theta^2
@@ -124,17 +126,17 @@ class Camera:
         return np.asarray((np.asarray(v, dtype=np.float64) - self.cy) / self.fy)
 
     def rays(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
-        """Directions in which the camera looks, in its frame.
+        """Compute the viewing directions of points in the image, in camera coordinates.
 
         Parameters
         ----------
         u, v : (...,)
-            Points of the image in pixels.
+            Points in the image, px.
 
         Returns
         -------
         (..., 3) float64
-            Unit vectors. A fisheye's image may have points that no direction appears at: NaN there.
+            Unit vectors; NaN at points of a fisheye's image to which no direction is projected.
         """
         a, b = np.broadcast_arrays(self._slopes_x(u), self._slopes_y(v))
         if self.model == "orthographic":
@@ -160,16 +162,16 @@ class Camera:
         rows |= {
             "focal lengths": f"{display.numbers([self.fx, self.fy])} px",
             "principal point": f"{display.numbers([self.cx, self.cy])} px",
-            "stands at": display.numbers(self.position),
-            "looks along": display.numbers(self.viewmat[2, :3]),
+            "position": display.numbers(self.position),
+            "viewing direction": display.numbers(self.viewmat[2, :3]),
         }
         return display.facts(f"Camera, {self.width} x {self.height} px", rows)
 
     @classmethod
     def look_at(cls, position: object, target: object, up: object, fx: float, width: int, height: int) -> "Camera":
-        """Camera at `position` (3,) looking at `target` (3,), the image's upper edge towards `up` (3,).
+        """Make a pinhole camera at `position` (3,) that looks at `target` (3,), with `up` (3,) upwards in the image.
 
-        Square pixels of focal length `fx` in pixels, principal point in the middle of the image.
+        It has square pixels, a focal length of `fx` pixels, and the principal point at the centre of the image.
         """
         eye = np.asarray(position, dtype=np.float64)
         forward = np.asarray(target, dtype=np.float64) - eye
@@ -182,21 +184,21 @@ class Camera:
         return cls(viewmat, fx, fx, width / 2, height / 2, width, height)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same view at another image size; the intrinsics follow."""
+        """Change the image size and scale the intrinsics, which keeps the view."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
         )
 
     def translated(self, offset: NDArray[np.float64]) -> "Camera":
-        """The same camera in a world whose origin is moved to `offset` (3,)."""
+        """Express the camera in a world whose origin is moved to `offset` (3,)."""
         viewmat = self.viewmat.copy()
         viewmat[:3, 3] += viewmat[:3, :3] @ offset
         return replace(self, viewmat=viewmat)
 
     @classmethod
     def panorama(cls, viewmat: NDArray[np.float64], width: int) -> "Camera":
-        """Equirectangular camera that sees all around: `width` pixels for 360 degrees, half as many for 180."""
+        """Make an equirectangular camera of the whole sphere: `width` pixels for 360 degrees, `width`/2 for 180."""
         height = width // 2
         return cls(
             viewmat, width / (2 * np.pi), height / np.pi, width / 2, height / 2, width, height, "equirectangular"
@@ -204,7 +206,7 @@ class Camera:
 
 
 def _fisheye_radius(angle: ArrayLike, distortion: tuple[float, ...]) -> NDArray[np.float64]:
-    """theta_d of theta, in radians."""
+    """Compute theta_d from theta, in radians."""
     theta = np.asarray(angle, dtype=np.float64)
     return np.asarray(theta * np.polyval([*reversed(distortion), 1.0], theta**2))
 
@@ -212,23 +214,24 @@ def _fisheye_radius(angle: ArrayLike, distortion: tuple[float, ...]) -> NDArray[
 def _fisheye_angle(
     radius: NDArray[np.float64] | np.float64, distortion: tuple[float, ...], most: float
 ) -> NDArray[np.float64]:
-    """theta of theta_d by bisection, between 0 and `most`, where the radius grows."""
+    """Compute theta from theta_d by bisection between 0 and `most`, in which range the radius grows."""
     low = np.zeros(np.shape(radius))
     high = np.full(np.shape(radius), most)
-    for _ in range(53):  # bits of a double
+    for _ in range(53):  # one bit of float64 per step
         middle = 0.5 * (low + high)
         below = _fisheye_radius(middle, distortion) < radius
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     return high
 
 
-# Mean squared sine of the angles between the axes and their common direction, about 3 degrees. Axes wrong by an
-# angle e move their intersection by about e/0.05 of its distance: a tenth of it for a third of a degree.
 AXES_SPREAD_MIN = 0.003
+"""Smallest mean squared sine of the angles between optical axes and their common direction at which their
+intersection is used; about 3 degrees. An error e of the axes' angles moves the intersection by about e/0.05 of its
+distance: by a tenth for a third of a degree."""
 
 
 def focus_point(cameras: list[Camera]) -> NDArray[np.float64]:
-    """The point the cameras look at: least-squares intersection of their optical axes.
+    """Compute the point at which the cameras look: the least-squares intersection of their optical axes.
 
     Parameters
     ----------
@@ -238,10 +241,10 @@ def focus_point(cameras: list[Camera]) -> NDArray[np.float64]:
     Returns
     -------
     (3,) float64
-        The point with the smallest sum of squared distances from the axes, in world units. Where there is no
-        such point in front of the cameras (one camera, nearly parallel axes, cameras that look away from each
-        other), the mean position plus the mean viewing direction times the largest distance of a camera from
-        that mean (times 1 where all cameras stand at one place).
+        The point with the smallest sum of squared distances from the axes, in world units. If there is no such point
+        in front of the cameras (one camera, nearly parallel axes, cameras that look away from each other): the mean
+        position plus the mean viewing direction times the largest distance of a camera from the mean position (times
+        1 if all cameras have the same position).
 
     Raises
     ------
@@ -254,8 +257,8 @@ def focus_point(cameras: list[Camera]) -> NDArray[np.float64]:
     directions = np.array([camera.viewmat[2, :3] for camera in cameras])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     centre = positions.mean(axis=0)
-    # The squared distance of p from an axis is |(I - d d^T)(p - c)|^2; positions count from their mean because
-    # those of a geo-referenced scene would cancel. The smallest eigenvalue of `normal` is the axes' spread.
+    # The squared distance of p from an axis is |(I - d d^T)(p - c)|^2. Positions are relative to their mean, which
+    # avoids cancellation in geo-referenced scenes. The smallest eigenvalue of `normal` is the spread of the axes.
     projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     normal = projectors.mean(axis=0)
     if np.linalg.eigvalsh(normal)[0] > AXES_SPREAD_MIN:

@@ -1,4 +1,4 @@
-"""The command line: a command of `clsplat.commands` each; errors in one sentence."""
+"""The command line: choose a command of `clsplat.commands`, run it, print errors as one sentence."""
 
 import os
 import sys
@@ -31,10 +31,10 @@ BENCHMARKS = (
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure this installation on this machine."""
+    """Run benchmarks on this machine."""
 
     what: Annotated[BENCHMARKS, tyro.conf.arg(name="")]
-    """What to measure."""
+    """Benchmark to run."""
 
     def run(self) -> None:
         """Run the command."""
@@ -43,27 +43,27 @@ class Bench:
 
 DESCRIPTION = """3D Gaussian Splatting on any OpenCL device.
 
-Every command takes -q (--quiet: nothing but warnings and errors) and -v (--verbose: also what structure from motion
-and the driver's compiler report, and where an error came from)."""
+Every command accepts -q (--quiet: only warnings and errors) and -v (--verbose: also messages of structure from motion
+and of the driver's compiler, and tracebacks of errors)."""
 
 COMMANDS = Devices | Frames | Sfm | Train | Eval | Render | View | Export | Compact | Info | Demo | Bench
 
 
 def set_loudness(arguments: list[str]) -> list[str]:
-    """Take -q and -v, which every command has, from the arguments: the rest."""
+    """Apply -q and -v, which every command accepts, and return the other arguments."""
     quiet, verbose = ({"-q", "--quiet"}.intersection(arguments), {"-v", "--verbose"}.intersection(arguments))
     if quiet and verbose:
         raise InputError("-q and -v: expected one of them, found both")
     console.loudness = "quiet" if quiet else "verbose" if verbose else "normal"
     if console.loudness == "quiet":
-        os.environ["TQDM_DISABLE"] = "1"  # read when tqdm is imported
+        os.environ["TQDM_DISABLE"] = "1"  # tqdm reads it on import
     if console.loudness == "verbose":
         os.environ["PYOPENCL_COMPILER_OUTPUT"] = "1"
     return [argument for argument in arguments if argument not in quiet | verbose]
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point of ``clsplat``: errors that are the user's to mend print one sentence and exit with 2."""
+    """Run the program ``clsplat``; print errors that the user can correct as one sentence and exit with status 2."""
     warnings.showwarning = lambda message, *_, **__: warn(f"warning: {message}")
     if os.environ.get("NO_COLOR"):  # no-color.org
         tyro._experimental_options["ansi_codes"] = False
@@ -74,8 +74,8 @@ def main(arguments: list[str] | None = None) -> None:
             traceback.print_exc()
         if isinstance(error, ClsplatError):
             warn(f"clsplat: {error}")
-        else:  # what no reader or writer has put in words: a disk that fills up under a log, say
-            warn(f"clsplat: {error.filename or 'input or output'}: {error.strerror or error}")
+        else:  # an OSError that no function has translated, such as a full disk while a log is written
+            warn(f"clsplat: cannot read or write {error.filename or 'a file'}: {error.strerror or error}")
         sys.exit(2)
     except KeyboardInterrupt:
         warn("clsplat: interrupted")
@@ -83,11 +83,11 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def run(arguments: list[str]) -> None:
-    """Run the command that the arguments name."""
+    """Parse the arguments and run the command."""
     arguments = set_loudness(arguments)
     command = tyro.cli(COMMANDS, prog="clsplat", args=arguments, description=DESCRIPTION)
     if isinstance(command, Train) and (base := command.base()):
-        # Read again: flags are told from defaults by what they are put into.
+        # Parsed again, with the settings of the preset or file as the defaults, which flags then override.
         start = replace(command, settings=base)
         command = tyro.cli(Train, prog="clsplat train", args=arguments[1:], default=start)
     with driver_errors():

@@ -1,7 +1,7 @@
-"""What objects look like in a notebook: small pieces of HTML from plain values and arrays.
+"""HTML for the display of objects in notebooks, from plain values and arrays.
 
-Everything inherits the page's text colour, so that it reads on white and on black, and is part of the HTML itself:
-nothing is loaded. Pillow is imported only when a picture is made.
+The HTML inherits the text colour of the page, so that it is legible on white and on black. It contains its images and
+loads nothing. Pillow is imported only when an image is made.
 """
 
 import base64
@@ -16,19 +16,20 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 THUMBNAIL = 84
-"""Height of a thumbnail in pixels: eight of them fill the column of a notebook."""
+"""Height of a thumbnail, px. Eight thumbnails fill the column of a notebook."""
 
 PLAN = 230
-"""Edge of a plan in pixels."""
+"""Edge of a plan, px."""
 
 PLAN_POINTS = 1500
-"""Most points drawn in a plan: its HTML then stays below 100 kB."""
+"""Approximate number of points in a plan, so that its HTML stays below 100 kB."""
 
 BINS = 32
+"""Number of bars of a histogram."""
 
 
 def facts(title: str, rows: Mapping[str, str], *extras: str) -> str:
-    """A title and a table of names and values, with more HTML to the right of it."""
+    """Make a title and a table of names and values, with further HTML to the right of it."""
     body = "".join(
         f'<tr><td style="text-align:left;opacity:.65;padding:0 1em 0 0">{html.escape(name)}</td>'
         f'<td style="text-align:left;padding:0">{html.escape(value)}</td></tr>'
@@ -45,17 +46,17 @@ def facts(title: str, rows: Mapping[str, str], *extras: str) -> str:
 
 
 def figure(content: str, caption: str) -> str:
-    """HTML above a line of small text."""
+    """Put a caption in small text under HTML."""
     return f'<div>{content}<div style="font-size:.78em;opacity:.65">{html.escape(caption)}</div></div>'
 
 
 def numbers(values: Any) -> str:
-    """A few numbers to three digits."""
+    """Format a few numbers with three digits."""
     return ", ".join(f"{v:.3g}" for v in np.ravel(values))
 
 
 def png(image: Array) -> bytes:
-    """An image, (H, W, 3) uint8 or floats whose range [0, 1] is shown, as PNG; NaN is black."""
+    """Encode an image (H, W, 3) as PNG: uint8, or floats, of which the range [0, 1] is shown; NaN becomes black."""
     from PIL import Image
 
     file = io.BytesIO()
@@ -64,7 +65,7 @@ def png(image: Array) -> bytes:
 
 
 def thumbnail(image: Array, title: str) -> str:
-    """A small copy of an image, with a text that appears where one points at it."""
+    """Make a small copy of an image, with a title that appears when the mouse points at it."""
     from PIL import Image
 
     small = Image.fromarray(_bytes(image))
@@ -77,7 +78,7 @@ def thumbnail(image: Array, title: str) -> str:
 
 
 def histogram(values: Array, low: float, high: float, caption: str) -> str:
-    """Bars over [low, high]; what lies beyond counts in the last bar of its side."""
+    """Draw a histogram over [low, high]; values outside count in the outermost bars."""
     counts, _ = np.histogram(np.clip(values, low, high), BINS, (low, high))
     top = max(int(counts.max()), 1)
     bars = "".join(
@@ -94,16 +95,18 @@ def histogram(values: Array, low: float, high: float, caption: str) -> str:
 
 
 def plan(eyes: Array, gazes: Array, held_out: NDArray[np.bool_], points: Array, colors: Array) -> str:
-    """Cameras and points, both already projected to a plane, (n, 2), as a map.
+    """Draw a plan of cameras and points, which are already projected to a plane.
 
     Parameters
     ----------
     eyes, gazes : (V, 2)
-        Where the cameras stand and which way they look, y up.
+        Positions and viewing directions of the cameras, y up.
     held_out : (V,) bool
-        Drawn hollow.
+        Whether each camera is held out; these are drawn hollow.
     points : (P, 2)
+        Positions of the points.
     colors : (P, 3) uint8
+        RGB of the points.
     """
     points, colors = points[:: -(-len(points) // PLAN_POINTS) or 1], colors[:: -(-len(colors) // PLAN_POINTS) or 1]
     centre = (eyes.min(axis=0) + eyes.max(axis=0)) / 2

@@ -1,4 +1,4 @@
-"""Equirectangular panoramas as the six faces of a cube: pinhole views that are rendered and trained on."""
+"""Equirectangular panoramas as six faces of a cube: pinhole views for rendering and training."""
 
 from functools import lru_cache
 from math import ceil, pi
@@ -17,33 +17,34 @@ FACES = {
     "up": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
     "down": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
 }
-"""Rotations from the panorama's frame (x right, y down, z forward) to each face's; the last row is where it looks."""
+"""Rotations from the frame of the panorama (x right, y down, z forward) to that of each face. The last row is the
+viewing direction of the face."""
 
 BORDER = 2
-"""Pixels that a rendered face has beyond its 90 degrees, for interpolation between the last ones."""
+"""Border of a rendered face beyond its 90 degrees, px, for interpolation at the edges."""
 
 
 def face_size(camera: Camera) -> int:
-    """Edge in pixels of a face of 90 degrees that has in its middle the panorama's pixels per angle."""
+    """Compute the edge, in pixels, of a face of 90 degrees with the panorama's pixels per angle at its centre."""
     return ceil(2 * max(camera.fx, camera.fy))
 
 
 def rotated(viewmat: NDArray[np.float64], face: str) -> NDArray[np.float64]:
-    """viewmat (4, 4) of a face of the panorama whose viewmat is given."""
+    """Compute the viewmat (4, 4) of a face from that of its panorama."""
     result = viewmat.copy()
     result[:3] = FACES[face] @ viewmat[:3]
     return result
 
 
 def faces(camera: Camera) -> list[Camera]:
-    """Pinhole cameras that see together what an equirectangular camera sees, in the order of FACES."""
+    """Make the pinhole cameras that together cover the view of an equirectangular camera, in the order of FACES."""
     size = face_size(camera) + 2 * BORDER
     focal, centre = face_size(camera) / 2, size / 2
     return [Camera(rotated(camera.viewmat, face), focal, focal, centre, centre, size, size) for face in FACES]
 
 
 def assemble(camera: Camera, images: list[NDArray[np.floating]]) -> NDArray[np.floating]:
-    """The panorama (H, W, C) from images (S, S, C) of its `faces`, by bilinear interpolation."""
+    """Assemble a panorama (H, W, C) from images (S, S, C) of its `faces`, by bilinear interpolation."""
     from scipy.ndimage import map_coordinates
 
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -55,15 +56,15 @@ def assemble(camera: Camera, images: list[NDArray[np.floating]]) -> NDArray[np.f
         here = nearest == k
         x, y, z = rotation @ rays[here].T
         # Indices count from pixel centres.
-        places = image.shape[0] / 2 - 0.5 + face_size(camera) / 2 * np.stack([y / z, x / z])
+        positions = image.shape[0] / 2 - 0.5 + face_size(camera) / 2 * np.stack([y / z, x / z])
         for channel in range(image.shape[2]):
-            result[here, channel] = map_coordinates(image[:, :, channel], places, order=1, mode="nearest")
+            result[here, channel] = map_coordinates(image[:, :, channel], positions, order=1, mode="nearest")
     return result
 
 
 @lru_cache(maxsize=len(FACES))
 def face_positions(face: str, width: int, height: int, size: int) -> NDArray[np.float32]:
-    """Row and column indices, (2, S, S), at which the pixels of a face lie in a panorama of `width` x `height` px."""
+    """Compute the row and column indices, (2, S, S), of a face's pixels in a panorama of `width` x `height` px."""
     panorama = Camera(
         np.eye(4), width / (2 * pi), height / pi, width / 2, height / 2, width, height, "equirectangular"
     )
@@ -76,7 +77,7 @@ def face_positions(face: str, width: int, height: int, size: int) -> NDArray[np.
 
 
 def bordered(pixels: NDArray[Any]) -> NDArray[Any]:
-    """A panorama (H, W, ...) with a pixel more on each side: beyond a pole the opposite ones, and across the seam."""
+    """Extend a panorama (H, W, ...) by a pixel on each side: across the seam, and across the poles."""
     half = pixels.shape[1] // 2
     tall = np.concatenate([np.roll(pixels[:1], half, axis=1), pixels, np.roll(pixels[-1:], half, axis=1)])
     return np.concatenate([tall[:, -1:], tall, tall[:, :1]], axis=1)

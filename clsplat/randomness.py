@@ -1,6 +1,6 @@
-"""Counter-based random numbers: a stream per seed, purpose and index, whatever was drawn before.
+"""Counter-based random numbers: a stream for each seed, purpose and index, independent of all earlier draws.
 
-A resumed run therefore needs no generator's state (Philox: Salmon et al. 2011, doi:10.1145/2063384.2063405).
+A checkpoint therefore stores no state of a generator (Philox: Salmon et al. 2011, doi:10.1145/2063384.2063405).
 """
 
 import numpy as np
@@ -16,8 +16,9 @@ PURPOSES = (
     "backgrounds",
     "points between points",
 )
+"""Uses of random numbers. The index is part of the stream: new purposes are added at the end."""
 
 
 def stream(seed: int, purpose: str, index: int = 0) -> np.random.Generator:
-    """Generator for one use: `purpose` is one of `PURPOSES`, `index` counts its uses (an epoch, an iteration)."""
+    """Make the generator for one use: `purpose` is one of `PURPOSES`, `index` counts its uses, such as iterations."""
     return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, PURPOSES.index(purpose), index]))

@@ -1,4 +1,4 @@
-"""A posed set of photos, as every reader of `clsplat.formats` returns it."""
+"""Scenes: posed photos and sparse points, as `clsplat.dataset` loads them."""
 
 from dataclasses import dataclass, field
 
@@ -11,25 +11,26 @@ from clsplat.camera import Camera
 Color = tuple[float, float, float]
 
 THUMBNAILS = 8
-"""Photos of a scene that a notebook shows."""
+"""Approximate number of photos that a notebook shows of a scene."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One photo and its camera.
+    """A photo and its camera.
 
     Parameters
     ----------
     name : str
         Path of the photo inside its folder, with forward slashes.
     camera : Camera
-        Pinhole camera of the photo's size, in the scene's coordinates.
+        Pinhole or fisheye camera of the photo's size, in the coordinates of the scene.
     image : (H, W, 3) uint8
-        The photo: undistorted, upright, composited on the background where it was transparent.
+        The photo, RGB: upright, undistorted unless the camera is a fisheye, composited on the background where it was
+        transparent.
     mask : (H, W) bool, optional
-        True where pixels count.
+        True where pixels are used.
     clear : (H, W) uint8, optional
-        What shows of the background, of 255, where the photo is transparent and trains on random backgrounds.
+        Visible share of the background, 0 to 255, if the photo is transparent and training uses random backgrounds.
     """
 
     name: str
@@ -39,7 +40,7 @@ class View:
     clear: NDArray[np.uint8] | None = None
 
     def on(self, background: Color, loaded_on: Color) -> NDArray[np.uint8]:
-        """The photo (H, W, 3) on another background than the one it was loaded on, RGB in [0, 1]."""
+        """Composite the photo (H, W, 3) on another background than that of loading; both are RGB in [0, 1]."""
         if self.clear is None:
             return self.image
         change = self.clear[:, :, None] * (np.array(background) - np.array(loaded_on))
@@ -53,13 +54,14 @@ class Scene:
     Parameters
     ----------
     train, test : list of View
-        The photos trained on and the photos held out, each sorted by name.
+        Training photos and held-out photos, each sorted by name.
     points : (P, 3) float64
-        Sparse points in the scene's coordinates; P may be 0.
+        Sparse points in the coordinates of the scene; P may be 0.
     colors : (P, 3) uint8
-        Their colours.
+        RGB of the points.
     offset : (3,) float64
-        What was subtracted from the world's coordinates: not 0 only for geo-referenced scenes.
+        What was subtracted from the world's coordinates, in world units; zero unless the cameras are far from the
+        origin, as in geo-referenced scenes.
     """
 
     train: list[View]
@@ -70,11 +72,13 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """Scale of the scene in world units: 1.1 times the largest distance of a training camera from their mean
-        (the original's `cameras_extent`); 1 where all cameras stand at one place."""
+        """Scale of the scene in world units: 1.1 times the largest distance of a training camera from their mean.
+
+        This is `cameras_extent` of the original implementation; 1 if all cameras have the same position.
+        """
         centres = np.array([view.camera.position for view in self.train])
         radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-        # Faces of a panorama stand at one place but for rounding.
+        # The faces of a panorama have one position, apart from rounding.
         return 1.1 * radius if radius > 1e-12 * np.abs(centres).max() else 1.0
 
     def _repr_html_(self) -> str:
@@ -91,14 +95,15 @@ class Scene:
             return display.facts("Scene", rows)
         rows["extent"] = f"{self.extent:.3g}" if self.train else ""
         eyes = np.array([v.camera.position for v in views])
-        looks = np.array([v.camera.viewmat[2, :3] for v in views])
+        gazes = np.array([v.camera.viewmat[2, :3] for v in views])
         up = -np.mean([v.camera.viewmat[1, :3] for v in views], axis=0)
-        # Of the axes at right angles to up any will do; that of the first camera's right edge is the familiar one.
+        # Any axis perpendicular to up is possible; with this one, the first camera's right is to the right in the
+        # plan.
         east = views[0].camera.viewmat[0, :3] - up * (views[0].camera.viewmat[0, :3] @ up) / max(up @ up, 1e-12)
         ground = np.stack([east, np.cross(up, east)])
         ground /= np.maximum(np.linalg.norm(ground, axis=1, keepdims=True), 1e-12)
         held_out = np.arange(len(views)) >= len(self.train)
-        plan = display.plan(eyes @ ground.T, looks @ ground.T, held_out, self.points @ ground.T, self.colors)
+        plan = display.plan(eyes @ ground.T, gazes @ ground.T, held_out, self.points @ ground.T, self.colors)
         chosen = self.train[:: -(-len(self.train) // THUMBNAILS) or 1] or self.test[:THUMBNAILS]
         photos = "".join(display.thumbnail(view.image, view.name) for view in chosen)
         return display.facts(

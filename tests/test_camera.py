@@ -1,4 +1,4 @@
-"""Cameras: what is refused, and geometry against known cases."""
+"""Cameras: invalid values are refused, and the geometry of known cases."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def test_position_is_where_the_camera_frame_has_its_origin():
 def test_look_at():
     camera = Camera.look_at((0, -5, 1), (0, 0, 1), (0, 0, 1), 80, 64, 48)
     np.testing.assert_allclose(camera.position, (0, -5, 1), atol=1e-15)
-    # Ahead is +z, right of the viewer +x, up -y.
+    # In camera coordinates +z is forward, +x right, -y up.
     for point, expected in [((0, 0, 1), (0, 0, 5)), ((1, 0, 1), (1, 0, 5)), ((0, 0, 3), (0, -2, 5))]:
         np.testing.assert_allclose(camera.viewmat @ [*point, 1], [*expected, 1], atol=1e-15)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (80, 80, 32, 24)

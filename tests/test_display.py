@@ -1,4 +1,4 @@
-"""What objects show of themselves in notebooks."""
+"""Display of objects in notebooks."""
 
 import io
 import re
@@ -19,7 +19,7 @@ from clsplat.testing import synthetic_scene
 
 
 class Balance(HTMLParser):
-    """Tags that are open."""
+    """Parser that checks that tags are balanced."""
 
     def __init__(self):
         super().__init__()
@@ -34,7 +34,7 @@ class Balance(HTMLParser):
 
 
 def text_of(markup):
-    """The words of well-formed HTML."""
+    """Check that HTML is well-formed; return its text."""
     parser = Balance()
     parser.feed(markup)
     parser.close()
@@ -48,7 +48,7 @@ def gaussians():
 
 
 def ring(count):
-    """A scene of photos around the origin, every third one held out."""
+    """Make a scene of photos around the origin; every third one is held out."""
     views = []
     for k in range(count):
         a = 2 * np.pi * k / count
@@ -89,7 +89,7 @@ def test_camera_says_where_it_stands():
     camera = Camera.look_at((0, -4, 0), (0, 0, 0), (0, 0, 1), fx=160, width=320, height=240)
     text = text_of(camera._repr_html_())
     assert "320 x 240 px" in text and "90° x 74°" in text
-    assert "stands at 0, -4, 0" in text.replace("-0", "0") and "looks along 0, 1, 0" in text.replace("-0", "0")
+    assert "position 0, -4, 0" in text.replace("-0", "0") and "viewing direction 0, 1, 0" in text.replace("-0", "0")
 
 
 def test_scene_shows_its_photos_and_cameras():
@@ -110,7 +110,7 @@ def test_scene_draws_each_camera_where_it_stands():
     start, end = np.split(np.array(marks, dtype=float), 2, axis=1)
     arms = start - display.PLAN / 2
     assert np.linalg.norm(arms, axis=1) == pytest.approx(display.PLAN / 2 / 1.25, abs=0.2)
-    # Every camera looks at the middle.
+    # Every camera looks at the centre.
     assert ((end - start) * arms).sum(axis=1) == pytest.approx(
         -np.linalg.norm(arms, axis=1) * np.linalg.norm(end - start, axis=1), rel=0.02
     )

@@ -241,7 +241,7 @@ def test_invalid_cameras_are_refused(device):
     gaussians, camera = synthetic_scene(2)
     with pytest.raises(InputError, match="expected a model among pinhole, orthographic"):
         replace(camera, model="mirror")
-    with pytest.raises(InputError, match="0 for all but a fisheye"):
+    with pytest.raises(InputError, match="0 for models other than fisheye"):
         replace(camera, distortion=WIDE)
     for where in (device, None):
         function = ops.project_fwd if where else reference.project_fwd

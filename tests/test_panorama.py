@@ -1,4 +1,4 @@
-"""Equirectangular panoramas: as faces of a cube to train on, and resampled from faces when rendered."""
+"""Equirectangular panoramas: split into faces of a cube for training, and assembled from faces in rendering."""
 
 import json
 
@@ -27,25 +27,25 @@ def pose(seed):
 
 
 def sky(directions):
-    """A colour for each world direction (..., 3), without a seam; up to 240 levels per radian."""
+    """Colour of world directions (..., 3), without a seam; changes by up to 240 levels per radian."""
     x, y, z = np.moveaxis(directions, -1, 0)
     return 127.5 + 60 * np.stack([np.sin(4 * x) + y, np.cos(4 * y) - z, np.sin(4 * z) + x], axis=-1)
 
 
 def pixel_directions(camera):
-    """World directions of all pixels, (H, W, 3)."""
+    """Compute the world directions of all pixels, (H, W, 3)."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return camera.rays(u, v) @ camera.viewmat[:3, :3]
 
 
 def write_dataset(root, count, masks=False):
-    """Panoramas of 256 x 128 px of one sky, each in a pose of its own."""
+    """Write a dataset with panoramas of 256 x 128 px of one sky, each with its own pose."""
     frames = []
     for k in range(count):
         camera = Camera.panorama(pose(k), 256)
         Image.fromarray(np.rint(sky(pixel_directions(camera))).astype(np.uint8)).save(root / f"{k}.png")
         to_world = np.linalg.inv(camera.viewmat)
-        to_world[:, 1:3] *= -1  # OpenGL's axes
+        to_world[:, 1:3] *= -1  # axes of OpenGL
         frames.append({"file_path": f"{k}.png", "transform_matrix": to_world.tolist()})
         if masks:
             Image.fromarray((pixel_directions(camera)[..., 0] > 0).astype(np.uint8) * 255).save(root / f"m{k}.png")
@@ -61,7 +61,7 @@ def test_faces_of_a_cube_are_rotations():
 
 
 def test_rays_are_colmaps():
-    """Where COLMAP sees the directions of pixels, on all sides."""
+    """Directions of pixels on all sides are projected as by COLMAP."""
     camera = Camera.panorama(np.eye(4), 64)
     u, v = np.meshgrid(np.arange(64) + 0.5, np.arange(32) + 0.5)
     pixels = project(Intrinsics("EQUIRECTANGULAR", (64.0, 32.0), 64, 32), 3 * camera.rays(u, v).reshape(-1, 3))
@@ -79,7 +79,7 @@ def test_a_panorama_becomes_six_pinhole_views(tmp_path, downscale):
         assert (camera.model, camera.width, camera.height) == ("pinhole", *[81 if downscale == 1 else 41] * 2)
         assert camera.fx == camera.cx == camera.width / 2
         np.testing.assert_allclose(camera.position, Camera.panorama(pose(0), 256).position, atol=1e-9)
-        # Two roundings, and bilinear interpolation of second derivatives of 960 per radian^2 in steps of 1/41.
+        # Two roundings, and bilinear interpolation with second derivatives of 960 per radian^2 in steps of 1/41.
         error = np.abs(view.image - sky(pixel_directions(camera)))
         assert error.max() < 1.5 + 2 * 960 / 8 / 41**2 * (1 if downscale == 1 else 4), view.name
 
@@ -117,7 +117,7 @@ DIRECTIONS = {
 
 @pytest.mark.parametrize("where", DIRECTIONS)
 def test_gaussians_appear_where_they_are(device, where):
-    """Centre of mass and distance of one Gaussian, at the seam and at the faces' edges too."""
+    """Centre of mass and distance of one Gaussian, also at the seam and at edges of faces."""
     camera = Camera.panorama(pose(1), 240)
     direction = np.array(DIRECTIONS[where]) / np.linalg.norm(DIRECTIONS[where])
     mean = camera.position + camera.viewmat[:3, :3].T @ direction * 5
@@ -129,11 +129,11 @@ def test_gaussians_appear_where_they_are(device, where):
     centre = (directions * (rendering.alpha * area)[..., None]).sum(axis=(0, 1))
     assert np.degrees(np.arccos(direction @ centre / np.linalg.norm(centre))) < 0.3  # a fifth of a pixel
     seen = rendering.alpha > 0.5
-    # Within a face a splat has one depth z: distances vary over it by 0.1 rad times the tangent of its angle to the
-    # face's axis; at an edge each face shows the nearer half.
+    # Within a face a splat has a single depth z. Distances within it vary by 0.1 rad times the tangent of its angle
+    # to the axis of the face; at an edge each face shows the nearer half.
     assert np.average(rendering.depth[seen], weights=rendering.alpha[seen]) == pytest.approx(5, rel=0.05)
-    # The integral of alpha over the sphere: 2 pi sigma^2 times what opacity has over ALPHA_MIN. In a corner each face
-    # shows the half that the affine approximation makes too large: by 18 % here, by 5 % at half the size.
+    # The integral of alpha over the sphere is 2 pi sigma^2 times the opacity in excess of ALPHA_MIN. In a corner each
+    # face shows the half that the affine approximation enlarges: by 18 % here, by 5 % at half the size.
     solid_angle = (rendering.alpha * area).sum() / camera.fx / camera.fy
     assert solid_angle == pytest.approx(2 * np.pi * (0.05**2 + BLUR / camera.fx**2) * 0.949, rel=0.2)
 

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from clsplat.scene import Scene, View
 
 HELD_OUT = 6
-"""Of views without a split of their own, every sixth judges and does not price."""
+"""Spacing of the evaluation views, if the views have no held-out ones: every sixth view."""
 
-SUSPICIOUS = 15.0
-"""Decibels: photos that a scene matches worse than this are hardly of this scene."""
+MATCH_MIN = 15.0
+"""Mean PSNR of a scene's renders against photos, dB, below which the photos hardly show this scene."""
 
 
 @dataclass(frozen=True)
@@ -32,20 +32,21 @@ class Compact:
     scene: tyro.conf.Positional[Path]
     """File of Gaussians."""
     out: Out
-    """File to write; its suffix names the format."""
+    """File to write; its suffix determines the format."""
     max_gaussians: int | None = None
-    """At most so many Gaussians."""
+    """Largest number of Gaussians."""
     max_bytes: str | None = None
-    """At most so large a file, such as 20MB."""
+    """Largest size of the file, such as 20MB."""
     max_psnr_loss: float | None = None
-    """The smallest file that loses at most so many dB, judged by views that had no say in what is removed."""
+    """Largest loss of PSNR, dB; the smallest file within it is chosen. The loss is measured in evaluation views,
+    which do not influence what is removed."""
     cameras: Path | None = None
-    """Dataset, as given to `train`: views from which the scene is compared with its own renders."""
+    """Dataset, as for `train`: the scene is compared with its own renders from the cameras of this dataset."""
     photos: Path | None = None
-    """Dataset with whose photos the scene is compared instead. Without either, viewpoints are chosen by
-    themselves."""
+    """Dataset, as for `train`: the scene is compared with the photos of this dataset. Without --cameras and --photos,
+    viewpoints are chosen automatically."""
     device: str | None = None
-    """Part of the platform's or device's name."""
+    """Part of the name of the platform or device."""
     data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
 
@@ -59,7 +60,7 @@ class Compact:
 
         limits = self._limits()
         suffix = suffix_of(self.out)
-        if not suffix or not self.out.absolute().parent.is_dir():  # said now, not after minutes
+        if not suffix or not self.out.absolute().parent.is_dir():  # checked now, not after minutes
             raise InputError(f"{self.out}: expected a file of Gaussians in a folder that exists; see docs/formats.md")
         if self.cameras is not None and self.photos is not None:
             raise InputError("--cameras, --photos: expected one of them, found both; --photos has cameras as well")
@@ -72,18 +73,18 @@ class Compact:
         if dataset is not None:
             scene = load_scene(dataset, self.data_config)
             gaussians, offset = moved(gaussians, offset - scene.offset), scene.offset
-        priced, judging = self._views(gaussians, scene, renderer)
-        say(f"views: {len(priced)} price the Gaussians, {len(judging)} judge the loss")
-        loss = LossMeter(gaussians, judging, self.photos is not None, renderer)
+        pricing, evaluation = self._views(gaussians, scene, renderer)
+        say(f"views: {len(pricing)} to price the Gaussians, {len(evaluation)} to measure the loss")
+        loss = LossMeter(gaussians, evaluation, self.photos is not None, renderer)
 
         def stored(version: "Gaussians") -> "tuple[Gaussians, int]":
             with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # said once, of the file that stays
+                warnings.simplefilter("ignore")  # the warnings for the final file are shown
                 path = Path(folder) / f"scene{suffix}"
                 save_gaussians(path, version, mode, offset)
                 return load_gaussians(path)[0], path.stat().st_size
 
-        found = compact(gaussians, priced, loss, limits, stored, renderer)
+        found = compact(gaussians, pricing, loss, limits, stored, renderer)
         save_gaussians(self.out, found.gaussians, mode, offset)
         size = self.scene.stat().st_size if self.scene.is_file() else stored(gaussians)[1]
         say(
@@ -92,9 +93,9 @@ class Compact:
             f"{bytes_text(self.out.stat().st_size)}"
         )
         if self.photos is not None:
-            say(f"loss: {found.loss:.3f} dB of PSNR against the photos that judge")
+            say(f"loss: {found.loss:.3f} dB of PSNR against the evaluation photos")
         else:
-            say(f"loss: {found.loss:.3f} dB of PSNR, if the scene has {ASSUMED_PSNR:.0f} dB against photos unknown")
+            say(f"loss: {found.loss:.3f} dB of PSNR, assuming {ASSUMED_PSNR:.0f} dB of the scene against photos")
 
     def _limits(self) -> "Limits":
         from clsplat.pruning.compaction import Limits
@@ -103,7 +104,7 @@ class Compact:
         size = None if self.max_bytes is None else parse_bytes(self.max_bytes, "--max-bytes")
         if self.max_gaussians is None and size is None and self.max_psnr_loss is None:
             raise InputError(
-                "--max-gaussians, --max-bytes, --max-psnr-loss: expected how small or how good, found none"
+                "--max-gaussians, --max-bytes, --max-psnr-loss: expected at least one of these limits, found none"
             )
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise InputError(f"--max-gaussians: expected 1 or more, found {self.max_gaussians}")
@@ -114,7 +115,7 @@ class Compact:
     def _views(
         self, gaussians: "Gaussians", scene: "Scene | None", renderer: "Renderer"
     ) -> "tuple[list[View], list[View]]":
-        """Views that price, and views that judge."""
+        """Choose the views that price the Gaussians and the evaluation views."""
         from clsplat.pruning.viewpoints import automatic_cameras, own_views
 
         if scene is None:
@@ -131,25 +132,26 @@ class Compact:
             own, views = views, [view for view in scene.train + scene.test if view.name in showing]
             self._check_photos(own, views)
         held_out = held_out or {view.name for view in views[::HELD_OUT]}
-        priced = [view for view in views if view.name not in held_out]
-        judging = [view for view in views if view.name in held_out]
-        if not priced or not judging:
+        pricing = [view for view in views if view.name not in held_out]
+        evaluation = [view for view in views if view.name in held_out]
+        if not pricing or not evaluation:
             where = self.photos or self.cameras or "automatic viewpoints"
             raise InputError(
-                f"{where}: expected a view that shows the scene to price with and one to judge by, found "
-                f"{len(priced)} and {len(judging)} of {len(cameras)}; do the cameras belong to {self.scene}?"
+                f"{where}: expected a view of the scene to price the Gaussians and another one to measure the loss, "
+                f"found {len(pricing)} and {len(evaluation)} of {len(cameras)}; do the cameras belong to "
+                f"{self.scene}?"
             )
-        return priced, judging
+        return pricing, evaluation
 
     def _check_photos(self, own: "list[View]", photos: "list[View]") -> None:
-        """Warn of photos that can hardly be of this scene."""
+        """Warn if the photos hardly show this scene."""
         import numpy as np
 
         from clsplat.metrics import psnr
 
         found = [psnr(render.image, photo.image, photo.mask) for render, photo in zip(own, photos, strict=True)]
-        if found and np.mean(found) < SUSPICIOUS:
+        if found and np.mean(found) < MATCH_MIN:
             warnings.warn(
-                f"{self.photos}: the scene matches the photos with {np.mean(found):.1f} dB only; are they of it?",
+                f"{self.photos}: the scene matches the photos with only {np.mean(found):.1f} dB; do they show it?",
                 stacklevel=2,
             )

@@ -1,4 +1,4 @@
-"""What commands share: words to the user, the device, folders and files to write to."""
+"""Functions that commands share: messages to the user, opening the device, writing folders and files."""
 
 import json
 import sys
@@ -15,23 +15,25 @@ if TYPE_CHECKING:
     from clsplat.device import Device
     from clsplat.gaussians import Gaussians
 
-STARTED = time.perf_counter()  # of the command, but for the 0.2 s that Python takes to get here
+STARTED = time.perf_counter()
+"""Time at which the command started, s, except for the 0.2 s that Python takes to get here."""
 
 loudness: Literal["quiet", "normal", "verbose"] = "normal"
-"""What the user asked for by -q or -v; the command line sets it before a command runs."""
+"""Amount of output, as set by -q or -v before a command runs."""
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+"""Type of the flag --out, -o."""
 
 
 def say(text: str) -> None:
-    """Tell the user, unless quiet is asked for."""
+    """Print a message for the user, unless -q was given."""
     if loudness != "quiet":
         warn(text)
 
 
 def warn(text: str) -> None:
-    """Tell the user in any case, beside the progress bars."""
-    if "tqdm" not in sys.modules:  # what takes a while to import is imported once it is needed
+    """Print a message for the user in any case, without disturbing progress bars."""
+    if "tqdm" not in sys.modules:  # there is no progress bar yet; importing tqdm takes time
         print(text, file=sys.stderr, flush=True)
         return
     from tqdm import tqdm
@@ -40,7 +42,7 @@ def warn(text: str) -> None:
 
 
 def open_device(name: str | None, memory_limit: int | None = None) -> "Device":
-    """The device the user asked for, named."""
+    """Open the requested device and print its name."""
     from clsplat.device import Device, select_device
 
     device = Device(select_device(name), memory_limit=memory_limit)
@@ -49,15 +51,15 @@ def open_device(name: str | None, memory_limit: int | None = None) -> "Device":
 
 
 def new_folder(out: Path) -> None:
-    """Create a folder, or say why it cannot be."""
+    """Create a folder, with an InputError if this fails."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{out}: expected a folder that can be made, found: {error.strerror or error}") from error
+        raise InputError(f"cannot create {out}: {error.strerror or error}") from error
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file, whole or not at all."""
+    """Write a JSON file atomically."""
     from clsplat.atomic import replacing
 
     with replacing(path) as file:
@@ -65,12 +67,12 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def moved(gaussians: "Gaussians", by: Any) -> "Gaussians":
-    """The Gaussians translated by `by` (3,), in float64 until the end."""
+    """Translate Gaussians by `by` (3,), computed in float64."""
     return replace(gaussians, means=(gaussians.means + by).astype(gaussians.means.dtype))
 
 
 def say_cameras(dataset: Path, picture: Path) -> None:
-    """Tell what structure from motion found, if it was ours, with warnings, and draw it."""
+    """Print and draw the result of structure from motion, with warnings, if clsplat recovered the cameras."""
     from clsplat.dataset.sfm.summary import draw_cameras, preview
 
     found = preview(dataset)
@@ -80,11 +82,11 @@ def say_cameras(dataset: Path, picture: Path) -> None:
     for warning in found.warnings():
         warn(f"warning: {warning}")
     draw_cameras(picture, found.model)
-    say(f"cameras: {picture} shows them")
+    say(f"cameras: drawn in {picture}")
 
 
 def say_scores(report: dict[str, Any], out: Path) -> None:
-    """Tell the mean figures and where the page is."""
+    """Print the mean metrics and the path of the evaluation page."""
     from clsplat.show.evaluation_page import METRICS
 
     mean = ", ".join(f"{METRICS[name][0]} {value:.4g}" for name, value in report["mean"].items() if value is not None)

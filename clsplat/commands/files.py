@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Devices:
-    """List the OpenCL devices, what each can do, and the one that would be taken."""
+    """List the OpenCL devices, their capabilities, and the default device."""
 
     def run(self) -> None:
         """Run the command."""
@@ -26,7 +26,7 @@ class Devices:
         default = select_device()
         for device in list_devices():
             extensions = device.extensions
-            abilities = [
+            capabilities = [
                 f"{device.max_compute_units} compute units",
                 f"{device.global_mem_size / 2**30:.1f} GiB, {device.max_mem_alloc_size / 2**30:.1f} GiB per buffer",
                 f"{device.local_mem_size // 1024} KiB local",
@@ -34,20 +34,20 @@ class Devices:
                 "double precision" if "cl_khr_fp64" in extensions else "no double precision",
                 "subgroups" if "subgroups" in extensions else "no subgroups",
             ]
-            print(f"{'*' if device == default else ' '} {device_label(device)}\n    {'; '.join(abilities)}")
-        print("* is taken by default; choose another by part of its name: --device NAME, or by PYOPENCL_CTX")
+            print(f"{'*' if device == default else ' '} {device_label(device)}\n    {'; '.join(capabilities)}")
+        print("* is the default; choose another device with --device and part of its name, or with PYOPENCL_CTX")
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Make photos of a video: the sharpest frame of each interval; `train` and `sfm` then match neighbours."""
+    """Extract photos from a video: the sharpest frame of each interval; `train` and `sfm` match only neighbours."""
 
     video: tyro.conf.Positional[Path]
     """The video; needs the extra `video`."""
     out: Out
     """New folder for the photos."""
     fps: float = 2.0
-    """Photos for each second of the video."""
+    """Photos per second of the video."""
 
     def run(self) -> None:
         """Run the command."""
@@ -59,12 +59,12 @@ class Frames:
 
 @dataclass(frozen=True)
 class Sfm:
-    """Recover the cameras of a folder of photos (pycolmap); `train` does so by itself where it is needed."""
+    """Recover the cameras of a folder of photos (pycolmap); `train` does this itself if there are no cameras."""
 
     photos: tyro.conf.Positional[Path]
     """Folder of photos."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder for the model; default: beside the photos."""
+    """Folder for the model; default: the folder of the photos."""
     sfm: Annotated[SfmConfig, tyro.conf.arg(name="")] = field(default_factory=SfmConfig)
 
     def run(self) -> None:
@@ -78,17 +78,17 @@ class Sfm:
 
 @dataclass(frozen=True)
 class Export:
-    """Convert a file of Gaussians, or make a page of it that shows the scene in any browser, without a network."""
+    """Convert a file of Gaussians to another format, or to a web page that shows the scene offline in any browser."""
 
     scene: tyro.conf.Positional[Path]
     """File of Gaussians."""
     to: tyro.conf.Positional[Path | None] = None
-    """File to write; its suffix names the format, and .html a page for the browser."""
+    """File to write; its suffix determines the format; .html makes a web page."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """The same, for those who look for -o."""
+    """Alternative to the second argument."""
     data: Path | None = None
-    """For a page: dataset, as given to `train`, whose first photo is the first view and whose cameras tell what is
-    upright."""
+    """For a web page: dataset, as for `train`. Its first photo is the first view, and its cameras determine the
+    upward direction."""
     data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
 
     def run(self) -> None:

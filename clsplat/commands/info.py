@@ -1,4 +1,4 @@
-"""The command `info`: what a file of Gaussians, a run or a dataset is and holds, as text."""
+"""The command `info`: describe a file of Gaussians, a run or a dataset."""
 
 import json
 from collections import Counter
@@ -18,17 +18,18 @@ if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
 
 BAR = 40
-"""Width of a histogram's longest bar in characters."""
+"""Length of the longest bar of a histogram, in characters."""
 
 BINS = 10
+"""Number of bars of a histogram."""
 
 
 @dataclass(frozen=True)
 class Info:
-    """Say what a file of Gaussians, the folder of a run or a dataset is, and what it holds."""
+    """Describe a file of Gaussians, the folder of a run, or a dataset."""
 
     path: tyro.conf.Positional[Path]
-    """File of Gaussians in any format, folder that `train` has written, or dataset."""
+    """File of Gaussians in any format, folder written by `train`, or dataset."""
 
     def run(self) -> None:
         """Run the command."""
@@ -44,7 +45,7 @@ class Info:
 
 
 def scene_lines(path: Path) -> list[str]:
-    """What `info` says about a file of Gaussians."""
+    """Describe a file of Gaussians."""
     from clsplat.formats import load_gaussians, suffix_of
     from clsplat.formats.anatomy import ANATOMIES
 
@@ -58,22 +59,22 @@ def scene_lines(path: Path) -> list[str]:
         "Gaussians": f"{len(gaussians):,}",
         "sh degree": str(gaussians.sh_degree),
         "mode": mode,
-        "size": f"{_size(size)}, {size / len(gaussians):.1f} bytes for a Gaussian",
+        "size": f"{_size(size)}, {size / len(gaussians):.1f} bytes per Gaussian",
         "bounds": f"{_vector(low)} to {_vector(high)}",
         "98 % within": f"{_vector(first)} to {_vector(last)}",
         "middle": _vector(middle),
     }
     if offset.any():
-        rows["offset"] = f"{_vector(offset, 10)}, to be added for coordinates of the world"
+        rows["offset"] = f"{_vector(offset, 10)}, to be added to obtain world coordinates"
     if anatomy.comments:
         rows["comments"] = "; ".join(anatomy.comments)
-    title = "bytes by part, before they are compressed together" if anatomy.packed else "bytes by part"
+    title = "bytes by part, before compression" if anatomy.packed else "bytes by part"
     parts = {name: (_size(n), n) for name, n in anatomy.parts.items()}
     return [str(path), *_table(rows), "", title, *_bars(parts), "", *_histograms(gaussians)]
 
 
 def run_lines(folder: Path) -> list[str]:
-    """What `info` says about a folder that `train` has written, finished or not."""
+    """Describe a folder written by `train`, whether the run is finished or not."""
     from clsplat.show.training_curve import read_log
     from clsplat.training.presets import DATA_PATH
 
@@ -94,13 +95,13 @@ def run_lines(folder: Path) -> list[str]:
     scene = folder / "scene.ply"
     if not scene.is_file():
         rows["Gaussians"] = f"{last['num_gaussians']:,}"
-        rows["scene.ply"] = "none: the run was interrupted, or goes on; the same command with --resume finishes it"
+        rows["scene.ply"] = "none: the run is in progress or was interrupted; --resume finishes it"
         return [str(folder), *_table(rows)]
     return [str(folder), *_table(rows), "", *scene_lines(scene)]
 
 
 def dataset_lines(path: Path) -> list[str]:
-    """What `info` says about a dataset; no cameras are recovered for it."""
+    """Describe a dataset, without recovering its cameras."""
     from clsplat.config import DataConfig
     from clsplat.dataset import colmap, transforms
     from clsplat.dataset.photos import list_photos, photo_folder, photo_size
@@ -112,13 +113,13 @@ def dataset_lines(path: Path) -> list[str]:
     if model is not None:
         cameras, posed, points, _ = colmap.read_model(model)
         lenses = [cameras[camera] for _, camera, _ in posed]
-        what = "photos and the cameras that clsplat found" if record else "COLMAP model"
+        what = "photos with cameras recovered by clsplat" if record else "COLMAP model"
     elif transforms.find_transforms(path):
         dataset = transforms.read_dataset(path, DataConfig())
         photos = [photo.path for photo in dataset.photos]
         lenses, points, what = [photo.intrinsics for photo in dataset.photos], dataset.points, "transforms.json"
     elif photos:
-        lenses, points, what = [], np.empty((0, 3)), "photos without cameras: train, or sfm, finds them"
+        lenses, points, what = [], np.empty((0, 3)), "photos without cameras: train or sfm recovers them"
     else:
         raise InputError(f"{path}: expected a scene, a run or a dataset, found neither photos nor cameras")
     rows = {"what": what, "photos": f"{len(photos):,}"}
@@ -148,13 +149,13 @@ def _histograms(gaussians: "Gaussians") -> list[str]:
         "opacity",
         *_bars(opacities),
         "",
-        "size: geometric mean of the standard deviations; the ends take what lies beyond",
+        "size: geometric mean of the standard deviations; outliers count in the outermost bars",
         *_bars(_histogram(sizes, edges)),
     ]
 
 
 def _histogram(values: "NDArray[Any]", edges: "NDArray[Any]") -> dict[str, tuple[str, int]]:
-    """Share and count by range."""
+    """Compute share, as text, and count of the values in each range."""
     bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     counts = np.bincount(bins, minlength=len(edges) - 1)
     return {
@@ -164,7 +165,7 @@ def _histogram(values: "NDArray[Any]", edges: "NDArray[Any]") -> dict[str, tuple
 
 
 def _bars(rows: Mapping[str, tuple[str, int]]) -> list[str]:
-    """Lines of a name, a figure in words, and a bar in proportion to the number."""
+    """Format rows (text, number) as lines with name, text, and a bar proportional to the number."""
     top = max((value for _, value in rows.values()), default=0)
     figures = {name: text for name, (text, _) in rows.items()}
     width = max(map(len, figures.values()), default=0)
@@ -181,12 +182,12 @@ def _table(rows: Mapping[str, str]) -> list[str]:
 
 
 def _counts(counts: Mapping[str, int]) -> str:
-    """Most frequent first."""
+    """Format counts, the largest first."""
     return ", ".join(f"{count:,} of {name}" for name, count in sorted(counts.items(), key=lambda x: -x[1]))
 
 
 def _vector(values: Iterable[float], digits: int = 4) -> str:
-    return "(" + ", ".join(f"{v + 0.0:.{digits}g}" for v in values) + ")"  # + 0.0: no -0
+    return "(" + ", ".join(f"{v + 0.0:.{digits}g}" for v in values) + ")"  # + 0.0 turns -0 to 0
 
 
 def _size(count: int) -> str:

@@ -16,16 +16,16 @@ from clsplat.errors import InputError
 
 @dataclass(frozen=True)
 class Eval:
-    """Compare renders of a scene with the held-out photos: metrics as JSON, and a page of pictures."""
+    """Compare renders of a scene with the held-out photos: metrics as JSON, and a web page."""
 
     scene: tyro.conf.Positional[Path]
     """File of Gaussians."""
     data: tyro.conf.Positional[Path]
-    """Dataset, as given to `train`."""
+    """Dataset, as for `train`."""
     out: Out
     """Folder for metrics.json, index.html and the renders."""
     device: str | None = None
-    """Part of the platform's or device's name."""
+    """Part of the name of the platform or device."""
     data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
 
@@ -50,22 +50,22 @@ class Eval:
 
 @dataclass(frozen=True)
 class Render:
-    """Render a scene as PNG files: the held-out views of its dataset, or an orbit around what its photos show."""
+    """Render a scene to PNG files: the held-out views of its dataset, or an orbit around the photographed subject."""
 
     scene: tyro.conf.Positional[Path]
     """File of Gaussians."""
     data: tyro.conf.Positional[Path]
-    """Dataset, as given to `train`; its cameras are the views or lead the orbit."""
+    """Dataset, as for `train`; its cameras are the views, or determine the orbit."""
     out: Out
-    """Folder for the pictures."""
+    """Folder for the images."""
     path: str = "test"
-    """test: the held-out views (all views, where none is held out). orbit: a closed path around the scene."""
+    """test: the held-out views (all views if none is held out). orbit: a closed path around the scene."""
     frames: int = 60
-    """Pictures of an orbit."""
+    """Number of images of an orbit."""
     depth: bool = False
     """Also write the expected depth, as 16-bit PNG scaled to the largest depth."""
     device: str | None = None
-    """Part of the platform's or device's name."""
+    """Part of the name of the platform or device."""
     data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
 
@@ -112,13 +112,13 @@ class Render:
         renderings = render_views(
             gaussians, cameras.values(), config, device, background=background, depth=self.depth
         )
-        # PNG compression takes as long as rendering: it runs beside it, a few pictures behind.
+        # PNG compression takes as long as rendering, so that other threads do it at the same time.
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             writing: deque[Future[None]] = deque()
             for name, rendering in tqdm(zip(cameras, renderings, strict=True), unit="view", total=len(cameras)):
                 writing.append(pool.submit(write, name, rendering))
                 if len(writing) > 2 * (os.cpu_count() or 1):
                     writing.popleft().result()
-            for picture in writing:
-                picture.result()
-        say(f"{self.out}: {len(cameras)} pictures")
+            for image in writing:
+                image.result()
+        say(f"{self.out}: {len(cameras)} images")

@@ -13,18 +13,18 @@ from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
 
 @dataclass(frozen=True)
 class View:
-    """Look at a scene in the browser, rendered here; needs the extra `viewer`."""
+    """Show a scene in the browser, rendered on this machine; needs the extra `viewer`."""
 
     scene: tyro.conf.Positional[Path]
     """File of Gaussians."""
     data: Path | None = None
-    """Dataset, as given to `train`: its cameras are shown, and a click on one goes there."""
+    """Dataset, as for `train`: its cameras are shown, and a click on one moves the view there."""
     host: str = "127.0.0.1"
-    """Address to listen at; 0.0.0.0 lets other machines in, too."""
+    """Address to listen on; 0.0.0.0 admits other machines."""
     port: int = 8080
-    """Where to listen; if it is taken, the next free one."""
+    """Port to listen on; if it is in use, the next free one."""
     device: str | None = None
-    """Part of the platform's or device's name."""
+    """Part of the name of the platform or device."""
     data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
 
@@ -48,7 +48,7 @@ class View:
         renderer = Renderer(device, replace(self.render, mode=mode), background)
         viewer = Viewer(renderer, start, views, host=self.host, port=self.port)
         viewer.tell({"File": self.scene.name, "Gaussians": f"{len(gaussians):,}", "Device": device.label})
-        say(f"viewer: open {viewer.address} in a browser; Ctrl-C ends it")
+        say(f"viewer: open {viewer.address} in a browser; Ctrl-C closes the viewer")
         with suppress(KeyboardInterrupt):
             viewer.hold(gaussians)
         viewer.close()

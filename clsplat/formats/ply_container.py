@@ -28,7 +28,7 @@ POSITION = ("x", "y", "z")
 
 
 class PlyHeader(NamedTuple):
-    """What the header of a PLY declares, and where the rows begin.
+    """Declarations in the header of a PLY.
 
     elements: elements with their properties, by name, in the order of the file; rows: number of rows of each; order:
     byte order, "<" or ">", or "=" for ASCII; comments: text of the comments; length: bytes of the header; file_size:
@@ -140,7 +140,7 @@ def read_points(path: str | Path, file: BinaryIO) -> Array:
         typed = data.astype(vertex.dtype())
     for name in names:
         if typed[name].dtype.kind in "iu" and (typed[name] != data[name]).any():
-            raise InputError(f"{path}: expected {name} within {typed[name].dtype} as the header says, found others")
+            raise InputError(f"{path}: expected {name} within {typed[name].dtype} as declared, found others")
     return typed
 
 

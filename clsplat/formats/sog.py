@@ -310,7 +310,8 @@ class _Decoder:
         image = self.image(group, index).reshape(-1, 4)
         if len(image) < self.count:
             raise InputError(
-                f"{self.path}: expected {self.count} Gaussians as {META} says, found {len(image)} pixels of {group}"
+                f"{self.path}: expected {self.count} Gaussians as {META} declares, found {len(image)} pixels of "
+                f"{group}"
             )
         return image[: self.count]
 

@@ -62,7 +62,7 @@ def save_splat(
     """Write Gaussians as a .splat file, sorted by volume times opacity, largest first.
 
     Positions and scales stay float32. Colours and opacities are rounded to multiples of 1/255, quaternions to
-    multiples of 1/128. A warning tells what is lost: bands of the spherical harmonics above 0, the mode, the offset,
+    multiples of 1/128. Warnings name what is lost: bands of the spherical harmonics above 0, the mode, the offset,
     colours beyond 0 to 1.
 
     Parameters

@@ -63,8 +63,8 @@ GZIP_LEVEL = 6
 """Compression level of gzip, 1 to 9. Measurement: docs/formats.md."""
 
 SIGMA_STEPS = 5
-"""Smallest number of steps of the positions per standard deviation of the median Gaussian along its shortest axis.
-Measurement: docs/formats.md."""
+"""Number of steps of the positions per smallest standard deviation of the median Gaussian, before it is rounded up to
+a whole number of bits. Measurement: docs/formats.md."""
 
 COLOR = (0.15 * 255, 127.5)
 LOG_SCALE = (16.0, 160.0)

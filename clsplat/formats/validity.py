@@ -1,4 +1,4 @@
-"""What every format checks and repairs: readable files, finite values, unit quaternions, world offsets."""
+"""Checks and repairs that every format shares: readable files, finite values, unit quaternions, world offsets."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

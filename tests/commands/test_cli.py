@@ -1,4 +1,4 @@
-"""The command line end to end on a tiny dataset, and one clear sentence for each kind of bad input."""
+"""The command line end to end on a tiny dataset, and one sentence for each kind of bad input."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def write_dataset(folder: Path, count: int = 9) -> Gaussians:
-    """A transforms.json dataset: renders of known Gaussians by the twins; returns them."""
+    """Write a transforms.json dataset with renders of known Gaussians by the twins; return the Gaussians."""
     truth = synthetic_scene(40, seed=4)[0]
     rng = np.random.default_rng(0)
     truth.means[:] = rng.uniform(-0.6, 0.6, truth.means.shape)
@@ -70,7 +70,7 @@ def run(*arguments: object) -> None:
 
 
 def fails(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """Run a command that must fail; return its one sentence."""
+    """Run a command that must fail; return its error message, a single sentence."""
     with pytest.raises(SystemExit) as exit_:
         run(*arguments)
     assert exit_.value.code == 2
@@ -94,7 +94,7 @@ def trained(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_export_knows_every_format(trained: Path, tmp_path: Path, suffix: str) -> None:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what the format cannot hold
+        warnings.simplefilter("ignore")  # about data that the format cannot hold
         run("export", trained / "scene.ply", "-o", tmp_path / f"a{suffix}")
         run("export", tmp_path / f"a{suffix}", "-o", tmp_path / "again.ply")
     assert len(load_gaussians(tmp_path / "again.ply")[0]) == len(load_gaussians(trained / "scene.ply")[0])
@@ -119,7 +119,7 @@ def test_train_leaves_a_scene_and_says_how_good_it_is(trained: Path) -> None:
     assert [r["iteration"] for r in records] == [10, 20]
     assert all(r["psnr"] > 5 and 0 < r["loss"] < 1 for r in records)
     metrics = json.loads((trained / "eval" / "metrics.json").read_text())
-    # The log's last evaluation and the report are of the same Gaussians.
+    # The last evaluation in the log and the report evaluate the same Gaussians.
     assert metrics["mean"]["psnr"] == pytest.approx(records[-1]["psnr"])
     assert len(metrics["views"]) == 2
 
@@ -183,7 +183,7 @@ def test_the_config_of_a_run_repeats_it(trained: Path, dataset: Path, tmp_path: 
 def test_flags_count_more_than_a_preset(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # 7000 is TrainConfig's own value: flags are not told by differing from it.
+    # 7000 is the default of TrainConfig: a flag counts even if it equals the default.
     seen: list[TrainConfig] = []
     monkeypatch.setattr("clsplat.commands.train.train_and_report", lambda scene, config, *_: seen.append(config))
     run("train", dataset, "-o", tmp_path / "a", "--preset", "fast", "--iterations", 7000, "--few.below", 0)
@@ -223,7 +223,7 @@ def test_shells_can_complete_every_command(shell: str, capsys: pytest.CaptureFix
 
 
 def test_quiet_says_nothing_and_verbose_where_an_error_is_from(dataset: Path, tmp_path: Path) -> None:
-    """In processes of their own: the progress bar is told by the environment, before it is imported."""
+    """In processes of their own, since tqdm reads the environment on import."""
 
     def said(*arguments: object) -> str:
         command = [sys.executable, "-m", "clsplat", *map(str, arguments)]
@@ -295,7 +295,7 @@ def test_bad_folders(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "empty" in fails(capsys, "train", tmp_path / "empty", "-o", out)
     assert not out.exists()
     (tmp_path / "file").write_text("not a folder")
-    assert "expected a folder" in fails(capsys, "train", dataset, "-o", tmp_path / "file" / "below", *TRAIN)
+    assert "cannot create" in fails(capsys, "train", dataset, "-o", tmp_path / "file" / "below", *TRAIN)
 
 
 def test_bad_photos_and_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -330,7 +330,7 @@ def test_unknown_device_lists_the_known(dataset: Path, tmp_path: Path, capsys: p
 
 
 def test_without_a_driver_it_says_how_to_get_one(tmp_path: Path) -> None:
-    # In a process of its own: the loader reads the list of drivers once.
+    # In a process of its own, since the loader reads the list of drivers once.
     script = (
         "import sys, pyopencl\npyopencl.get_platforms = lambda: []\nfrom clsplat.cli import main\nmain(['devices'])"
     )

@@ -1,4 +1,4 @@
-"""The viewer as commands open it."""
+"""The viewer, opened by the commands `view` and `train`."""
 
 # ruff: noqa: F811 (a fixture is imported and then named as an argument)
 import sys
@@ -17,7 +17,7 @@ from clsplat.gaussians import Gaussians
 
 @pytest.fixture
 def held(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Gaussians]]:
-    """What viewers hold, with the text of their panel; each is left by Ctrl-C at once."""
+    """The Gaussians shown by viewers, with the text of their panel; Ctrl-C is simulated at once."""
     pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
     from clsplat.show.viewer import Viewer
 
@@ -37,7 +37,7 @@ def test_view_opens_every_format(
 ) -> None:
     scene = tmp_path / f"scene{suffix}"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what the format cannot hold
+        warnings.simplefilter("ignore")  # about data that the format cannot hold
         run("export", trained / "scene.ply", scene)
     run("view", scene, "--port", 18090)
     ((facts, gaussians),) = held
@@ -60,7 +60,7 @@ def test_view_goes_to_the_photos(
 
     monkeypatch.setattr(Viewer, "__init__", watched)
     gaussians = load_gaussians(trained / "scene.ply")[0]
-    save_gaussians(tmp_path / "scene.ply", gaussians, offset=(10.0, 0.0, 0.0))  # the dataset's is 0
+    save_gaussians(tmp_path / "scene.ply", gaussians, offset=(10.0, 0.0, 0.0))  # the offset of the dataset is 0
     run("view", tmp_path / "scene.ply", "--data", dataset, "--port", 18090)
     scene = load_scene(dataset, DataConfig())
     _, viewpoint, views = made[0]

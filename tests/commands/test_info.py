@@ -1,4 +1,4 @@
-"""What `clsplat info` says about files of every format, runs and datasets."""
+"""The output of `clsplat info` for files of every format, runs and datasets."""
 
 import json
 import warnings
@@ -16,7 +16,7 @@ N = 300
 
 
 def info(path, capsys):
-    """The table's rows by name, and all of the text."""
+    """Run `clsplat info`; return the rows of the table by name, and the whole text."""
     main(["info", str(path)])
     text = capsys.readouterr().out
     rows = (line.strip().split("  ", 1) for line in text.splitlines() if line.startswith("  "))
@@ -38,7 +38,7 @@ def gaussians():
 def test_every_format_tells_what_it_holds(gaussians, suffix, tmp_path, capsys):
     path = tmp_path / f"a{suffix}"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what the format cannot hold
+        warnings.simplefilter("ignore")  # about data that the format cannot hold
         save_gaussians(path, gaussians, "antialiased", (1000, 0, -20))
     rows, text = info(path, capsys)
     anatomy = ANATOMIES[suffix](path)
@@ -51,7 +51,7 @@ def test_every_format_tells_what_it_holds(gaussians, suffix, tmp_path, capsys):
     assert ("offset" in rows) == (suffix in (".ply", ".compressed.ply", ".sog"))
     if "offset" in rows:
         assert rows["offset"].startswith("(1000, 0, -20)")
-    # The parts are all of the file, but for the ZIP's directory and the headers of compressed files.
+    # The parts make up the whole file, except for the directory of a ZIP and the headers of compressed files.
     whole = sum(anatomy.parts.values())
     if anatomy.packed:
         assert whole == N * (9 + 1 + 3 + 3 + 4 + 24)
@@ -124,7 +124,7 @@ def test_photos_and_transforms(tmp_path, capsys):
         Image.new("RGB", (width, 20)).save(tmp_path / f"{k}.png")
     rows, _ = info(tmp_path, capsys)
     assert rows == {
-        "what": "photos without cameras: train, or sfm, finds them",
+        "what": "photos without cameras: train or sfm recovers them",
         **{"photos": "3", "sizes": "2 of 40x20, 1 of 30x20"},
     }
     pose = np.eye(4).tolist()

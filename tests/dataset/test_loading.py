@@ -63,7 +63,7 @@ def test_nothing_is_drawn_long_before_the_nearest_points(tmp_path):
     assert {view.camera.near for view in scene.train + scene.test} == {near_plane(scene)}
     assert near_plane(scene) == pytest.approx(0.1 * 3.0, abs=1e-3)
     few = dataclasses.replace(scene, points=scene.points[:99])
-    assert near_plane(few) == NEAR, "too few to tell a wrong one"
+    assert near_plane(few) == NEAR, "too few to recognise an outlier"
     assert near_plane(dataclasses.replace(scene, points=scene.points[:0])) == NEAR
 
 

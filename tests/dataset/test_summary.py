@@ -111,7 +111,7 @@ def test_what_was_found_is_said_and_drawn(dataset, tmp_path, capsys):
     error = capsys.readouterr().err
     assert "cameras: 3 of 4 photos have a pose; 1 points" in error
     assert "no pose was found for 1 of 4 photos: d.png;" in error and "blurred compared with the others" in error
-    assert "cameras.png shows them" in error
+    assert "drawn in" in error and "cameras.png" in error
     with Image.open(tmp_path / "cameras.png") as image:
         assert image.width > 800
 

@@ -70,7 +70,7 @@ def test_number_of_gaussians(bloated, tmp_path, capsys):
     assert len(found) == 40 and found.sh_degree == before.sh_degree
     assert (found.logit_opacities > 1).mean() > 0.9, "those that make the picture are kept"
     said = capsys.readouterr().err
-    assert "views: 10 price the Gaussians, 2 judge the loss" in said, "every view has one of the two offices"
+    assert "views: 10 to price the Gaussians, 2 to measure the loss" in said, "every view has one of the two tasks"
     assert "200 Gaussians of degree 3" in said and "40 Gaussians of degree 3" in said and "loss: " in said
     assert len(compacted(bloated, tmp_path / "b.ply", "--max-gaussians", 999)) == 200
 
@@ -132,7 +132,7 @@ def test_without_cameras(bloated, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(viewpoints, "CANDIDATES", 5)
     run("compact", bloated / "bloated.ply", "-o", tmp_path / "a.ply", "--max-gaussians", 50)
     assert len(load_gaussians(tmp_path / "a.ply")[0]) == 50
-    assert "if the scene has 30 dB against photos unknown" in capsys.readouterr().err
+    assert "assuming 30 dB of the scene against photos" in capsys.readouterr().err
 
 
 def test_views_of_nothing_are_left_out(device):
@@ -150,7 +150,7 @@ def test_bad_input_is_a_sentence(bloated, tmp_path, capsys):
     def error(*arguments, scene=scene, out=out):
         return fails(capsys, "compact", scene, "-o", out, *arguments)
 
-    assert "expected how small or how good, found none" in error()
+    assert "expected at least one of these limits, found none" in error()
     assert "--max-gaussians: expected 1 or more, found 0" in error("--max-gaussians", 0)
     assert "--max-psnr-loss: expected more than 0 dB, found -1" in error("--max-psnr-loss", -1.0)
     assert "--max-bytes: expected a size such as" in error("--max-bytes", "20")
@@ -188,4 +188,4 @@ def test_photos_of_something_else_are_warned_of(bloated, tmp_path, capsys):
             *("compact", tmp_path / "other.ply", "-o", tmp_path / "a.ply", "--max-gaussians", 9),
             *("--photos", bloated / "photos"),
         )
-    assert "dB only; are they of it?" in capsys.readouterr().err
+    assert "dB; do they show it?" in capsys.readouterr().err

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_cli import run, write_dataset
-from test_triangulation import START, posed, write_transforms  # noqa: F401  (a fixture)
+from test_triangulation import POINTS_TARGET, posed, write_transforms  # noqa: F401  (a fixture)
 
 from clsplat import TrainConfig, prepare, save_gaussians, train
 from clsplat.config import DataConfig, InitConfig
@@ -44,7 +44,7 @@ def test_poses_without_points(posed: list[View], tmp_path: Path) -> None:
     assert from_python(path, config, tmp_path / "python") == (tmp_path / "command" / "scene.ply").read_bytes()
     told: list[str] = []
     scene, _ = prepare(path, config, tell=told.append)
-    assert len(scene.points) == START and f"start: {START} points, from photos and poses" in told[1]
+    assert len(scene.points) == POINTS_TARGET and f"start: {POINTS_TARGET} points, from photos and poses" in told[1]
 
 
 def test_a_resumed_run_of_many_photos_needs_no_points(posed: list[View], tmp_path: Path) -> None:
