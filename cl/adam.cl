@@ -1,11 +1,13 @@
 // Stage adam: one step of Adam (adam.h) on an array of parameters, in place.
 //
-// Mapping: one work-item per run of `width` values, the runs `stride` values apart; values between the end of a run and
-// the next one are left alone. The first `split` values of a run have a rate of their own. So a row of spherical
-// harmonics is a run that ends with the trained bands and starts with degree 0; any other array is cut into runs of 16.
-// project.cl has the same update fused with the gradients, for training. The penalties of the loss by the sums of all
-// opacities and scales add o (1 - o) and the scale itself to the gradients of their logits and logarithms; each is 0
-// for the other fields; so is the third, by the effective ranks (adam.h), for which runs of ln(scales) are rows.
+// Mapping: one work-item per run of `width` values. Runs begin `stride` values apart, and values between two runs are
+// not changed. The first `split` values of a run have a separate learning rate. A row of spherical harmonics is a
+// run: it starts with degree 0 and ends with the trained bands. All other arrays are cut into runs of 16 values.
+// Training uses the same update fused with the gradients, in project.cl.
+//
+// The penalties of the sums of all opacities and scales add o (1 - o) to the gradients of the logits, and the scale
+// to the gradients of its logarithm. The third penalty depends on the effective ranks (adam.h). For it, runs of
+// ln(scales) consist of whole rows. Each penalty is 0 for the other fields.
 //
 // Buffers, `total` values each: in gradients; in and out parameters, first (m), second (v).
 #include "common.h"
@@ -35,7 +37,7 @@ __kernel void adam_step(const uint total, const uint stride, const uint width, c
             const real16 below = -ABSOLUTE(p), e = OF16(exp, below);
             g += opacity_penalty * e / ((1 + e) * (1 + e)) + (scale_penalty != 0 ? scale_penalty * OF16(exp, p) : 0);
         }
-        // Runs are of whole rows then.
+        // In this case, runs consist of whole rows.
         for (int k = 0; erank_penalty != 0 && k + 3 <= count; k += 3) {
             const real3 v = erank_penalty * erank_vjp(load3(parameters + i, k / 3), adam.erank_slack);
             ((real *)&g)[k] += v.x;

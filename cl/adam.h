@@ -6,7 +6,7 @@
 
 #include "structs.h"
 
-// rates are divided by 1 - beta1^t already.
+// Rates are already divided by 1 - beta1^t.
 static inline real16 adam_update(const Adam *adam, real16 rates, real16 p, real16 g, real16 *m, real16 *v) {
     *m = adam->keep1 * *m + adam->take1 * g;
     *v = adam->keep2 * *v + adam->take2 * (g * g);
@@ -14,9 +14,9 @@ static inline real16 adam_update(const Adam *adam, real16 rates, real16 p, real1
     return p - rates * (*m / (OF16(sqrt, mean) + adam->eps));
 }
 
-// Gradient by ln(scales) of max(-ln(erank - 1 + slack), 0), with erank = exp(entropy of s^2 / sum of s^2) (Hyung et al.
-// 2024, "Effective rank analysis", equation 8): q_i = s_i^2 / sum has d q_i / d ln s_j = 2 q_i (delta_ij - q_j), hence
-// d erank / d ln s_j = -2 erank q_j (ln q_j + entropy).
+// Gradient by ln(scales) of max(-ln(erank - 1 + slack), 0), with erank = exp(entropy of s^2 / sum of s^2) (Hyung et
+// al. 2024, "Effective rank analysis", equation 8): q_i = s_i^2 / sum has d q_i / d ln s_j = 2 q_i (delta_ij - q_j),
+// hence d erank / d ln s_j = -2 erank q_j (ln q_j + entropy).
 static inline real3 erank_vjp(real3 log_scales, real slack) {
     const real largest = GREATER(GREATER(log_scales.x, log_scales.y), log_scales.z);
     const real3 d = 2 * (log_scales - largest);
@@ -26,11 +26,11 @@ static inline real3 erank_vjp(real3 log_scales, real slack) {
     const real3 log_q = d - log(sum);
     const real entropy = -(q.x * log_q.x + q.y * log_q.y + q.z * log_q.z);
     const real excess = expm1(entropy) + slack;
-    // Not a number fails the test too.
+    // NaN fails this test, too.
     return excess < 1 ? 2 * exp(entropy) / excess * q * (log_q + entropy) : (real3)0;
 }
 
-// The same for `count` < 16 parameters that lie side by side; beyond them nothing is read or written.
+// The same for `count` < 16 adjacent parameters. Nothing beyond them is read or written.
 static inline void adam_update_some(const Adam *adam, real16 rates, int count, real16 g, __global real *parameters,
                                     __global real *first, __global real *second) {
     real16 p = 0, m = 0, v = 0;

@@ -1,34 +1,34 @@
-// Stage bin: which splats touch which tile, in depth order.
+// Stage bin: the list of splats of each tile, in depth order.
 //
-// A tile's list holds, by depth and then by index, every splat whose ellipse {alpha >= ALPHA_MIN} may cover
-// the centre of one of its pixels: the test is exact (ellipse.h) but for a slack in the threshold.
+// The list of a tile contains each splat whose ellipse {alpha >= ALPHA_MIN} may cover the centre of one of its
+// pixels, sorted by depth and then by index. The test is exact (ellipse.h), except for a slack in the threshold.
 //
-// Splats are walked in some order: by depth (scheme "global", after a sort of all splats), or by index (scheme
-// "per_tile", which sorts each tile's list afterwards). Either way a stable distribution to the tiles keeps
-// that order within each list. Steps, with the stages scan and sort between them:
-//   bin_prepare  keys[N], depths as integers that sort like them, invisible splats last; ellipses[N], see ellipse.h
-//   bin_identity or (sort)  order[N], the splats in the order of the walk
-// On a CPU, a counting sort by tile of which work-item w owns the w-th run of splats and counters of its own:
-//   bin_histogram  counters[W,T], entries per run and tile; counts[N], tiles of splat order[i] (GRADIENTS)
-//   bin_totals     totals[T], entries per tile; the counters become entries of the runs before
-//   (scan)         tile_begins[T + 1], their total M, and first_slots[N + 1] (GRADIENTS)
-//   bin_scatter    gauss_ids[M] and slots[M] (GRADIENTS), where the counters say
-// On a GPU, a radix sort by tile, one work-item per splat:
+// Splats are visited by depth (scheme "global", after a sort of all splats) or by index (scheme "per_tile", which
+// sorts the list of each tile afterwards). A stable distribution to the tiles keeps this order within each list.
+// Steps, with the stages scan and sort in between:
+//   bin_prepare  keys[N], depths as integers with the same order, invisible splats last; ellipses[N], see ellipse.h
+//   bin_identity or (sort)  order[N], the splats in the order of the visits
+// On a CPU, a counting sort by tile. Work-item w has the w-th run of splats, and its own counters:
+//   bin_histogram  counters[W,T], entries per run and tile; counts[N], number of tiles of splat order[i] (GRADIENTS)
+//   bin_totals     totals[T], entries per tile; the counters become the numbers of entries of the preceding runs
+//   (scan)         tile_begins[T + 1] with their total M, and first_slots[N + 1] (GRADIENTS)
+//   bin_scatter    gauss_ids[M] and slots[M] (GRADIENTS), at the positions given by the counters
+// On a GPU, a radix sort by tile, with one work-item per splat:
 //   bin_count    counts[N]
 //   (scan)       first_slots[N + 1]
-//   bin_emit     slot by slot: tiles[M] and the splat's index slot_gauss[M], a splat's slots side by side
+//   bin_emit     for each slot the tile, tiles[M], and the index of the splat, slot_gauss[M]
 //   (sort)       the slots by tile, stable, and with GRADIENTS bin_gather
 //   bin_bisect   tile_begins[T + 1], from the sorted tiles
-// Then bin_ranges: tile_ranges[T,2], begin and end of each tile's list. Scheme per_tile goes on with
+// Then bin_ranges writes tile_ranges[T,2], begin and end of each tile's list. Scheme "per_tile" continues with
 //   bin_list_keys  the depth key of each entry
-//   (sort)         the entries of each tile by it, stable, and bin_gather
+//   (sort)         the entries of each tile by this key, stable, and bin_gather
 //
-// Counting and emitting are one function, walk_tiles: they cannot disagree.
+// Counting and emitting use the same function, walk_tiles, so that they always agree.
 //
-// Buffers: N splats, M intersections, T = tiles_x tiles_y tiles in row-major order, W runs; see above and
-// project.cl. A splat's slots lie side by side and are numbered in the order of the walk.
+// Buffers: N splats, M intersections, T = tiles_x tiles_y tiles in row-major order, W runs; see above and project.cl.
+// The slots of a splat are adjacent, and numbered in the order of the visits.
 // -DTILE            edge of a tile, px
-// -DGRADIENTS=0|1   1: bin_histogram and bin_scatter also write what the backward pass needs
+// -DGRADIENTS=0|1   1: bin_histogram and bin_scatter also write the arrays for the backward pass
 #include "common.h"
 #include "ellipse.h"
 
@@ -39,29 +39,29 @@
 #error "-DGRADIENTS must be 0 or 1"
 #endif
 
-// Rows of tiles looked at together.
+// Number of rows of tiles that are tested together.
 #define ROWS        8
 #define ROW_OFFSETS (TILE * (real8)(0, 1, 2, 3, 4, 5, 6, 7))
 
-// What walk_tiles does with a tile.
+// Action of walk_tiles on a tile.
 #define COUNT   0 // nothing
 #define LIST    1 // out_a[slot] = tile, out_b[slot] = g
 #define TALLY   2 // ++counters[tile]
 #define SCATTER 3 // out_a[counters[tile]] = g, out_b[counters[tile]++] = slot (GRADIENTS)
 
-// Walks the tiles of splat g with ellipse e, whose slots begin at `slot`. Returns their number.
+// Visits the tiles of splat g with ellipse e, whose slots begin at `slot`. Returns their number.
 static inline uint walk_tiles(const int task, uint g, Ellipse e, int width, int height, uint slot,
                               __global uint *counters, __global uint *out_a, __global uint *out_b) {
     if (!(e.half_height > 0))
         return 0;
     const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
-    // Rows of tiles within the box; where rounding adds one, no ellipse meets it.
+    // Rows of tiles within the box. If rounding adds a row, the ellipse does not meet it.
     const real top = (e.y - e.half_height) / TILE, bottom = (e.y + e.half_height) / TILE;
     const int begin = top > 0 ? (top < tiles_y ? (int)top : tiles_y) : 0;
     const int end = bottom > 0 ? (bottom < tiles_y ? (int)bottom + 1 : tiles_y) : 0;
     uint count = 0;
     for (int ty = begin; ty < end; ty += ROWS) {
-        // Distances of the first and the last row of pixel centres in each row of tiles; the image may cut it off.
+        // Distances of the first and the last row of pixel centres in each row of tiles, which the image may cut off.
         const real8 first_row = ROW_OFFSETS + (ty * TILE + (real)0.5);
         const real8 image_end = height - (real)0.5, tile_end = first_row + (TILE - 1);
         const real8 last_row = LESSER(tile_end, image_end);
@@ -102,8 +102,8 @@ typedef uint depth_key;
 #define LAST   UINT_MAX
 #endif
 
-// The bits of a positive floating-point number order like the number. A work-item takes eight splats: on CPUs
-// one vector logarithm costs less than one scalar one.
+// The bits of positive floating-point numbers have the same order as the numbers. A work-item takes eight splats,
+// because on CPUs a vector logarithm is faster than a scalar one.
 __kernel void bin_prepare(const uint n, const __global real *means2d, const __global real *conics,
                           const __global real *depths, const __global real *extents, const __global real *opacities,
                           __global depth_key *keys, __global Ellipse *ellipses) {
@@ -129,8 +129,8 @@ __kernel void bin_identity(const uint n, __global uint *order) {
         order[i] = i;
 }
 
-// The run of a work-item: from both ends in turn, since the last runs of an order by depth hold what is invisible, and
-// neighbouring work-items often share a core.
+// The run of a work-item. Runs are taken from both ends alternately: in an order by depth the last runs hold the
+// invisible splats, and neighbouring work-items often share a core.
 static inline uint run_of(uint w, uint runs) {
     return w % 2 ? runs - 1 - w / 2 : w / 2;
 }
@@ -139,7 +139,7 @@ static inline uint run_begin(uint n, uint runs, uint run) {
     return (uint)((ulong)n * run / runs);
 }
 
-// Ellipses gathered together: the cache misses of the gather overlap.
+// Number of ellipses that are loaded together, so that their cache misses overlap.
 #define BATCH 32
 
 static inline void gather(uint begin, uint end, const __global uint *order, const __global Ellipse *ellipses,

@@ -1,13 +1,13 @@
 // Real type, literals and index helpers shared by every stage.
 //
-// -DUSE_DOUBLE  selects real = double; without it real = float and the host passes -cl-single-precision-constant,
-//               so that unsuffixed literals are of type real in both builds.
+// -DUSE_DOUBLE  selects real = double. Without it, real is float, and the host passes -cl-single-precision-constant, so
+//               that unsuffixed literals have the type real in both builds.
 // -DALPHA_MIN, LOG2_ALPHA_MIN, EXPONENT_SLACK, ALPHA_MAX, TRANSMITTANCE_MIN, BLUR, COMPENSATION_MIN, NEAR, FRUSTUM_MARGIN,
 // -DQUAT_NORM2_MIN, EXTENT_SLACK
-//               the model's constants; their home, reasons and sources are in clsplat/constants.py.
+//               constants of the model; clsplat/constants.py defines them, with reasons and sources.
 //
-// Functions are `static inline`: in C99's sense a plain `inline` defines nothing to link with where a compiler chooses
-// not to inline, as some drivers do when they do not optimise.
+// Functions are `static inline`: a plain `inline` of C99 defines no external function, and linking fails if the
+// compiler does not inline it, as some drivers do without optimisation.
 #ifndef CLSPLAT_COMMON_H
 #define CLSPLAT_COMMON_H
 
@@ -25,7 +25,7 @@ typedef double3 real3;
 typedef double4 real4;
 typedef double8 real8;
 typedef double16 real16;
-typedef long4 mask4; // what comparing two real4 gives
+typedef long4 mask4; // result of comparing two real4
 typedef long8 mask8;
 typedef long16 mask16;
 #else
@@ -43,17 +43,16 @@ typedef int16 mask16;
 #define CONCATENATE_(a, b) a##b
 #define CONCATENATE(a, b)  CONCATENATE_(a, b)
 
-// For the innermost loops, and for vectors as for scalars. PoCL inlines its built-in functions only where its library
-// was compiled for no more than what it takes the CPU to be; elsewhere each costs a call that spills every vector
-// register.
+// For innermost loops; for vectors and scalars. PoCL inlines built-in functions only if its library was compiled for
+// features of the detected CPU. Otherwise each use is a call, which spills all vector registers.
 #define LESSER(a, b)     ((a) < (b) ? (a) : (b))
 #define GREATER(a, b)    ((a) > (b) ? (a) : (b))
 #define CLAMP(x, lo, hi) ((x) < (lo) ? (lo) : (x) > (hi) ? (hi) : (x))
 #define ABSOLUTE(x)      ((x) < 0 ? -(x) : (x))
 
-// A function of the driver on 4, 8 or 16 values, called with at most 256 bits at once: PoCL 3.0 takes Zen 4, which has
-// AVX-512, for a CPU without, but calls what was built for AVX-512, and over wider arguments its compiler crashes, hangs
-// or yields wrong code. vload16 and conversions are such functions too.
+// A function of the driver on 4, 8 or 16 values, called with at most 256 bits at once. PoCL 3.0 compiles for Zen 4,
+// which has AVX-512, as for a CPU without it, but calls functions that were built for AVX-512. With wider arguments
+// its compiler crashes, hangs or generates wrong code. vload16 and conversions are such functions, too.
 #define IN_HALVES(type, f, x) ((type)(f((x).lo), f((x).hi)))
 #define OF4(f, x)             f(x)
 #ifdef USE_DOUBLE
@@ -94,7 +93,7 @@ static inline void store4(__global real *x, size_t i, real4 value) {
     x[4 * i + 3] = value.w;
 }
 
-// 16 neighbours at any address.
+// 16 adjacent values at any address.
 typedef struct __attribute__((packed)) {
     real16 v;
 } Packed16;

@@ -1,12 +1,12 @@
-// One splat over a group of pixels and the gradients of that: the mathematics that both variants of the
-// compositing stage share. REALV is real (one pixel) or a vector of reals (a block of pixels); MASKV what
-// comparing two gives.
+// Compositing one splat over a group of pixels, and its gradients: the mathematics that all variants of the stage
+// composite share. REALV is real (one pixel) or a vector of reals (a block of pixels). MASKV is the result of
+// comparing two of them.
 //
 //   sigma = (a dx^2 + c dy^2)/2 + b dx dy,   alpha = min(ALPHA_MAX, opacity exp(-sigma))    (paper, equation 4)
 //   C = sum_i c_i alpha_i T_i,   T_i = prod_{j<i} (1 - alpha_j)                             (paper, equation 3)
 //
-// Splats come packed, with the exponent of two: alpha = 2^t, t = log2(opacity) - sigma log2(e). A splat is seen where
-// sigma >= 0, which only rounding of a needle's conic violates, and alpha >= ALPHA_MIN: both are tests of t.
+// Splats are packed for exponents of two: alpha = 2^t, t = log2(opacity) - sigma log2(e). A splat is visible where
+// sigma >= 0, which only the rounding of a needle's conic violates, and alpha >= ALPHA_MIN. Both are tests of t.
 #ifndef CLSPLAT_COMPOSITE_H
 #define CLSPLAT_COMPOSITE_H
 
@@ -37,10 +37,10 @@ static inline MASKV splat_seen(const Splat *s, REALV t) {
     return (t <= (REALV)(s->level + (real)EXPONENT_SLACK)) & (t >= (REALV)LOG2_ALPHA_MIN);
 }
 
-// Composites a splat over a group of pixels; alpha becomes what counts: clamped, and 0 where the splat is not seen. A
-// pixel whose transmittance would fall to `stop` or below is finished: its transmittance stays, and from then on is kept
-// negated. (Elsewhere the transmittance is above `stop`, also where nothing is seen.) Returns the weight alpha T, 0 where
-// the splat is not drawn; *live: the pixels that are not finished.
+// Composites a splat over a group of pixels. alpha is clamped, and set to 0 where the splat is not visible. A pixel
+// whose transmittance would fall to `stop` or below is finished: its transmittance stays the same, and is stored
+// negated from then on. (Other pixels have a transmittance above `stop`.) Returns the weight alpha T, which is 0
+// where the splat is not drawn. *live: the pixels that are not finished.
 static inline REALV splat_over(MASKV seen, real stop, REALV *alpha, MASKV *live, REALV *transmittance) {
     const REALV clamped = LESSER(*alpha, (REALV)ALPHA_MAX), before = *transmittance;
     *alpha = seen ? clamped : (REALV)0;
@@ -50,17 +50,18 @@ static inline REALV splat_over(MASKV seen, real stop, REALV *alpha, MASKV *live,
     return *live ? weight : (REALV)0;
 }
 
-// Gradient of sigma; alpha, live and weight as splat_over gave them, u = colour . v_image. *behind goes from the sum
-// of u alpha T over this splat and all behind it, the background included, to that without it:
+// Gradient of sigma. alpha, live and weight are those of splat_over, and u = colour . v_image. On entry, *behind is
+// the sum of u alpha T over this splat and all behind it, background included; on return it is the sum without this
+// splat:
 //   v_sigma = -alpha v_alpha = behind alpha/(1 - alpha) - u alpha T.
 static inline REALV splat_over_vjp(REALV alpha, MASKV live, REALV weight, REALV u, REALV *behind) {
     const REALV part = weight * u;
     *behind -= part;
-    // The clamp of alpha passes no gradient; ALPHA_MAX < 1 bounds the quotient.
+    // Clamped alpha has no gradient. ALPHA_MAX < 1 bounds the quotient.
     return (live & (alpha < (REALV)ALPHA_MAX)) ? *behind * (alpha / (1 - alpha)) - part : (REALV)0;
 }
 
-// Sums over pixels of v_sigma, v_sigma dx, ... and of weight v_image: every gradient of a splat follows from these
+// Sums over pixels of v_sigma, v_sigma dx, ... and of weight v_image, from which all gradients of a splat follow
 // (composite_splats.h). A record holds them for one splat and one tile: RECORD reals, in this order.
 #define RECORD (6 + CHANNELS)
 

@@ -1,10 +1,10 @@
-// Pixels of a tile in blocks of LANES, and the splats that meet them: what kernels share in which a work-item owns a tile.
+// Blocks of LANES pixels, and the splats that meet them, for kernels in which a work-item has a whole tile.
 //
-// A block is one vector, 4 pixels wide and LANES / 4 high; a splat visits only the blocks that its ellipse meets. How are
-// these found? With the tile's rows of blocks as the lanes of a second vector, one evaluation gives the range of x over
-// which the ellipse spans each row (ellipse.h has the reasons), and comparisons with the columns of blocks a set of bits.
+// A block is one vector, 4 pixels wide and LANES / 4 high. A splat visits only the blocks that its ellipse meets. To
+// find them, a second vector has the rows of blocks as its lanes: one evaluation yields the range of x that the
+// ellipse spans in each row (ellipse.h), and comparisons with the columns of blocks yield a set of bits.
 //
-// -DLANES=8|16   vectors that fit the device's registers: of 16 floats where it has 512 bits, of 8 elsewhere
+// -DLANES=8|16   size of the device's vector registers: 16 floats if it has 512 bits, otherwise 8
 #ifndef CLSPLAT_COMPOSITE_BLOCKS_H
 #define CLSPLAT_COMPOSITE_BLOCKS_H
 
@@ -33,7 +33,7 @@
 #define PIXEL_Y ((real8)(0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5))
 #endif
 
-// Rows of blocks, in lanes: their numbers, and the bit of each one's first block (none where the tile has no such row).
+// Rows of blocks, in lanes: their numbers, and the bit of the first block of each (0 if the tile has no such row).
 #if ROWS == 8
 #define ROWV      real8
 #define MASKR     mask8
@@ -94,10 +94,10 @@ static inline bool any_lane(MASKV mask) {
     return m4.x | m4.y | m4.z | m4.w;
 }
 
-// Lane i of a vector that lies in memory.
+// Lane i of a vector in memory.
 #define LANE(vector, i) (((const real *)&(vector))[i])
 
-// Where pixel (x, y) of a tile is: its block and its lane there.
+// Block and lane of pixel (x, y) of a tile.
 static inline int block_of(int x, int y) {
     return y / BLOCK_ROWS * COLUMNS + x / 4;
 }
@@ -146,8 +146,8 @@ DEFINE_POWER(8)
 #define POWERV power8
 #endif
 
-// Takes the next of a set of blocks. Counting zeros in one instruction makes compositing a tenth faster; no function of
-// OpenCL C 1.2 does it, and Oclgrind 21.10, which is built upon Clang, cannot run it (-DWITHOUT_CTZ).
+// Removes the next block from a set. Counting zeros in one instruction makes compositing a tenth faster. OpenCL C 1.2
+// has no function for it, and Oclgrind 21.10, which is based on Clang, cannot run the built-in (-DWITHOUT_CTZ).
 static inline uint take_block(uint *blocks) {
 #if defined(__clang__) && !defined(WITHOUT_CTZ)
     const uint next = __builtin_ctz(*blocks);
@@ -173,13 +173,13 @@ typedef struct {
     uint blocks;
 } Over;
 
-// Splats whose blocks are found before any of them is composited: a loop over blocks ends where the processor cannot
-// foresee it, and with the bits at hand it learns of that early. Between batches finished blocks are looked for, at
-// about the cost of one splat.
+// Number of splats whose blocks are found before the first of them is composited. A processor cannot predict the end
+// of the loop over blocks; if the bits are available early, it knows the end early. Finished blocks are searched
+// between batches, which costs about as much as one splat.
 #define BATCH 32
 
-// Asks for memory, to read or to write, that will be needed: splats and records lie at random, and a fetch from beyond the
-// nearest caches lasts as long as a block. Only for kernels that run on the host's processor, whose addresses are plain.
+// Prefetches memory to read or to write. Splats and records have random addresses, and a load that misses the nearest
+// caches takes as long as a block. Only for kernels on the host's processor, where addresses are ordinary pointers.
 #if defined(__clang__) && (defined(__x86_64__) || defined(__aarch64__))
 #define FETCH_TO_READ(p)  __builtin_prefetch((const void *)(size_t)(p))
 #define FETCH_TO_WRITE(p) __builtin_prefetch((const void *)(size_t)(p), 1)
@@ -188,15 +188,15 @@ typedef struct {
 #define FETCH_TO_WRITE(p)
 #endif
 
-// Loads up to BATCH splats from the list's entry `first` on; returns their number.
+// Loads up to BATCH splats, beginning with the entry `first` of the list. Returns their number.
 static inline uint load_batch(const __global Splat *splats, const __global uint *gauss_ids, uint first, uint end,
                               int x0, int y0, Over *batch) {
     const uint count = LESSER((uint)BATCH, end - first);
-    // First all loads, so that the caches' misses overlap.
+    // All loads come first, so that cache misses overlap.
     for (uint j = 0; j < count; ++j)
         batch[j].splat = splats[gauss_ids[first + j]];
     for (uint j = first + BATCH; j < LESSER(end, first + 2 * BATCH); ++j) {
-        // Most lie across two lines of the cache.
+        // Most of them span two cache lines.
         FETCH_TO_READ(&splats[gauss_ids[j]].x);
         FETCH_TO_READ(&splats[gauss_ids[j]].color[CHANNELS - 1]);
     }
@@ -205,14 +205,14 @@ static inline uint load_batch(const __global Splat *splats, const __global uint 
     return count;
 }
 
-// Transmittance 1 inside the image; what lies outside counts as finished.
+// Transmittance 1 inside the image. Pixels outside count as finished.
 static inline REALV transmittance_at_first(const Grid *grid, int b, int rows, int columns) {
     const MASKV inside = (grid->x[b % COLUMNS] < (REALV)columns) & (grid->y[b / COLUMNS] < (REALV)rows);
     return inside ? (REALV)1 : (REALV)-1;
 }
 
-// Composites the entries [begin, end) of a tile's list over its blocks, whose pixels are finished where the transmittance
-// would fall to `stop` or below; adds the colours to sums.
+// Composites the entries [begin, end) of a tile's list over its blocks, and adds the colours to `sums`. A pixel is
+// finished where the transmittance would fall to `stop` or below.
 static inline void composite_tile(const Grid *grid, const __global Splat *splats, const __global uint *gauss_ids,
                                   uint begin, uint end, int x0, int y0, real stop, REALV *transmittance,
                                   REALV (*sums)[CHANNELS]) {

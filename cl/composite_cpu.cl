@@ -1,29 +1,30 @@
-// Stage composite, variant for CPUs: splats to pixels, front to back, and gradients back.
+// Stage composite, variant for CPUs: composites splats to pixels, front to back, and propagates gradients back.
 //
 //   image = sum_i colour_i alpha_i T_i + T_end background,  alpha = 1 - T_end   (Kerbl et al. 2023, equation 3)
-// A pixel skips pairs with alpha < ALPHA_MIN and stops before T would fall to TRANSMITTANCE_MIN or below.
-// composite.h holds the mathematics, composite_gpu.cl the variant for GPUs, clsplat/reference/composite.py
-// the twin.
+// A pixel skips pairs with alpha < ALPHA_MIN, and stops before T would fall to TRANSMITTANCE_MIN or below.
+// composite.h contains the mathematics, composite_gpu.cl the variant for GPUs, clsplat/reference/composite.py the
+// twin.
 //
-// Mapping: one work-item per tile, which keeps the tile's pixels in private memory (they stay in the L1 cache) and
-// takes its splats in depth order, visiting the blocks of 4x4 or 4x2 pixels that each meets (composite_blocks.h).
+// Mapping: one work-item per tile. It keeps the pixels of the tile in private memory (they stay in the L1 cache) and
+// takes its splats in depth order. Each splat visits the blocks of 4x4 or 4x2 pixels that it meets
+// (composite_blocks.h).
 //
-// How does the backward pass work? It replays the forward pass front to back. With u_i = colour_i . v_image
-// and S the part of sum_i u_i alpha_i T_i + T_end (background . v_image - v_alpha) that lies behind splat i,
-//   v_alpha_i = T_i u_i - S_i / (1 - alpha_i);
-// S starts as image . v_image - T_end v_alpha and loses one term per splat, so nothing is saved but the
-// image, and no transmittance is divided back. A splat's sums over the pixels of a tile go, as a record, to its slot
-// of the unsorted list, where the records of a splat are neighbours; composite_sum adds them in a fixed order: no
-// atomics.
+// Backward pass: it repeats the forward pass from front to back. Let u_i = colour_i . v_image, and let S_i be the
+// part of sum_i u_i alpha_i T_i + T_end (background . v_image - v_alpha) that lies behind splat i. Then
+//   v_alpha_i = T_i u_i - S_i / (1 - alpha_i).
+// S starts as image . v_image - T_end v_alpha, and each splat subtracts its term. So only the image must be stored,
+// and transmittances are not recovered by divisions. The sums of a splat over the pixels of a tile are written, as a
+// record, to the splat's slot in the unsorted list, where its records are adjacent. composite_sum adds them in a
+// fixed order, without atomics.
 //
 // Buffers: N splats as in project.cl, M intersections and T tiles as in bin.cl, C = CHANNELS
-//   in   means2d, conics, extents, opacities, colors, as in project.cl; splats[N], the same packed by composite_pack;
+//   in   means2d, conics, extents, opacities, colors, as in project.cl; splats[N], the same, packed by composite_pack;
 //        gauss_ids[M], tile_ranges[T,2], background[C], slots[M]
 //   out  image[H,W,C], alpha[H,W]; backward: records[M,6+C], v_means2d[N,2], v_conics[N,3], v_opacities[N],
 //        v_colors[N,C]
 // -DTILE=8|16   edge of a tile, px
-// -DCHANNELS    colour channels, 1 or more
-// -DLANES=8|16  pixels of a block
+// -DCHANNELS    number of colour channels, 1 or more
+// -DLANES=8|16  number of pixels of a block
 #include "common.h"
 #include "composite_blocks.h"
 

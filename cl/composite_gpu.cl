@@ -1,37 +1,37 @@
-// Stage composite, variant for GPUs: splats to pixels, front to back, and gradients back.
+// Stage composite, variant for GPUs: composites splats to pixels, front to back, and propagates gradients back.
 //
-// The equations, the recurrence of the backward pass and the results are those of composite_cpu.cl, and
-// composite.h holds the mathematics of both; only the mapping differs.
+// The equations, the recurrence of the backward pass and the results are those of composite_cpu.cl. composite.h
+// contains the mathematics of both. Only the mapping differs.
 //
-// Forward mapping: one work-group per tile, one work-item per pixel. The group stages BATCH splats at a time in
-// local memory, and each work-item composites them onto its pixel. A work-item whose pixel is finished, or lies
-// outside the image, goes on staging; the group stops together once live_pixels, counted down once per pixel, is 0.
+// Forward mapping: one work-group per tile, one work-item per pixel. The group loads BATCH splats at a time into
+// local memory, and each work-item composites them onto its pixel. A work-item whose pixel is finished or outside the
+// image continues to load. The group stops when live_pixels, the number of unfinished pixels, is 0.
 //
-// Backward mapping: one work-group of BATCH work-items per tile, one work-item per splat of a batch; the pixels
-// of the tile stream past them.
+// Backward mapping: one work-group of BATCH work-items per tile, one work-item per splat of a batch. The pixels of
+// the tile pass from work-item to work-item.
 //
-// How does the diagonal scheme of the backward pass work? A pixel's state (transmittance, the part behind, the
-// gradient of its colour) waits in local memory. At step s of a batch, work-item t takes its splat over pixel s - t,
+// Diagonal scheme of the backward pass: the state of a pixel (transmittance, part behind, gradient of the colour) is
+// in local memory. At step s of a batch, work-item t composites its splat over pixel s - t:
 //
-//          step  0  1  2  3 ...          so a pixel meets the splats front to back, one step apart, as in the
-//   work-item 0  p0 p1 p2 p3 ...         forward pass, and no two work-items ever hold the same pixel. One barrier
-//   work-item 1     p0 p1 p2 ...         per step hands the pixels on. All sums of a splat over the tile's pixels
-//   work-item 2        p0 p1 ...         stay in its work-item's registers: no reduction, no atomics, no subgroups,
-//                                        and the same bits in each run.
-// A batch takes TILE*TILE + BATCH - 1 steps. The work-item of its last splat sees each pixel as the batch leaves it:
-// its vote stops the group where no pixel is left, and the records behind are zeros.
+//          step  0  1  2  3 ...          A pixel meets the splats front to back, one step apart, as in the forward
+//   work-item 0  p0 p1 p2 p3 ...         pass. No two work-items have the same pixel at a time. One barrier per step
+//   work-item 1     p0 p1 p2 ...         passes the pixels on. All sums of a splat over the pixels of the tile stay in
+//   work-item 2        p0 p1 ...         the registers of its work-item: no reduction, no atomics, no subgroups, and
+//                                        the same bits in each run.
+// A batch takes TILE*TILE + BATCH - 1 steps. The work-item of the last splat sees the final state of each pixel in
+// the batch. It stops the group if all pixels are finished; the records of the remaining splats are zeros.
 //
-// Where the device has subgroups, BATCH is the size of one: a step then ends with a barrier of the subgroup, which costs
-// a GPU next to nothing, and a batch has the fewest steps in which some work-items have no pixel. What is computed, and so
-// every bit, is the same.
+// If the device has subgroups, BATCH is the size of a subgroup. A step then ends with a barrier of the subgroup,
+// which is almost free on a GPU, and the number of steps in which some work-items have no pixel is smallest. The
+// computation, and therefore each bit of the result, is the same.
 //
 // Buffers: as in composite_cpu.cl.
 // Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (11 + CHANNELS), backward TILE^2
-// (2 + CHANNELS). At TILE 16, BATCH 64 and CHANNELS 4 that is 4 KiB and 6 KiB (double: 8 KiB and 12 KiB) of the 32 KiB
-// which OpenCL 1.2 guarantees.
+// (2 + CHANNELS). With TILE 16, BATCH 64 and CHANNELS 4 this is 4 KiB and 6 KiB (double: 8 KiB and 12 KiB) of the 32
+// KiB that OpenCL 1.2 guarantees.
 // -DTILE=8|16   edge of a tile, px; the forward work-group has TILE*TILE work-items
-// -DCHANNELS    colour channels, 1 or more
-// -DBATCH       splats per batch, 1 or more; the backward work-group has BATCH work-items
+// -DCHANNELS    number of colour channels, 1 or more
+// -DBATCH       number of splats per batch, 1 or more; the backward work-group has BATCH work-items
 // -DSUBGROUPS=0|1   1: the device has the functions of subgroups, by cl_khr_subgroups or OpenCL 2.1 and later
 #include "common.h"
 
@@ -54,7 +54,7 @@
 
 #define PIXELS (TILE * TILE)
 
-// Where pixel p of the tile with origin (x0, y0) lies.
+// Position of pixel p of the tile with origin (x0, y0).
 static inline int2 pixel_of(int x0, int y0, uint p) {
     return (int2)(x0 + p % TILE, y0 + p / TILE);
 }
@@ -79,7 +79,7 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
 
     const uint begin = tile_ranges[2 * tile], length = tile_ranges[2 * tile + 1] - begin;
     for (uint first = 0; first < length; first += BATCH) {
-        barrier(CLK_LOCAL_MEM_FENCE); // live_pixels is written, and nobody reads the last batch any more
+        barrier(CLK_LOCAL_MEM_FENCE); // live_pixels is written, and the last batch is no longer read
         if (live_pixels == 0)
             break;
         const uint count = min((uint)BATCH, length - first);
@@ -163,7 +163,7 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
             sums[k] = 0;
 
         for (uint step = 0; step < PIXELS + count - 1; ++step) {
-            const uint p = step - lane; // wraps to beyond PIXELS where the stream has not reached this work-item
+            const uint p = step - lane; // wraps to a value beyond PIXELS while no pixel has reached this work-item
             if (lane < count && p < PIXELS && transmittance[p] > 0) {
                 const int2 pixel = pixel_of(x0, y0, p);
                 const real dx = pixel.x + (real)0.5 - s.x, dy = pixel.y + (real)0.5 - s.y;

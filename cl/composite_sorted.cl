@@ -1,27 +1,28 @@
-// Stage composite, variant that sorts the splats of each pixel (--sort pixel): splats to pixels, and gradients back.
+// Stage composite, variant that sorts the splats of each pixel (--sort pixel), with its gradients.
 //
-// The equations are those of composite_cpu.cl. There all pixels take the splats in the order of their centres' depths,
-// and where two swap their order the image jumps at once wherever both are seen: it pops when the camera turns. Here a
-// pixel takes them in the order in which its ray meets them (project_disparities in project.cl), which changes from
-// place to place and moves on steadily with the camera (Radl et al. 2024, "StopThePop").
+// The equations are those of composite_cpu.cl. There, all pixels take the splats in the order of the depths of their
+// centres. When two splats swap, all pixels that show both of them change at once: the image pops when the camera
+// turns. Here, each pixel takes the splats in the order in which its ray meets them (project_disparities in
+// project.cl). This order differs between pixels, and changes gradually with the camera (Radl et al. 2024,
+// "StopThePop").
 //
-// How is a pixel sorted, exactly and in fixed memory? In rounds over the tile's list. In each a window gathers the
-// WINDOW nearest of the splats that the pixel sees and has not composited yet; then they are composited, and the next
-// round looks beyond the last of them. Ties go by the list, that is by the depth of the centres and by index. Most
-// pixels are finished after a few rounds; the list, which is nearly in order, fills a window early, and what lies
-// behind all of a block's windows costs no more than to find that out.
+// A pixel is sorted exactly and in fixed memory, in rounds over the tile's list. In each round, a window collects the
+// WINDOW nearest splats that the pixel shows and has not composited yet. They are composited, and the next round
+// continues behind the last of them. Ties are decided by the list, that is by the depth of the centres and by index.
+// Most pixels are finished after a few rounds. The list is almost in order, so a window fills early. A splat behind
+// all windows of a block only costs the test for it.
 //
-// Mapping: one work-item per tile, its pixels in blocks (composite_blocks.h). This variant serves all devices. At
-// one place of a block's windows are up to LANES different splats: their colours are gathered, and in the backward pass
-// their sums scattered, lane by lane. A work-item alone writes the records of its tile, in a fixed order: no atomics,
-// the same bits each run.
+// Mapping: one work-item per tile, with its pixels in blocks (composite_blocks.h). This variant is for all devices.
+// At one position of a block's windows there are up to LANES different splats: their colours are gathered lane by
+// lane, and their sums in the backward pass are scattered lane by lane. Only one work-item writes the records of a
+// tile, in a fixed order: no atomics, and the same bits in each run.
 //
 // Buffers: as in composite_cpu.cl, and
 //   in   disparities[N,3], as in project.cl
 // -DTILE=8|16   edge of a tile, px
-// -DCHANNELS    colour channels, 1 or more
-// -DLANES=8|16  pixels of a block
-// -DWINDOW      entries of a pixel's window, 1 or more
+// -DCHANNELS    number of colour channels, 1 or more
+// -DLANES=8|16  number of pixels of a block
+// -DWINDOW      number of entries of a pixel's window, 1 or more
 #include "common.h"
 #include "composite_blocks.h"
 
@@ -42,13 +43,14 @@ typedef struct {
     MASKV entry; // in the list of intersections
 } Entry;
 
-#define NOWHERE ((REALV)-INFINITY) // a disparity behind all
+#define NOWHERE ((REALV)-INFINITY) // a disparity behind all others
 
-// Puts an entry into a window that holds at most `count` in any pixel, nearest first; the farthest drops out of a full
-// one. Those that come late belong far behind: the search begins there and ends where no pixel needs to go on.
+// Inserts an entry into a window with at most `count` entries per pixel, nearest first. The farthest entry leaves a
+// full window. Late entries belong far behind, so the search begins at the end, and stops when no pixel needs to
+// continue.
 static inline void window_insert(Entry *window, int count, Entry e) {
     int j = LESSER(count, WINDOW - 1);
-    const MASKV kept = window[j].disparity >= e.disparity; // only where the window is full
+    const MASKV kept = window[j].disparity >= e.disparity; // only if the window is full
     e.disparity = kept ? window[j].disparity : e.disparity;
     e.alpha = kept ? window[j].alpha : e.alpha;
     e.entry = kept ? window[j].entry : e.entry;
@@ -67,7 +69,7 @@ static inline void window_insert(Entry *window, int count, Entry e) {
     window[j] = e;
 }
 
-// A tile as both passes need it.
+// Data of a tile for both passes.
 typedef struct {
     const __global Splat *splats;
     const __global real *disparities;
@@ -77,10 +79,10 @@ typedef struct {
     const Grid *grid;
 } Tile;
 
-// The pixels of a tile; `sums` is the colour in the forward pass, v_image in the backward one.
+// The pixels of a tile. `sums` is the colour in the forward pass and v_image in the backward pass.
 typedef struct {
     REALV transmittance[BLOCKS], behind[BLOCKS], sums[BLOCKS][CHANNELS];
-    REALV last_disparity[BLOCKS]; // of what was composited last; NOWHERE: nothing is left
+    REALV last_disparity[BLOCKS]; // of the last composited splat; NOWHERE: none is left
     MASKV last_entry[BLOCKS];
     int counts[BLOCKS];
     Entry windows[BLOCKS][WINDOW];
@@ -130,7 +132,8 @@ static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, c
     }
 }
 
-// Takes a splat to the window of block b if a pixel there has not composited it yet and sees it among the nearest.
+// Inserts a splat into the window of block b, for pixels that have not composited it yet and for which it is near
+// enough.
 static inline void gather_splat(const Tile *tile, const Splat *s, real3 disparity, uint entry, Pixels *pixels,
                                 int b) {
     const REALV x = tile->grid->x[b % COLUMNS] + (tile->x0 - s->x),
@@ -171,7 +174,7 @@ static inline void composite_window(const Tile *tile, Pixels *pixels, int b) {
     pixels->last_disparity[b] = pixels->transmittance[b] > 0 ? pixels->last_disparity[b] : NOWHERE;
 }
 
-// All that a tile's pixels see, in rounds.
+// Composites all splats of a tile, in rounds.
 static inline void composite_list(const Tile *tile, uint begin, uint end, Pixels *pixels) {
     uint open = begin < end ? unfinished_blocks(pixels->transmittance) : 0;
     for (int b = 0; b < BLOCKS; ++b) {
@@ -184,7 +187,7 @@ static inline void composite_list(const Tile *tile, uint begin, uint end, Pixels
     while (open) {
         for (uint first = begin; first < end; first += BATCH) {
             const uint count = load_batch(tile->splats, tile->gauss_ids, first, end, tile->x0, tile->y0, batch);
-            // Block by block: its window stays in the nearest cache.
+            // One block after the other, so that its window stays in the nearest cache.
             for (uint blocks = open; blocks;) {
                 const int b = take_block(&blocks);
                 for (uint j = 0; j < count; ++j) {
@@ -202,7 +205,7 @@ static inline void composite_list(const Tile *tile, uint begin, uint end, Pixels
     }
 }
 
-// Number of the tile's first pixel, and how much of the tile lies inside the image.
+// Index of the tile's first pixel, and size of the part of the tile inside the image.
 static inline int4 tile_box(uint t, int width, int height) {
     const int tiles_x = (width + TILE - 1) / TILE;
     const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;

@@ -1,6 +1,6 @@
-// What both variants of the stage composite do per splat, before and after the pixels.
-//   composite_pack  the splats as compositing reads them, side by side (composite.h)
-//   composite_sum   a splat's records, one per tile, added up in the order of their slots, and its gradients:
+// Steps per splat of all variants of the stage composite, before and after the pixels.
+//   composite_pack  packs the splats for compositing (composite.h)
+//   composite_sum   adds up a splat's records, one per tile, in the order of their slots, and computes its gradients:
 //     v_mean2d = -sum_pixels v_sigma (a dx + b dy, b dx + c dy),   v_conic = sum_pixels v_sigma (dx^2/2, dx dy, dy^2/2),
 //     v_opacity = -sum_pixels v_sigma / opacity,                   v_colour = sum_pixels weight v_image
 //
@@ -50,7 +50,7 @@ __kernel void composite_sum(const uint n, const __global uint *order, const __gl
     const real2 v_mean = -(real2)(conic.x * total[1] + conic.y * total[2], conic.y * total[1] + conic.z * total[2]);
     const real3 v_conic = (real3)((real)0.5 * total[3], total[4], (real)0.5 * total[5]);
     const real v_opacity = begin < end ? -total[0] / opacities[g] : 0;
-    // A splat whose gradients overflow gets none: they would stay in the statistics of densification.
+    // Gradients that overflow are set to 0: they would stay in the statistics of densification.
     real any = v_mean.x + v_mean.y + v_conic.x + v_conic.y + v_conic.z + v_opacity;
     for (int k = 0; k < CHANNELS; ++k)
         any += total[6 + k];

@@ -1,9 +1,9 @@
-// How many pairs of a splat and a pixel there are: what an image costs, for the viewer and for `clsplat bench kernels`.
+// Stage count: numbers of pairs of a splat and a pixel, for the viewer and for `clsplat bench kernels`.
 //
-// A pair is evaluated if the pixel, not finished yet, lies in the box of the splat's extents and in a tile whose list
-// holds the splat; it is accepted if it is drawn: alpha >= ALPHA_MIN, and the transmittance behind it stays above
-// TRANSMITTANCE_MIN. The rule is that of composite.h, in its plainest form, so that the count does not change with
-// what the compositing kernels do to be fast.
+// A pair is evaluated if the pixel is not finished and lies in the box of the splat's extents and in a tile whose
+// list contains the splat. It is accepted if it is drawn: alpha >= ALPHA_MIN, and the transmittance behind it stays
+// above TRANSMITTANCE_MIN. The rule is that of composite.h in its simplest form. The counts do not depend on
+// optimisations of the compositing kernels.
 //
 // Mapping: one work-item per pixel.
 //

@@ -1,19 +1,19 @@
-// Stage dropout: splats left out of an image at random, the others more opaque instead.
+// Stage dropout: drops random splats of an image, and makes the others more opaque.
 //
-//   a splat is dropped with probability r; the opacity of the others becomes o / (1 - r), so that its mean over the draws
-//   is o                                                  (Park et al. 2025, "DropGaussian", equation 4)
-// The draws come from Philox (philox.h), whose counter is the Gaussian's index and the iteration. docs/stages/dropout.md;
-// clsplat/reference/dropout.py is the twin.
+//   A splat is dropped with probability r. The opacity of the others becomes o / (1 - r), so that its mean over the
+//   draws is o                                            (Park et al. 2025, "DropGaussian", equation 4)
+// The draws come from Philox (philox.h); its counter is the Gaussian's index and the iteration. See
+// docs/stages/dropout.md; clsplat/reference/dropout.py is the twin.
 //
 // Mapping: one work-item per splat.
 //
-// Buffers, N splats: in and out extents[N,2] px, 0 where dropped, opacities[N], v_opacities[N].
-// A splat that is too dim or too far outside to be visible stays so: its gradients are small.
+// Buffers, N splats: in and out extents[N,2] px, 0 for dropped splats, opacities[N], v_opacities[N].
+// A splat that is invisible, because it is too faint or too far outside, stays invisible: its gradients are small.
 #include "common.h"
 #include "ellipse.h"
 #include "philox.h"
 
-// Dropped are draws below `threshold`, r 2^32; gain is 1 / (1 - r).
+// Draws below `threshold` = r 2^32 are dropped; gain is 1 / (1 - r).
 __kernel void dropout_fwd(const uint n, const uint2 key, const uint iteration, const uint threshold, const real gain,
                           __global real *extents, __global real *opacities) {
     const size_t i = get_global_id(0);
@@ -21,7 +21,7 @@ __kernel void dropout_fwd(const uint n, const uint2 key, const uint iteration, c
         return;
     const real opacity = opacities[i];
     const bool kept = philox((uint4)((uint)i, iteration, 1, 0), key).x >= threshold;
-    // Half widths grow as the root of r2.
+    // Half widths are proportional to the square root of r2.
     const real growth = kept ? sqrt(ellipse_r2(gain * opacity) / ellipse_r2(opacity)) : 0;
     store2(extents, i, growth * load2(extents, i));
     opacities[i] = kept ? gain * opacity : 0;

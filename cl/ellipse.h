@@ -15,24 +15,24 @@
 #define FMA8     fma
 #endif
 
-// r2 in the unit of 2 sigma, the slack of clsplat/constants.py included; not positive: the splat is
+// r2 in the unit of 2 sigma, including EXTENT_SLACK (clsplat/constants.py). If it is not positive, the splat is
 // invisible.
 static inline real ellipse_r2(real opacity) {
     return opacity > ALPHA_MIN ? (real)(2 / LOG2_E) * (logarithm(opacity) - (real)LOG2_ALPHA_MIN) + 2 * EXTENT_SLACK
                                : 0;
 }
 
-// r2 of eight splats. On CPUs a vector logarithm costs less than one scalar one.
+// r2 of eight splats. On CPUs a vector logarithm is faster than a scalar one.
 static inline real8 ellipse_r2_8(real8 opacity) {
     return opacity > (real8)ALPHA_MIN ? 2 * (OF8(log, opacity / ALPHA_MIN) + EXTENT_SLACK) : (real8)0;
 }
 
-// A splat's ellipse as its ranges need it; all that is expensive is done once.
+// Precomputed values of a splat's ellipse from which its ranges follow.
 typedef struct {
-    real x, y;                         // centre, px; what follows is relative to it
-    real half_height, inv_half_height; // 0 in the first: the splat is invisible
-    real at_right;                     // y of the rightmost point; the leftmost lies at -at_right
-    real slope, half_sq;               // a chord has its middle at slope y; at y = 0, the square of its half
+    real x, y;                         // centre, px; the other values are relative to it
+    real half_height, inv_half_height; // the first is 0 if the splat is invisible
+    real at_right;                     // y of the rightmost point; that of the leftmost is -at_right
+    real slope, half_sq;               // x of a chord's middle over y; square of half the chord at y = 0
     real unused;
 } Ellipse;
 
@@ -48,12 +48,12 @@ static inline Ellipse ellipse_of(real2 centre, real3 conic, real r2, real2 exten
     return e;
 }
 
-// Exact range x_min <= x <= x_max over the part of the ellipse with lo <= y <= hi, for eight bands; a lane of the result
-// is true where the ellipse meets the band, and elsewhere its range means nothing. The leftmost and rightmost points
-// lie at y = -+at_right; within the band an extreme is attained there or at the nearer border (Hanson et al. 2024,
-// "Speedy-Splat", AccuTile). With half_height^2 = r2 a/(a c - b^2) the determinant of the conic, which cancels for
-// needles, is not needed. Products that are added stand as fma: nothing is left for a compiler to contract in one
-// place and not in another, so that the same call gives the same bits wherever it is inlined.
+// Exact range x_min <= x <= x_max over the part of the ellipse with lo <= y <= hi, for eight bands. A lane of the
+// result is true if the ellipse meets the band; otherwise its range is undefined. The leftmost and rightmost points
+// lie at y = -+at_right. Within the band, an extreme lies there or at the nearer border (Hanson et al. 2024,
+// "Speedy-Splat", AccuTile). With half_height^2 = r2 a/(a c - b^2), the determinant of the conic, which cancels for
+// needles, is not needed. Sums of products are written as fma, so that the compiler cannot contract them in one place
+// only: the same call gives the same bits wherever it is inlined.
 static inline mask8 ellipse_ranges8(const Ellipse *e, real8 lo, real8 hi, real8 *x_min, real8 *x_max) {
     const real8 bottom = -e->half_height, top = e->half_height, zero = 0;
     lo = GREATER(lo, bottom);
@@ -72,22 +72,22 @@ static inline mask8 ellipse_ranges8(const Ellipse *e, real8 lo, real8 hi, real8 
     return lo <= hi;
 }
 
-// Indices [first, last] of the pixels in [0, size) whose centres lie in [lo, hi]; first > last: none.
+// Indices [first, last] of the pixels in [0, size) whose centres lie in [lo, hi]. If there are none, first > last.
 static inline int2 pixels_between(real lo, real hi, int size) {
-    // Clamped as reals: converting a real beyond int's range is undefined.
+    // Reals are clamped before the conversion: converting a real beyond the range of int is undefined.
     const int first = (int)ceil(clamp(lo - (real)0.5, (real)0, (real)size));
     const int last = (int)floor(clamp(hi - (real)0.5, (real)-1, (real)(size - 1)));
     return (int2)(first, last);
 }
 
-// The same for eight intervals, without a call to ceil or floor.
+// The same for eight intervals, without calls to ceil and floor.
 static inline void pixels_between8(real8 lo, real8 hi, int size, int8 *first, int8 *last) {
     const real8 zero = 0, end = size;
     lo -= (real)0.5;
     hi -= (real)0.5;
     lo = CLAMP(lo, zero, end);
     hi = CLAMP(hi, zero - 1, end - 1);
-    // Truncated, then put right: a vector's comparison is -1 where it is true.
+    // Truncate, then correct the result: a vector comparison is -1 where it is true.
     *first = INT8_OF(lo);
     const mask8 above = REAL8_OF(*first) < lo;
     *first -= INT8_OF(above);

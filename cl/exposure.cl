@@ -1,25 +1,26 @@
-// Stage exposure: an affine map of an image's colours, and gradients back.
+// Stage exposure: an affine map of an image's colours, and its gradients.
 //
-//   y = A x + b per pixel   (Rematas et al. 2022, "Urban radiance fields", section 3.2; Kerbl et al. 2024, "A hierarchical
-//                            3D Gaussian representation", has the same 3x4 matrix per photo)
+//   y = A x + b per pixel   (Rematas et al. 2022, "Urban radiance fields", section 3.2; Kerbl et al. 2024, "A
+//                            hierarchical 3D Gaussian representation", has the same 3x4 matrix per photo)
 //   v_x = A^T v_y,  v_A = sum of v_y x^T,  v_b = sum of v_y
-// A camera clips: where the photo is 255, y counts as 1 at most, where it is 0, as 0 at least, and there v_y is 0.
-// docs/stages/exposure.md; clsplat/reference/exposure.py is the twin.
+// A camera clips: y is clamped to at most 1 where the photo is 255, and to at least 0 where it is 0. There v_y is 0.
+// See docs/stages/exposure.md; clsplat/reference/exposure.py is the twin.
 //
-// Mapping: exposure_fwd has one work-item per pixel. In exposure_bwd work-item i has the pixels i first, i first + step,
-// ..., `count` of them at most: neighbours on a CPU (step 1), on a GPU as far apart as there are work-items, so that
-// those touch neighbours together. Sums have a fixed order: within a work-item, then over `parts`, on the host.
+// Mapping: exposure_fwd has one work-item per pixel. In exposure_bwd, work-item i has at most `count` pixels: i first,
+// i first + step, and so on. On a CPU they are adjacent (step 1). On a GPU, step is the number of work-items, so that
+// adjacent work-items access adjacent pixels. Sums have a fixed order: within a work-item, then over `parts`, on the
+// host.
 //
-// Buffers, P pixels: in image[P,3] (x), photo[P,3] uchar; out adjusted[P,3] (y); in and out v_image[P,3], v_y before and
-//   v_x after; out parts[work-items,12], the gradient of (A, b) row by row.
-// affine holds the rows of (A, b), four values each, and four that are not read.
+// Buffers, P pixels: in image[P,3] (x), photo[P,3] uchar; out adjusted[P,3] (y); in and out v_image[P,3], first v_y,
+//   then v_x; out parts[work-items,12], the gradient of (A, b) row by row.
+// affine holds the rows of (A, b), four values each, and four unused values.
 #include "common.h"
 
 static inline real3 mapped(const real16 affine, const real3 x) {
     return affine.s048 * x.x + affine.s159 * x.y + affine.s26a * x.z + affine.s37b;
 }
 
-// A channel beyond the end of the range at which the camera has clipped it.
+// True if a channel lies beyond the limit at which the camera has clipped the photo.
 static inline int beyond(const real y, const uchar photo) {
     return (photo == 255 && y > 1) || (photo == 0 && y < 0);
 }

@@ -1,21 +1,21 @@
-// Stage filter: Mip-Splatting's 3D smoothing filter. No Gaussian is thinner than what the training cameras can resolve.
+// Stage filter: Mip-Splatting's 3D smoothing filter. It widens Gaussians to the resolution of the training cameras.
 //
 //   Sigma' = Sigma + f^2 I,  opacity' = opacity sqrt(det Sigma / det Sigma'),  f^2 = FILTER_VARIANCE h^2
-// h is the smallest size of a pixel at the Gaussian, in world units, of all cameras that see it: max focal/depth there is
-// the highest rate at which the photos sample it (Yu et al. 2024, equations 6 to 9). Since f^2 I commutes with the
-// rotation this changes scales and opacity alone:
+// h is the smallest size of a pixel at the Gaussian, in world units, over all cameras that see it. The maximum of
+// focal/depth is the highest rate at which the photos sample it (Yu et al. 2024, equations 6 to 9). Since f^2 I
+// commutes with the rotation, only scales and opacity change:
 //   scale'^2 = scale^2 + f^2,  opacity' = opacity prod scale/scale'.
-// docs/stages/filter.md; clsplat/reference/filter.py is the twin.
+// See docs/stages/filter.md; clsplat/reference/filter.py is the twin.
 //
 // Mapping: one work-item per Gaussian.
 //
 // Buffers, N Gaussians: means[N,3] world, log_scales[N,3] ln(world), logit_opacities[N]
 //   pixel_sizes     in and out pixels[N] world, the smallest so far; one camera per launch
 //   filter_fwd      in pixels[N]; out filtered_log_scales[N,3], filtered_logit_opacities[N]
-//   filter_bwd      in pixels[N]; in and out v_log_scales[N,3], v_logit_opacities[N]: of the filtered ones, then of those
-//                   that were filtered
-// -DFILTER_VARIANCE  of the filter, in squared sizes of a pixel
-// -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  the camera's model (lens.h)
+//   filter_bwd      in pixels[N]; in and out v_log_scales[N,3], v_logit_opacities[N]: first the gradients with respect
+//                   to the outputs of filter_fwd, then those with respect to its inputs
+// -DFILTER_VARIANCE  variance of the filter, in squared sizes of a pixel
+// -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  camera model (lens.h)
 #include "common.h"
 #include "linalg.h"
 #include "power.h"
@@ -44,16 +44,16 @@ __kernel void pixel_sizes(const uint n, const Camera camera, const __global real
         pixels[i] = LESSER(pixels[i], lens_reach(&camera, p) / GREATER(camera.fx, camera.fy));
 }
 
-// 2^t, finite and not 0; NaN stays.
+// 2^t, clamped to finite positive values; NaN stays NaN.
 static inline real4 power(real4 t) {
     return t == t ? power4(CLAMP(t, (real4)POWER_MIN, (real4)(POWER_MAX - 1))) : t;
 }
 
-// A Gaussian under the filter. In logarithms, to base two, nothing overflows: scale'^2 = scale^2 (1 + 2^excess).
+// A filtered Gaussian. Logarithms to base two prevent overflow: scale'^2 = scale^2 (1 + 2^excess).
 typedef struct {
     real3 log_scales, kept; // ln(scale'), scale^2/scale'^2
-    real log2_factor, loss; // log2 and 1 less the factor on the opacity
-    real odds;              // 1/opacity - 1, of the opacity before
+    real log2_factor, loss; // log2 of the factor on the opacity, and 1 minus the factor
+    real odds;              // 1/opacity - 1 of the unfiltered opacity
 } Filtered;
 
 static inline Filtered filtered(real3 log_scales, real logit, real pixel) {

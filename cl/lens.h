@@ -1,13 +1,13 @@
-// Camera models: where a point of the camera's frame appears, with the Jacobian of the local affine approximation, and
+// Camera models: image position of a point in the camera's frame, the Jacobian of the local affine approximation, and
 // the vector-Jacobian product of both.
 //
-//   PINHOLE       u = fx x/z + cx; in the Jacobian alone x/z and y/z are clamped to the enlarged image
+//   PINHOLE       u = fx x/z + cx; only in the Jacobian, x/z and y/z are clamped to the enlarged image
 //   ORTHOGRAPHIC  u = fx x + cx, with fx in px per world unit
 //   FISHEYE       u = fx s x + cx, s = theta_d/rho, rho^2 = x^2 + y^2, theta = atan2(rho, z),
 //                 theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)   (Kannala and Brandt 2006,
 //                 equation 6, with the odd powers that OpenCV and COLMAP keep)
-// v likewise. Depth is z, but the distance |p| for FISHEYE, which sees beyond 90 degrees.
-// docs/stages/project.md derives the fisheye's second derivatives; clsplat/reference/lens.py is the twin.
+// v accordingly. The depth is z, except for FISHEYE, which sees beyond 90 degrees: there it is the distance |p|.
+// docs/stages/project.md derives the second derivatives of FISHEYE; clsplat/reference/lens.py is the twin.
 //
 // The file that includes this documents -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE.
 #ifndef CLSPLAT_LENS_H
@@ -27,7 +27,7 @@ static inline mat3 camera_rotation(const Camera *camera) {
 }
 
 typedef struct {
-    real2 slopes; // PINHOLE: x/z, y/z as clamped
+    real2 slopes; // PINHOLE: clamped x/z, y/z
     real3 j0, j1; // rows of the Jacobian, px per world unit
     real depth;   // world units
     real3 onward; // gradient of the depth
@@ -63,8 +63,8 @@ static inline Lens lens(const Camera *camera, real3 p) {
     return l;
 }
 
-// Gradient with respect to p; v_intrinsics receives those with respect to fx, fy, cx, cy. The slopes' own derivative is
-// 0 where they are clamped; fx times the limit is affine in cx and does not depend on fx.
+// Gradient with respect to p. v_intrinsics receives the gradients with respect to fx, fy, cx, cy. The derivative of a
+// clamped slope is 0. fx times the limit is affine in cx and does not depend on fx.
 static inline real3 lens_vjp(const Camera *camera, real3 p, const Lens *l, real2 v_centre, real3 v_j0, real3 v_j1,
                              real v_depth, real4 *v_intrinsics) {
     const real inv_z = 1 / p.z;
@@ -109,7 +109,8 @@ static inline real3 lens_vjp(const Camera *camera, real3 p, const Lens *l, real2
 
 #else
 
-// s and its derivatives, which are even in rho: ds = q (x dx + y dy) + h dz, and so on for q (by w and m) and h (by m, n).
+// s and its derivatives, which are even in rho: ds = q (x dx + y dy) + h dz; likewise for q (by w and m) and h (by
+// m, n).
 typedef struct {
     real s, q, h, w, m, n;
 } Radial;
@@ -119,7 +120,7 @@ static inline Radial radial(const Camera *camera, real3 p) {
     const real k1 = camera->k1, k2 = camera->k2, k3 = camera->k3, k4 = camera->k4;
     const real rho2 = p.x * p.x + p.y * p.y, z = p.z, inv_z = 1 / z, t = rho2 * inv_z * inv_z;
     // Near the axis the quotients below cancel, and 0/0 on it: four terms of s z as a power series in (rho/z)^2. At the
-    // switch they are as exact as the quotients in single precision, and far more so in double.
+    // switch they are as accurate as the quotients in single precision, and far more accurate in double precision.
     if (z > 0 && t < (real)1e-4) {
         const real a1 = k1 - (real)(1.0 / 3), a2 = k2 - k1 + (real)0.2;
         const real a3 = k3 - (real)(5.0 / 3) * k2 + (real)(14.0 / 15) * k1 - (real)(1.0 / 7);
@@ -190,7 +191,7 @@ static inline real3 lens_vjp(const Camera *camera, real3 p, const Lens *l, real2
 
 #endif
 
-// Size at p, in world units, of what is one unit wide in an image with a focal length of one unit; at a fisheye's axis.
+// Size at p, in world units, of one unit in an image with a focal length of one unit; for FISHEYE, on the axis.
 static inline real lens_reach(const Camera *camera, real3 p) {
 #if LENS == ORTHOGRAPHIC
     return 1;
@@ -199,7 +200,8 @@ static inline real lens_reach(const Camera *camera, real3 p) {
 #endif
 }
 
-// From where a Gaussian is seen, of any length: from the centre; under ORTHOGRAPHIC all are seen along the axis.
+// Direction from which a Gaussian is seen, not normalised: from the camera's centre, or for ORTHOGRAPHIC along the
+// axis.
 static inline real3 lens_offset(const Camera *camera, real3 mean) {
 #if LENS == ORTHOGRAPHIC
     return camera_rotation(camera).row2;

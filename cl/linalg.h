@@ -2,7 +2,7 @@
 // For y = f(x), f_vjp(x, v_y) returns v_x, the gradient with respect to x of a scalar whose gradient with
 // respect to y is v_y.
 //
-// dot3 and cross3 stand for the built-in functions, which not every driver inlines (common.h).
+// dot3 and cross3 replace built-in functions, which not every driver inlines (common.h).
 #ifndef CLSPLAT_LINALG_H
 #define CLSPLAT_LINALG_H
 

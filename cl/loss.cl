@@ -1,31 +1,31 @@
-// Stage loss: (1 - lambda) L1 + lambda (1 - SSIM) of an image against a photo, and its gradient.
+// Stage loss: (1 - lambda) L1 + lambda (1 - SSIM) of an image and a photo, and its gradient.
 //
 //   SSIM = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sxx + syy + C2))   (Wang et al. 2004, equation 13)
-// with Gaussian-weighted moments over an 11x11 window, zero padding and population variances; both terms are
-// means over all pixels and channels (Kerbl et al. 2023, equation 7). A mask weights image and photo alike
-// before either term. docs/stages/loss.md derives the gradient; clsplat/reference/loss.py is the twin.
+// with Gaussian-weighted moments over an 11x11 window, zero padding and population variances. Both terms are means
+// over all pixels and channels (Kerbl et al. 2023, equation 7). A mask weights both image and photo before either
+// term. docs/stages/loss.md derives the gradient; clsplat/reference/loss.py is the twin.
 //
-// How does it work? The window is separable, and a row of interleaved channels is 3 W values, in which its taps
-// lie 3 apart: neighbouring values make a vector, whatever their channels. A work-item walks down the rows of
-// its band, blurs each along the row, and keeps the blurred rows that the window spans in a ring, from which it
-// blurs along columns. So no moment leaves private memory.
-//   loss_ssim  blurs four moments of image x and photo y: mx, my, E[xx + yy] (SSIM needs the sum of the
-//              variances only), E[xy]; writes SSIM's derivatives by mx, E[xx], E[xy], and parts of the loss
+// The window is separable. A row of interleaved channels has 3 W values, in which the taps of the window are 3 apart,
+// so that adjacent values form a vector regardless of their channels. A work-item goes down the rows of its band. It
+// blurs each along the row, and keeps the blurred rows that the window spans in a ring, from which it blurs along
+// columns. So the moments stay in private memory.
+//   loss_ssim  blurs four moments of image x and photo y: mx, my, E[xx + yy] (SSIM only needs the sum of the
+//              variances), E[xy]; writes the derivatives of SSIM by mx, E[xx], E[xy], and parts of the loss
 //   loss_sum   adds up the parts
-//   loss_grad  blurs the derivatives (the window is symmetric: its own adjoint), combines them to v_image
-// Mapping: loss_ssim and loss_grad have one work-item for VECTORS neighbouring vectors of LANES values in a band
-// of `band` rows, from MARGIN values before each row to at least MARGIN values behind it; loss_sum is one
-// work-group. Sums have a fixed order: within a work-item, then a work-group (a tree), then loss_sum.
+//   loss_grad  blurs the derivatives (the symmetric window is its own adjoint), and combines them to v_image
+// Mapping: loss_ssim and loss_grad have one work-item for VECTORS adjacent vectors of LANES values in a band of `band`
+// rows. Together they cover each row, MARGIN values before it, and at least MARGIN values after it. loss_sum is one
+// work-group. Sums have a fixed order: within a work-item, then in a work-group (as a tree), then in loss_sum.
 //
-// Buffers: image[H,W,3], photo[H,W,3] u8, mask[H,W] u8 (0 or 1; not read where masked is 0), v_image[H,W,3];
-//   derivatives[H,3,pitch], where a row begins with the margin, and loss_ssim fills the margins with zeros, so
-//   that loss_grad needs no guards; parts: one per work-group of loss_ssim; loss[1].
+// Buffers: image[H,W,3], photo[H,W,3] u8, mask[H,W] u8 (0 or 1; not read if masked is 0), v_image[H,W,3];
+//   derivatives[H,3,pitch], whose rows begin with the margin; loss_ssim fills the margins with zeros, so that
+//   loss_grad needs no bounds checks; parts, one per work-group of loss_ssim; loss[1].
 // -DSSIM_C1, -DSSIM_C2     stabilisers
 // -DSSIM_TAPS=w0,w1,..     the 2 RADIUS + 1 weights of the window
 // -DRADIUS                 half width of the window, px, 1 or more
-// -DLANES=1|16             values per vector: 16 on CPUs, 1 on GPUs, whose work-items touch neighbours together
-// -DVECTORS                vectors per work-item, 1 where LANES is 1
-// -DGROUP                  largest work-group; work-groups are powers of two wide
+// -DLANES=1|16             values per vector: 16 on CPUs; 1 on GPUs, so that work-items access adjacent values
+// -DVECTORS                vectors per work-item; 1 if LANES is 1
+// -DGROUP                  size of the largest work-group; sizes are powers of two
 #include "common.h"
 
 #if !defined(SSIM_C1) || !defined(SSIM_C2) || !defined(SSIM_TAPS) || !defined(RADIUS)
@@ -46,7 +46,7 @@
 
 #define WINDOW (2 * RADIUS + 1)
 
-// Of each row a work-item fetches FETCHED values, STEP apart; those for tap k of its first vector begin at TAP(k).
+// A work-item loads FETCHED values of each row, STEP apart. Those for tap k of its first vector begin at TAP(k).
 #if LANES == 1
 typedef real reals;
 #define INDICES          0
@@ -63,7 +63,7 @@ typedef real16 reals;
 #define FETCHED          (VECTORS * LANES + 2 * MARGIN)
 #define TAP(k)           (MARGIN + 3 * ((k)-RADIUS))
 
-// The vector at any address. PoCL 3.0 calls vload16 and vstore16 as functions, which doubled the time of loss_grad.
+// The vector at any address. PoCL 3.0 calls vload16 and vstore16 as functions, which doubles the time of loss_grad.
 typedef struct __attribute__((packed)) {
     reals v;
 } Vector;
@@ -83,7 +83,7 @@ static inline reals load_photo(const __global uchar *photo) {
 #endif
 
 __constant real taps[WINDOW] = {SSIM_TAPS};
-// From entry 2 RADIUS - newest on: the taps in the order in which their rows lie in a ring.
+// Beginning with entry 2 RADIUS - newest, the taps in the order of their rows in a ring.
 __constant real turned_taps[2 * WINDOW] = {SSIM_TAPS, SSIM_TAPS};
 
 static inline real sum_lanes(reals v) {
@@ -109,7 +109,7 @@ static inline real sum_group(real value, __local real *sums) {
     return sums[i];
 }
 
-// Image and photo from a column on, where a row has `length` values: masked, 0 beside the image.
+// Image and photo, beginning with a column, for rows of `length` values: masked, and 0 outside of the image.
 static inline void fetch(int length, int row, int column, const __global real *image, const __global uchar *photo,
                          int masked, const __global uchar *mask, real *x, real *y) {
     const size_t begin = (size_t)row * length;
@@ -174,7 +174,7 @@ static inline reals differentiate(Moments m, Derivatives *d) {
     return 1 - ssim;
 }
 
-// 0 in lanes beside the image.
+// 0 in lanes outside of the image.
 static inline reals inside(int length, int column, reals v) {
     const reals columns = INDICES + (reals)column;
     return columns >= 0 && columns < (reals)length ? v : (reals)0;
@@ -202,7 +202,7 @@ __kernel void loss_ssim(const int width, const int height, const int band, const
             const int c = column + v * LANES, centre = TAP(RADIUS) + v * LANES;
             if (row >= begin && row < end) {
                 const reals difference = VECTOR(const, x + centre) - VECTOR(const, y + centre);
-                l1 += difference < 0 ? -difference : difference; // both are 0 beside the image
+                l1 += difference < 0 ? -difference : difference; // both are 0 outside of the image
             }
             if (row - RADIUS < begin)
                 continue;

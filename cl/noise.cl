@@ -1,17 +1,17 @@
-// Stage noise: a random walk of the means that explores along each Gaussian's own shape.
+// Stage noise: a random walk of the means, shaped by the covariance of each Gaussian.
 //
 //   mean += size gate(opacity) Sigma eta,  Sigma = R S S^T R^T,  eta ~ N(0, I)          (Kheradmand et al. 2024,
 //   gate(o) = 1 / (1 + exp(GATE_SLOPE (o - GATE_OPACITY)))                               equation 8 and section 3.2)
-// eta comes from Philox4x32-10 (Salmon et al. 2011, section 3.3), whose counter is the Gaussian's index and the
-// iteration: the same integers on every device, without a state. docs/stages/noise.md; clsplat/reference/noise.py is
-// the twin.
+// eta comes from Philox4x32-10 (Salmon et al. 2011, section 3.3). Its counter is the Gaussian's index and the
+// iteration, so that the integers are the same on every device, without a state. See docs/stages/noise.md;
+// clsplat/reference/noise.py is the twin.
 //
 // Mapping: one work-item per Gaussian.
 //
 // Buffers, N Gaussians: in log_scales[N,3] ln(world), quats[N,4], logit_opacities[N]; in and out means[N,3] world
 //
-// -DGATE_SLOPE    of the gate, against opacity
-// -DGATE_OPACITY  at which the gate is one half
+// -DGATE_SLOPE    slope of the gate by the opacity
+// -DGATE_OPACITY  opacity at which the gate is one half
 #include "common.h"
 #include "linalg.h"
 #include "philox.h"
@@ -26,7 +26,7 @@ DEFINE_POWER(4)
 // Three independent standard normal numbers (Box and Muller 1958).
 static inline real3 normals(uint4 bits) {
     const real4 u = ((real4)((real)bits.x, (real)bits.y, (real)bits.z, (real)bits.w) + (real)0.5) *
-                    (real)2.3283064365386963e-10; // 2^-32: above 0, and 1 at most
+                    (real)2.3283064365386963e-10; // 2^-32: u is above 0 and at most 1
     const real2 radii = sqrt((real)(-2 / LOG2_E) * (real2)(logarithm(u.x), logarithm(u.z)));
     return radii.xxy * cospi((real)2 * (real4)(u.y, u.y - (real)0.25, u.w, 0)).xyz;
 }

@@ -1,8 +1,8 @@
-// Stage observe: what densification wants to know about each Gaussian, added up over iterations.
+// Stage observe: statistics of each Gaussian for densification, added up over iterations.
 //
-//   grad_sum += |(v_mean2d.x W/2, v_mean2d.y H/2)|,   seen += 1 where the Gaussian is visible
-// The positional gradient counts in normalised device coordinates, of which one unit is half the image (Kerbl et al.
-// 2023, section 5.2, and the original code). docs/stages/observe.md; clsplat/reference/observe.py is the twin.
+//   grad_sum += |(v_mean2d.x W/2, v_mean2d.y H/2)|,   seen += 1 if the Gaussian is visible
+// The positional gradient is in normalised device coordinates, in which one unit is half of the image (Kerbl et al.
+// 2023, section 5.2, and the original code). See docs/stages/observe.md; clsplat/reference/observe.py is the twin.
 //
 // Mapping: one work-item per Gaussian.
 //

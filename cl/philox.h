@@ -1,5 +1,5 @@
 // Philox4x32-10 (Salmon et al. 2011, section 3.3): four random integers from a counter, without a state. Stages that
-// draw for the same Gaussian in the same iteration differ in the counter's third word.
+// draw for the same Gaussian in the same iteration use different third words of the counter.
 #ifndef CLSPLAT_PHILOX_H
 #define CLSPLAT_PHILOX_H
 

@@ -1,13 +1,14 @@
-// Powers of two and logarithms to base two. In single precision they take the place of exp2 and log2, which cost a call
-// on drivers that do not inline them (common.h) and twice as much where they do.
+// Powers of two and logarithms to base two. In single precision they replace exp2 and log2, which are calls on drivers
+// that do not inline them (common.h), and take twice as long on drivers that do.
 #ifndef CLSPLAT_POWER_H
 #define CLSPLAT_POWER_H
 
 #define LOG2_E 1.4426950408889634
 
-// DEFINE_POWER(N) defines powerN on vectors of N: 2^t for POWER_MIN <= t <= POWER_MAX, the last being infinity, and
-// anything beyond. In single precision 2^(t - round(t)) is the polynomial of degree 5 with the least largest relative
-// error, 7.5e-8, and the rest goes into the exponent; adding 1.5 * 2^23 leaves the bits of round(t) at the end.
+// DEFINE_POWER(N) defines powerN on vectors of N: 2^t for POWER_MIN <= t <= POWER_MAX. The result at POWER_MAX is
+// infinity; beyond these limits it is undefined. In single precision, 2^(t - round(t)) is the polynomial of degree 5
+// with the smallest maximal relative error, 7.5e-8, and round(t) is added to the exponent. Adding 1.5 * 2^23 to t
+// leaves round(t) in the last bits.
 #ifdef USE_DOUBLE
 #define POWER_MIN -1022
 #define POWER_MAX 1024
@@ -32,8 +33,8 @@
     }
 #endif
 
-// log2(x) for normal x > 0, anything elsewhere. In single precision, with x = 2^e m and m from sqrt(1/2) to sqrt(2), e
-// and ln m = 2 (s + s^3/3 + s^5/5 + ...), s = (m - 1)/(m + 1), whose first term left out is below 2e-9.
+// log2(x) for normal x > 0; otherwise undefined. In single precision, x = 2^e m with m from sqrt(1/2) to sqrt(2), and
+// ln m = 2 (s + s^3/3 + s^5/5 + ...) with s = (m - 1)/(m + 1). The first omitted term is below 2e-9.
 static inline real logarithm(real x) {
 #ifdef USE_DOUBLE
     return log2(x);

@@ -1,12 +1,12 @@
-// Stage project: Gaussians to splats, and gradients back.
+// Stage project: projects Gaussians to splats, and propagates gradients back.
 //
-// Computes for each Gaussian its centre in the image, the inverse of its 2D covariance (EWA splatting with
-// the local affine approximation J of the projection), its depth, the half widths of the box outside which
-// alpha < ALPHA_MIN, its opacity and its colour:
+// Computes for each Gaussian its centre in the image, the inverse of its 2D covariance (EWA splatting with the local
+// affine approximation J of the projection), its depth, the half widths of the box outside of which alpha < ALPHA_MIN,
+// its opacity and its colour:
 //   cov2d = J W Sigma W^T J^T + BLUR I,  Sigma = R S S^T R^T          (Kerbl et al. 2023, equations 5 and 6)
 //   colour = max(SH(direction) + 1/2, 0)                               (original code)
 //   antialiased: opacity * sqrt(det(cov2d - BLUR I)/det(cov2d))        (Yu et al. 2024, "Mip-Splatting", equation 10)
-// and, where pixels are sorted one by one, the disparity 1/z at which a pixel's ray meets it (project_disparities).
+// If each pixel is sorted, also the disparity 1/z at which the ray of a pixel meets it (project_disparities).
 // docs/stages/project.md derives the gradients; clsplat/reference/project.py is the float64 twin.
 //
 // Mapping: one work-item per Gaussian, no local memory except for CAMERA_GRAD.
@@ -20,10 +20,10 @@
 //   v_x  is the gradient with respect to x; v_camera[groups,16] holds a partial sum per work-group of the gradient
 //        with respect to rotation (9, row-major), translation (3) and fx, fy, cx, cy.
 //
-// -DCHANNELS=3|4      4: the depth is composited beside RGB
-// -DANTIALIASED=0|1   opacity compensation
-// -DCAMERA_GRAD=0|1   the backward kernels also write v_camera; needs -DGROUP, the work-group size
-// -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  the camera's model (lens.h)
+// -DCHANNELS=3|4      4: the depth is composited as a fourth channel
+// -DANTIALIASED=0|1   1: opacity compensation
+// -DCAMERA_GRAD=0|1   1: the backward kernels also write v_camera; requires -DGROUP, the work-group size
+// -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  camera model (lens.h)
 #include "common.h"
 #include "adam.h"
 #include "ellipse.h"
@@ -43,10 +43,10 @@
 #error "-DCAMERA_GRAD=1 needs -DGROUP, the work-group size of the backward kernels"
 #endif
 
-// What forward and backward both need of one Gaussian.
+// Intermediate values of one Gaussian for the forward and the backward pass.
 typedef struct {
     real3 p;         // centre, camera frame
-    Lens lens;       // there: J and the depth
+    Lens lens;       // J and the depth at the centre
     mat3 rotation;   // of the Gaussian
     real3 scales;    // standard deviations, world units
     real3 t0, t1;    // rows of J W
@@ -135,7 +135,7 @@ static inline real2 compensation_vjp(real det0, real det, real v_factor) {
 
 DEFINE_POWER(4)
 
-// Scales in x, y, z and the opacity in w; too large becomes infinity, too small the least normal number, NaN stays.
+// Scales in x, y, z and the opacity in w. Overflow gives infinity, underflow the smallest normal number; NaN stays NaN.
 static inline real4 activate(real3 log_scales, real logit_opacity) {
     const real4 t = (real)LOG2_E * (real4)(log_scales, -logit_opacity);
     real4 e = t == t ? power4(CLAMP(t, (real4)POWER_MIN, (real4)POWER_MAX)) : t;
@@ -175,7 +175,7 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
     for (int k = 0; k < (sh_degree + 1) * (sh_degree + 1); ++k)
         color += basis[k] * load3(sh, i * sh_stride + k);
 
-    // Zero times infinity is NaN: one test finds what is not finite in any term.
+    // 0 times infinity is NaN, so that one test detects values that are not finite in any term.
     const real any =
         norm2 + f.det + f.lens.depth + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
     bool visible = 0 * any == 0 && lens_sees(&camera, f.p) && norm2 >= QUAT_NORM2_MIN && r2 > 0;
@@ -196,11 +196,11 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
 #endif
 }
 
-// Where along the ray of a pixel is a Gaussian densest? In the local affine approximation depth and image position are
-// jointly normal: given a pixel at d from the centre, the depth is densest at its conditional mean
+// Depth of a Gaussian's maximum along the ray of a pixel. In the local affine approximation, depth and image position
+// are jointly normal. For a pixel at d from the centre, the maximum is at the conditional mean of the depth,
 //   z + g.d,   g = cov2d^-1 (J W Sigma W^T e_z).
-// The disparity 1/z of a plane is affine in the image, so 1/z - (g/z^2).d has the same value and slope at the centre and
-// is exact for discs (cf. Radl et al. 2024, "StopThePop", equation 10, which is that of the Gaussian without blur).
+// The disparity 1/z of a plane is affine in the image. 1/z - (g/z^2).d has the same value and slope at the centre, and
+// is exact for discs (cf. Radl et al. 2024, "StopThePop", equation 10, for the Gaussian without blur).
 __kernel void project_disparities(const uint n, const Camera camera, const __global real *means,
                                   const __global real *log_scales, const __global real *quats,
                                   const __global real *extents, const __global real *conics,
@@ -217,15 +217,15 @@ __kernel void project_disparities(const uint n, const Camera camera, const __glo
                     conic = load3(conics, i);
         const real xz = dot3(f.b0, b2), yz = dot3(f.b1, b2), inv_z = 1 / f.lens.depth;
         const real2 slope = -inv_z * inv_z * (real2)(conic.x * xz + conic.y * yz, conic.y * xz + conic.z * yz);
-        // What is not finite at some pixel has no order.
+        // Disparities that are not finite at some pixel have no order.
         const bool finite = 0 * (slope.x * extents[2 * i] + slope.y * extents[2 * i + 1]) == 0;
         disparity = (real3)(inv_z, finite ? slope : (real2)0);
     }
     store3(disparities, i, disparity);
 }
 
-// Gradients of one visible Gaussian, those with respect to its spherical harmonics as factors: of coefficient k,
-// basis[k] color.
+// Gradients of one visible Gaussian. Those with respect to its spherical harmonics are given by factors: the gradient
+// of coefficient k is basis[k] color.
 typedef struct {
     FootprintGrad geometry;
     real logit_opacity;
@@ -263,7 +263,7 @@ static inline GaussianGrad gaussian_vjp(size_t i, const Camera *camera, int sh_s
     v.geometry = footprint_vjp(camera, &f, mean, unit_quat, v_cov, load2(splats.v_means2d, i), v_depth);
     v.geometry.quat = normalize_quat_vjp(quat, v.geometry.quat);
 
-    // Colour; where it is clamped at 0 nothing passes.
+    // Colour. If it is clamped at 0, its gradient is 0.
     const __global real *color = splats.colors + CHANNELS * i, *v_color = splats.v_colors + CHANNELS * i;
     v.color.x = color[0] > 0 ? v_color[0] : 0;
     v.color.y = color[1] > 0 ? v_color[1] : 0;
@@ -288,7 +288,7 @@ static inline GaussianGrad gaussian_vjp(size_t i, const Camera *camera, int sh_s
     v.geometry.view.row2 += v_translation.z * position;
 #endif
 
-    // What overflows would make Adam's moments NaN for good: such a Gaussian gets no gradient from this view.
+    // Gradients that overflow would make Adam's moments NaN permanently: they are set to 0 for this view.
     const real3 sum = v.geometry.mean + v.geometry.log_scales + v.geometry.p + v.geometry.quat.xyz + v.color +
                       v.geometry.view.row0 + v.geometry.view.row1 + v.geometry.view.row2;
     real any = sum.x + sum.y + sum.z + v.geometry.quat.w + v.logit_opacity;

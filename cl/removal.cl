@@ -1,33 +1,35 @@
-// Stage removal: what becomes of the squared error of an image if one splat alone is removed, or changes its colour.
+// Stage removal: change of an image's squared error if a single splat is removed, or changes its colour.
 //
-// In a pixel splat i has the weight w = alpha T and colour c; S is what of the image lies behind it, background
-// included. Without it the image is less by
-//   D = w c - S alpha/(1 - alpha) = w (c - B),   B = S/(T (1 - alpha)), the colour that would be seen in its place,
-// and the sum of squared errors more by sum_pixels |D|^2 - 2 r.D, with r = image - target. Another colour c + d changes
-// it by sum_pixels w^2 |d|^2 + 2 w r.d. docs/stages/removal.md; clsplat/reference/removal.py is the twin.
+// In a pixel, a splat has the weight w = alpha T and the colour c. S is the part of the image that lies behind it,
+// background included. Removing the splat reduces the image by
+//   D = w c - S alpha/(1 - alpha) = w (c - B),   where B = S/(T (1 - alpha)) is the colour visible in its place,
+// and increases the sum of squared errors by sum_pixels |D|^2 - 2 r.D, with r = image - target. Another colour c + d
+// changes it by sum_pixels w^2 |d|^2 + 2 w r.d. See docs/stages/removal.md; clsplat/reference/removal.py is the twin.
 //
-// Without the splat a pixel goes on to what lies beyond its stop: here pixels stop only where the transmittance would
-// fall to (1 - ALPHA_MAX) TRANSMITTANCE_MIN, so that S/(1 - alpha) misses no more than a pixel's stop leaves out.
+// Without the splat, a pixel would continue beyond its stop. Therefore pixels stop here only where the transmittance
+// would fall to (1 - ALPHA_MAX) TRANSMITTANCE_MIN. So S/(1 - alpha) omits no more than the stop of a pixel omits in an
+// image.
 //
-// Mapping: one work-item per tile, its pixels in blocks (composite_blocks.h). A first pass over its splats sums up the
-// colour, of which a second one, front to back as well, takes away each splat's part to find what is behind: nothing is
-// divided by a transmittance, and alpha/(1 - alpha) is at most 99. A splat's sums over the tile go, as a record, to its
-// slot of the unsorted list; removal_sum adds a splat's records in a fixed order, one work-item per splat: no atomics.
-// It runs once per view in a pruning of many rounds, not in training: one variant serves all devices.
+// Mapping: one work-item per tile, with its pixels in blocks (composite_blocks.h). A first pass over the splats sums up
+// the colours. A second pass, also from front to back, subtracts the part of each splat to find what is behind it. So
+// nothing is divided by a transmittance, and alpha/(1 - alpha) is at most 99. The sums of a splat over the tile are
+// written, as a record, to the splat's slot in the unsorted list. removal_sum adds up the records of a splat in a fixed
+// order, with one work-item per splat and without atomics. There is one variant for all devices, because the stage runs
+// once per view in a pruning of many rounds, and not in training.
 //
 // Buffers: N, M, T, C and splats as in composite_cpu.cl, order[N], first_slots[N+1], slots[M] as in bin.cl
 //   in   splats[N], gauss_ids[M], tile_ranges[T,2], slots[M], background[C]; residuals[H,W,C], image - target;
 //        mask[H,W] uchar, 1 where pixels count
 //   out  records[M,4+C]; sums[N,4+C]: change of the squared error, sums of |D|^2, of w, of w^2, of w r
 // -DTILE=8|16   edge of a tile, px
-// -DCHANNELS    colour channels, 1 or more
-// -DLANES=8|16  pixels of a block
+// -DCHANNELS    number of colour channels, 1 or more
+// -DLANES=8|16  number of pixels of a block
 #include "common.h"
 #include "composite_blocks.h"
 
 #define STOP ((real)(TRANSMITTANCE_MIN * (1 - ALPHA_MAX)))
 
-// Reals of a record.
+// Number of reals of a record.
 #define SUMS (4 + CHANNELS)
 
 __kernel void removal(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,

@@ -1,14 +1,14 @@
-// What the device can do at best: micro-benchmarks of `clsplat bench kernels`, no stage of the pipeline.
+// Micro-benchmarks of `clsplat bench kernels` that measure the limits of the device. This is not a stage.
 //
-//   roof_fma, roof_exp, roof_exp2   arithmetic on CHAINS values per work-item, none waiting for another
+//   roof_fma, roof_exp, roof_exp2   arithmetic on CHAINS independent values per work-item
 //   roof_copy, roof_triad           y = a; y = a + factor b
-//   roof_empty                      nothing: what remains is the launch
+//   roof_empty                      no work, to measure the launch
 //
-// Mapping: a work-item keeps its values in registers for `rounds` rounds, or moves `count` vectors, those
-// first, first + step, ... of the buffers: a piece of its own on a CPU, neighbours of other work-items' on a GPU.
-// The recurrences converge to a number of the order of 1 whatever they start from, and their results are
-// stored: no compiler can leave the work out, and none of it meets infinities or denormal numbers.
-// Without the order to unroll PoCL keeps the values in memory, at a quarter of the speed.
+// Mapping: a work-item keeps its values in registers for `rounds` rounds, or moves the `count` vectors first,
+// first + step, ... of the buffers. On a CPU these are adjacent; on a GPU, adjacent work-items have adjacent vectors.
+// The recurrences converge to a number of the order of 1 from any start, and their results are stored. So a compiler
+// cannot remove the work, and there are no infinities or denormal numbers.
+// Without the pragma to unroll, PoCL keeps the values in memory, at a quarter of the speed.
 //
 // Buffers: out[items,WIDTH]; a, b, y[items count,WIDTH]
 // -DWIDTH=1|4|16   width of the vectors
@@ -39,7 +39,7 @@
 #define FUNCTION(f, x) f(x)
 #endif
 
-// Two multiply-adds a cycle that take four cycles each need eight at least; PoCL's exp gains up to 12.
+// Two multiply-adds per cycle with a latency of four cycles need at least eight values. PoCL's exp gains up to 12.
 #define CHAINS 16
 
 static inline void start(REALV *x) {

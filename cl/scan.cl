@@ -1,14 +1,14 @@
 // Stage scan: exclusive prefix sum of unsigned integers.
 //
 //   out[i] = sum of in[0 .. i-1] for i = 0 .. n; out[n] is the total.
-//   Where the total exceeds 2^32 - 1, out is undefined; sums[P] holds the true total, for the host to check.
+//   If the total exceeds 2^32 - 1, out is undefined. sums[P] holds the true total, which the host checks.
 //
-// How does it work? Reduce, then scan (OpenCL promises no forward progress between work-groups, so no
-// look-back): work-item p of P owns the contiguous chunk [p ceil(n/P), (p+1) ceil(n/P)).
+// Algorithm: reduce, then scan. Look-back is not possible, because OpenCL does not guarantee forward progress between
+// work-groups. Work-item p of P has the contiguous chunk [p ceil(n/P), (p+1) ceil(n/P)).
 //   scan_reduce  work-item p writes the sum of its chunk to sums[p]                          (P work-items)
 //   scan_spine   one work-group turns sums into exclusive prefix sums, the total in sums[P]  (GROUP work-items)
 //   scan_down    work-item p rewrites its chunk as prefix sums that start at sums[p]         (P work-items)
-// P is small on a CPU (a few chunks per core) and thousands on a GPU; it changes nothing in the result.
+// P is small on a CPU (a few chunks per core) and in the thousands on a GPU. It does not affect the result.
 //
 // Buffers: in[n] u32, sums[P + 1] u64, out[n + 1] u32.
 // -DGROUP   work-group size of scan_spine, at least 1

@@ -41,7 +41,7 @@ static inline void sh_basis(real3 d, int degree, real *basis) {
     }
 }
 
-// Gradient with respect to d, its three components taken as independent; v holds the gradients of the basis.
+// Gradient with respect to the three components of d as independent variables. v holds the gradients of the basis.
 static inline real3 sh_basis_vjp(real3 d, int degree, const real *v) {
     const real x = d.x, y = d.y, z = d.z;
     real3 v_d = 0;

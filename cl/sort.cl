@@ -2,7 +2,7 @@
 //
 //   order is the permutation that sorts keys; equal keys keep their order.
 //
-// Two algorithms, one result:
+// Two algorithms with the same result:
 //
 // Radix sort, least significant digit first (reduce, then scan). The n keys are cut into `groups` blocks,
 // block g into GROUP runs of contiguous keys, one per work-item. A pass over one digit of DIGIT_BITS bits:
@@ -11,14 +11,14 @@
 //   (stage scan)  turns the histogram, digit-major, into the position of each block's first key of each digit
 //   sort_scatter  counts again if there are several runs, turns the counts into positions, and writes keys and
 //                 values in order
-// With GROUP = 1 a block is a sequential counting sort, which is what a CPU core does best; on a GPU a block
-// is a work-group. Runs are in the order of work-items, blocks in the order of groups: stable.
+// With GROUP = 1 a block is a sequential counting sort, which is fastest on a CPU core; on a GPU a block is a
+// work-group. Runs are in the order of work-items and blocks in the order of groups, so that the sort is stable.
 //
-// Bitonic sort of up to BITONIC keys by one work-group in local memory (Batcher 1968), for short lists. It is
-// not stable by itself: the comparison of (key, position) makes it so.
+// Bitonic sort of up to BITONIC keys by one work-group in local memory (Batcher 1968), for short lists. It compares
+// pairs (key, position), which makes it stable.
 //
-// Segments of an array are sorted by a work-group each, short ones by the bitonic sort, longer ones by passes as above
-// within the work-group: sort_short_segments, sort_long_segments. Each leaves the other's segments alone.
+// Segments of an array are sorted by one work-group each: short ones by the bitonic sort (sort_short_segments), longer
+// ones by passes as above within the work-group (sort_long_segments). Each kernel ignores the segments of the other.
 //
 // Buffers: keys_in[n], values_in[n] (not read where use_positions is 1: the positions 0 to n - 1 instead),
 //          keys_out[n], values_out[n], histogram[2^DIGIT_BITS, groups], offsets[2^DIGIT_BITS * groups + 1] its
@@ -58,7 +58,7 @@ static inline uint digit_of(sort_key key, uint shift) {
     return (uint)(key >> shift) & (DIGITS - 1);
 }
 
-// First key of the run of work-item `lane` of block g; its end is the begin of the next lane.
+// First key of the run of work-item `lane` of block g. The run ends where that of the next lane begins.
 static inline uint run_begin(uint n, uint groups, uint g, uint lane) {
     const uint run = (n + groups * GROUP - 1) / (groups * GROUP);
     return min(n, (g * GROUP + lane) * run);
@@ -92,7 +92,7 @@ __kernel void sort_scatter(const uint n, const uint groups, const uint shift, co
                            const __global sort_key *keys_in, const __global uint *values_in,
                            const __global uint *offsets, __global sort_key *keys_out, __global uint *values_out) {
     __local uint positions[DIGITS * GROUP];
-#if GROUP > 1 // else the offsets of the block are those of its only run
+#if GROUP > 1 // otherwise the offsets of the block are those of its only run
     count_digits(n, groups, shift, keys_in, positions);
 #else
     for (uint d = 0; d < DIGITS; ++d)
@@ -143,7 +143,7 @@ static inline void bitonic(uint size, __local sort_key *keys, __local uint *valu
 static inline void bitonic_load(uint n, uint size, const __global sort_key *keys_in, __local sort_key *keys,
                                 __local uint *values) {
     for (uint i = get_local_id(0); i < size; i += BITONIC_GROUP) {
-        // Padding sorts last: no key is larger, and its position breaks the tie with a largest key.
+        // Padding is last: no key is larger, and its position decides the tie with a key of the same value.
         keys[i] = i < n ? keys_in[i] : KEY_MAX;
         values[i] = i;
     }
@@ -168,7 +168,7 @@ __kernel void sort_short_segments(const uint use_positions, const __global uint 
     __local sort_key keys[BITONIC];
     __local uint values[BITONIC];
     const uint begin = ranges[2 * get_group_id(0)], length = ranges[2 * get_group_id(0) + 1] - begin;
-    const uint n = length <= BITONIC ? length : 0; // longer: not for this kernel
+    const uint n = length <= BITONIC ? length : 0; // the other kernel sorts longer segments
     uint size = 1;
     while (size < n)
         size *= 2;
@@ -180,7 +180,8 @@ __kernel void sort_short_segments(const uint use_positions, const __global uint 
     }
 }
 
-// Passes over one segment, between the outputs and the spare arrays so that the last one ends in the outputs.
+// Passes over one segment, which alternate between the outputs and the spare arrays, so that the last one writes the
+// outputs.
 __kernel void sort_long_segments(const uint use_positions, const uint bits, const __global uint *ranges,
                                  const __global sort_key *keys_in, const __global uint *values_in,
                                  __global sort_key *keys_out, __global uint *values_out,
@@ -204,7 +205,7 @@ __kernel void sort_long_segments(const uint use_positions, const uint bits, cons
         for (uint i = from; i < to; ++i)
             ++counts[digit_of(keys[i], shift) * GROUP + lane];
         barrier(CLK_LOCAL_MEM_FENCE);
-        // Counts, digit by digit and lane by lane, become positions: each lane takes DIGITS of them.
+        // Turns counts, ordered by digit and then by lane, into positions. Each lane takes DIGITS of them.
         uint total = 0;
         for (uint k = lane * DIGITS; k < (lane + 1) * DIGITS; ++k)
             total += counts[k];
