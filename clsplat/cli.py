@@ -15,7 +15,7 @@ from clsplat.commands.compact import Compact
 from clsplat.commands.console import warn
 from clsplat.commands.files import Devices, Export, Frames, Sfm
 from clsplat.commands.info import Info
-from clsplat.commands.pictures import Eval, Render
+from clsplat.commands.rendering import Eval, Render
 from clsplat.commands.train import Demo, Train
 from clsplat.commands.viewing import View
 from clsplat.errors import ClsplatError, InputError, driver_errors

@@ -21,6 +21,7 @@ from clsplat.formats import save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr
 from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.training.presets import load_preset, with_settings
 
 ITERATIONS = 12
@@ -201,14 +202,14 @@ class TestOneTraining:
             quality, "time", SimpleNamespace(perf_counter=lambda: clock.now, process_time=lambda: clock.now)
         )
 
-        def renderings(gaussians, cameras, *_, **__):
+        def renderings(renderer, gaussians, cameras):
             for i, _ in enumerate(cameras):
                 # The first round is slow, and so are a few later ones.
                 clock.now += 7.0 if i < len(scene.test) or i % 4 == 0 else 0.25
                 yield object()
 
-        monkeypatch.setattr(quality, "render_views", renderings)
-        assert quality.frames_per_second(None, scene.test, cell.config, device) == 4.0
+        monkeypatch.setattr(quality, "renderings", renderings)
+        assert quality.frames_per_second(None, scene.test, Renderer(device)) == 4.0
 
 
 class TestBench:
@@ -280,7 +281,7 @@ class TestBench:
         by_scene = {}
         for r in read_records(path):
             by_scene.setdefault(r["scene"], []).append(r)
-        assert [r["failed"].startswith("corrupt/3.png: expected") for r in by_scene["corrupt"]] == [True, True]
+        assert [r["failed"].startswith("cannot read corrupt/3.png: ") for r in by_scene["corrupt"]] == [True, True]
         assert ["found none" in r["failed"] for r in by_scene["empty"]] == [True, True]
         assert ["held-out" in r["failed"] for r in by_scene["one:test_every=0"]] == [True, True]
         assert sum("fps" in r for r in by_scene["one"]) == 2

@@ -24,7 +24,7 @@ def test_black_objects_stay_opaque(device, tmp_path, cut_out):
     if not cut_out:
         scene = replace(scene, train=[replace(view, clear=None) for view in scene.train])
     for data in (DataConfig(), RANDOM):
-        gaussians = train(scene, replace(CONFIG, data=data), device, tmp_path)
+        gaussians = train(scene, replace(CONFIG, data=data), tmp_path, device)
         alphas = [render(gaussians, view.camera, device=device).alpha for view in scene.test]
         opacity[data.random_background] = np.mean([a[s].mean() for a, s in zip(alphas, solid, strict=True)])
     # Measured opacity: 0.00 with a black background, 0.99 and 1.00 with random ones.

@@ -61,7 +61,7 @@ def test_masks_are_found_in_the_dataset_first(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "data" / "masks").mkdir()
     monkeypatch.chdir(tmp_path)
     config = TrainConfig(data=DataConfig(masks="masks"), init=InitConfig(triangulate=False))
-    with pytest.raises(InputError, match=r"data/masks/0\.png: expected the mask of photo 0\.png"):
+    with pytest.raises(InputError, match=r"cannot find the mask of photo 0\.png: neither .*data/masks/0\.png"):
         prepare("data", config)
 
 
