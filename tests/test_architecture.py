@@ -1,4 +1,4 @@
-"""The promises of the design: five files for a stage, imports one way, kernels that are OpenCL C by themselves."""
+"""Rules of the design: five files per stage, imports in one direction, short modules, plain OpenCL C kernels."""
 
 import ast
 import inspect
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "clsplat"
 STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__init__")
 
-# A unit, a package or a module of the top level, imports from rows above its own only.
+# A unit is a package or a module of the top level. It imports only from the rows above its own.
 LAYERS = """
     constants errors stages randomness display
     config atomic
@@ -37,7 +37,7 @@ LAYERS = """
 """.strip().splitlines()
 LAYER = {unit: depth for depth, row in enumerate(LAYERS) for unit in row.split()}
 
-# Packages that stand below a row they could import from, and must not know what it does.
+# Units that must not be imported although LAYERS would allow it.
 APART = {
     "reference": {"device", "structs", "ops", "scene", "metrics", "config"},  # the equations alone
     "dataset": {"gaussians", "ops", "render", "pruning", "training"},
@@ -45,23 +45,23 @@ APART = {
     "demo": {"gaussians", "reference", "ops", "render", "training"},
 }
 
-# Kernels of `clsplat bench kernels`, no stages: nothing is rendered or trained by them, and
+# Kernels of `clsplat bench kernels`. They are not stages: they neither render nor train, and
 # tests/bench/test_bench_kernels.py checks them. roof measures the device's limits, which no equation describes.
 BENCH_KERNELS = {"roof"}
 
-# Where a foreign package may be imported at all, whose absence or weight the rest must not feel.
+# The only units that may import certain third-party packages, which are optional or slow to import.
 ONLY_IN = {
     "pyopencl": {"device", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
     "av": {"dataset"},
     "pillow_heif": {"dataset"},
-    "sqlite3": set(),  # beside pycolmap's in one process it ends in a bus error, see FOLLOWER in matching.py
+    "sqlite3": set(),  # with pycolmap in the same process it causes a bus error, see FOLLOWER in matching.py
 }
 
 
 def imports_of(path):
-    """Dotted names that a module imports, wherever in it."""
+    """Dotted names of all imports of a module, including those in functions."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -141,6 +141,46 @@ def test_every_package_says_what_belongs_there(path):
     assert "Belongs here:" in docstring and "Does not belong here:" in docstring
 
 
+# Limits on shape, and the packages and modules that keep them.
+LINES_MAX, FUNCTION_LINES_MAX, PARAMETERS_MAX = 350, 60, 8
+SHAPED = ("bench", "constants", "demo", "device", "metrics", "show", "structs", "testing")
+GSPLATS = {"rasterization"}  # its signature and its length are those of gsplat's function
+EACH_SHAPED = pytest.mark.parametrize(
+    "path", [p for p in MODULES if unit_of(p) in SHAPED], ids=lambda p: str(p.relative_to(PACKAGE))
+)
+
+
+def functions(path):
+    """Functions and methods of a module, nested ones too, without those that mirror another library."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and node.name not in GSPLATS:
+            yield node
+
+
+def parameters(function):
+    """Number of parameters without self and cls; *args and **kwargs count as one each."""
+    a = function.args
+    named = [arg.arg for arg in (*a.posonlyargs, *a.args, *a.kwonlyargs)]
+    return len(named) - (named[:1] in (["self"], ["cls"])) + (a.vararg is not None) + (a.kwarg is not None)
+
+
+@EACH_SHAPED
+def test_modules_are_short(path):
+    assert len(path.read_text().splitlines()) <= LINES_MAX
+
+
+@EACH_SHAPED
+def test_functions_are_short(path):
+    lengths = {(f.name, f.lineno): f.end_lineno - f.lineno + 1 for f in functions(path)}
+    assert {name: lines for name, lines in lengths.items() if lines > FUNCTION_LINES_MAX} == {}
+
+
+@EACH_SHAPED
+def test_functions_have_few_parameters(path):
+    counts = {(f.name, f.lineno): parameters(f) for f in functions(path)}
+    assert {name: count for name, count in counts.items() if count > PARAMETERS_MAX} == {}
+
+
 def test_import_is_light():
     heavy = {"pyopencl", "scipy", "matplotlib", "skimage", "pycolmap", "plyfile"}
     code = "import clsplat, sys; print(*sys.modules)"
@@ -150,20 +190,20 @@ def test_import_is_light():
 
 def test_no_path_of_a_machine():
     if not (ROOT / ".git").exists() or shutil.which("git") is None:
-        pytest.skip("not a git checkout: what belongs to the project cannot be told from what lies beside it")
+        pytest.skip("not a git checkout: the files of the project are not known")
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     pattern = re.compile(r"(?<![\w./:~-])/(?:home|root|Users|work|mnt|media|srv)/\w|\b[A-Z]:\\\w")
     found = []
     for name in filter(None, listed.split("\0")):
         try:
             text = (ROOT / name).read_text(encoding="utf-8")
-        except (UnicodeDecodeError, FileNotFoundError):  # a picture; deleted, but not committed yet
+        except (UnicodeDecodeError, FileNotFoundError):  # a picture, or a deleted file
             continue
         found += [f"{name}: {match[0]}" for match in pattern.finditer(text)]
     assert not found, found
 
 
-# What each file's header documents, with values it allows.
+# Defines that the header of each file documents, with allowed values.
 DEFINES = {
     "adam": {},
     "dropout": {},

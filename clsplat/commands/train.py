@@ -228,7 +228,7 @@ class Demo:
         from clsplat.dataset import load_scene
         from clsplat.demo import make_photos
         from clsplat.render import render_views
-        from clsplat.show.pictures import side_by_side
+        from clsplat.show.comparisons import side_by_side
 
         if self.out.exists() and any(self.out.iterdir()):
             raise InputError(f"{self.out}: expected an empty or new folder for the demo; choose another with -o")
