@@ -2,45 +2,45 @@ PYTHON = python
 
 .PHONY: test test-slow stability fuzz lint docs check-races bench bench-knobs bench-quality bench-stability formats
 
-# The default tests: a few minutes on two cores.
+# Run the default tests: a few minutes on two cores.
 test:
 	$(PYTHON) -m pytest
 
-# Trainings, which take minutes each.
+# Run the slow tests: trainings of minutes each.
 test-slow:
 	$(PYTHON) -m pytest -m slow
 
-# Of these, the trainings that show that a known failure of the method is held off.
+# Run the slow tests of stability: trainings that would fail without the remedies.
 stability:
 	$(PYTHON) -m pytest -m slow tests/stability tests/training/test_faults.py
 
-# The fuzzed tests with CASES cases each, drawn anew: more than 100 000 in all, about half an hour.
+# Run the fuzzed tests with CASES new random cases each: more than 100 000 cases, about half an hour.
 CASES = 4000
 fuzz:
 	CLSPLAT_FUZZ=$(CASES) $(PYTHON) -m pytest --hypothesis-profile=fuzz $(shell ls tests/stability/test_fuzz_*.py)
 
-# Style, types, and the kernels' format.
+# Check style, types, and the format of the kernels.
 lint:
 	$(PYTHON) -m ruff check clsplat tests notebooks
 	$(PYTHON) -m ruff format --check clsplat tests notebooks
 	$(PYTHON) -m mypy
 	@if command -v clang-format; then clang-format --dry-run --Werror cl/*.cl cl/*.h; \
-	else echo "clang-format is missing: the kernels' format is not checked"; fi
+	else echo "clang-format is missing: the format of the kernels is not checked"; fi
 
-# The documentation, as pages in docs/_build/html; needs the extra `docs`.
+# Build the documentation in docs/_build/html. Requires the extra `docs`.
 docs:
 	$(PYTHON) -m sphinx -W -b html docs docs/_build/html
 
-# The kernels under the simulator Oclgrind: data races, divergent barriers, accesses out of bounds.
+# Run the kernels in the simulator Oclgrind, which finds data races, divergent barriers and accesses out of bounds.
 check-races:
 	$(PYTHON) -m pytest tests/check_races.py
 
-# The figures of docs/benchmarks.md, measured anew: some minutes, on a machine that does nothing else.
+# Measure the figures of docs/benchmarks.md: some minutes, on a machine without other work.
 bench:
 	$(PYTHON) -m clsplat bench kernels -o docs/results/kernels.json --scaling docs/results/kernels.svg
 
-# The charts of docs/benchmarks.md, measured anew: make bench-quality DATA=folder of real scenes. An hour and a half on
-# two cores; what is there already is not measured again (make bench-quality METHODS=paper-30k adds four hours).
+# Measure the charts of docs/benchmarks.md: make bench-quality DATA=folder of real scenes. This takes an hour and a half
+# on two cores. Finished trainings are not repeated (make bench-quality METHODS=paper-30k adds four hours).
 QUALITY_SCENES = fox_pinhole:downscale=4 lego:background=white:downscale=2 fern:downscale=4 castle_p30:downscale=4
 METHODS = fast paper-7k auto mcmc
 bench-quality:
@@ -50,16 +50,16 @@ bench-quality:
 	cp build/quality/results.jsonl docs/results/quality.jsonl
 	cp build/quality/time-psnr.svg docs/results/quality.svg
 
-# The knobs of docs/benchmarks.md, measured anew: make bench-knobs WORKLOAD=10k-320x240 (default: 100k-640x480).
+# Measure the knobs of docs/benchmarks.md: make bench-knobs WORKLOAD=10k-320x240 (default: 100k-640x480).
 bench-knobs:
 	$(PYTHON) -m clsplat bench knobs $(if $(WORKLOAD),--workload $(WORKLOAD)) -o docs/results/knobs.json --chart docs/results/knobs.svg
 
-# The figures of docs/stability.md: make bench-stability DATA=folder of real scenes. Without DATA, only the experiments
-# that need no scenes are measured. NAMES and SCENE_NAMES choose experiments of the two kinds.
+# Measure the figures of docs/stability.md: make bench-stability DATA=folder of real scenes. Without DATA, only the
+# experiments that do not require scenes are measured. NAMES and SCENE_NAMES select experiments of the two kinds.
 bench-stability:
 	$(PYTHON) -m clsplat bench stability $(NAMES) -o docs/results
 	$(if $(DATA),$(PYTHON) tests/stability/scenes/measure_scenes.py $(SCENE_NAMES) --data $(DATA) -o docs/results)
 
-# The figures of docs/formats.md: make formats SCENE=scene.ply DATA=dataset OPTIONS="--downscale 2".
+# Measure the figures of docs/formats.md: make formats SCENE=scene.ply DATA=dataset OPTIONS="--downscale 2".
 formats:
 	$(PYTHON) tests/formats/measure_formats.py $(SCENE) $(DATA) $(OPTIONS)

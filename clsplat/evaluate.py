@@ -19,8 +19,8 @@ from clsplat.metrics import flip, psnr, psnr_fitted, ssim, to_uint8
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
 from clsplat.scene import View
+from clsplat.show.comparisons import save_difference, save_png
 from clsplat.show.evaluation_page import write_page
-from clsplat.show.pictures import save_difference, save_png
 
 Result = TypeVar("Result")
 Metric = Callable[..., float | None]

@@ -1,4 +1,4 @@
-"""The promises of the design: five files for a stage, imports one way, kernels that are OpenCL C by themselves."""
+"""Rules of the design: five files per stage, imports in one direction, short modules, plain OpenCL C kernels."""
 
 import ast
 import inspect
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "clsplat"
 STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__init__")
 
-# A unit, a package or a module of the top level, imports from rows above its own only.
+# A unit is a package or a module of the top level. It imports only from the rows above its own.
 LAYERS = """
     constants errors randomness display
     config atomic
@@ -40,7 +40,7 @@ LAYERS = """
 """.strip().splitlines()
 LAYER = {unit: depth for depth, row in enumerate(LAYERS) for unit in row.split()}
 
-# Packages that stand below a row they could import from, and must not know what it does.
+# Units that must not be imported although LAYERS would allow it.
 APART = {
     "reference": {"device", "structs", "ops", "scene", "metrics", "config"},  # the equations alone
     "dataset": {"gaussians", "ops", "render", "pruning", "training"},
@@ -48,23 +48,23 @@ APART = {
     "demo": {"gaussians", "reference", "ops", "render", "training"},
 }
 
-# Kernels of `clsplat bench kernels`, no stages: nothing is rendered or trained by them, and
+# Kernels of `clsplat bench kernels`. They are not stages: they neither render nor train, and
 # tests/bench/test_bench_kernels.py checks them. roof measures the device's limits, which no equation describes.
 BENCH_KERNELS = {"roof"}
 
-# Where a foreign package may be imported at all, whose absence or weight the rest must not feel.
+# The only units that may import certain third-party packages, which are optional or slow to import.
 ONLY_IN = {
     "pyopencl": {"device", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
     "av": {"dataset"},
     "pillow_heif": {"dataset"},
-    "sqlite3": set(),  # beside pycolmap's in one process it ends in a bus error, see COUNT_ROWS in matching.py
+    "sqlite3": set(),  # with pycolmap in the same process it causes a bus error, see COUNT_ROWS in matching.py
 }
 
 
 def imports_of(path):
-    """Dotted names that a module imports, wherever in it."""
+    """Dotted names of all imports of a module, including those in functions."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -145,6 +145,42 @@ def test_every_package_says_what_belongs_there(path):
     assert "Belongs here:" in docstring and "Does not belong here:" in docstring
 
 
+# Limits on shape: lines of a module; lines of code and parameters of a function.
+LINES_MAX, CODE_MAX, PARAMETERS_MAX = 350, 60, 8
+GSPLATS = {"rasterization"}  # its parameters are those of gsplat's function
+
+
+def functions(path):
+    """Functions and methods of a module, including nested ones."""
+    return [
+        n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))
+    ]
+
+
+def code_lines(function):
+    """Lines of a function without its docstring."""
+    first = function.body[0]
+    documented = ast.get_docstring(function) is not None
+    return function.end_lineno - function.lineno + 1 - documented * (first.end_lineno - first.lineno + 1)
+
+
+def parameters(function):
+    """Number of parameters without self, cls and the device of a launch; *args and **kwargs count as one each."""
+    a = function.args
+    named = [arg.arg for arg in (*a.posonlyargs, *a.args, *a.kwonlyargs)]
+    return (
+        len(named) - (named[:1] in (["self"], ["cls"], ["device"])) + (a.vararg is not None) + (a.kwarg is not None)
+    )
+
+
+@EACH_MODULE
+def test_modules_and_functions_are_short(path):
+    assert len(path.read_text().splitlines()) <= LINES_MAX
+    assert {f.name: code_lines(f) for f in functions(path) if code_lines(f) > CODE_MAX} == {}
+    counts = {f.name: parameters(f) for f in functions(path) if f.name not in GSPLATS}
+    assert {name: count for name, count in counts.items() if count > PARAMETERS_MAX} == {}
+
+
 def test_import_is_light():
     heavy = {"pyopencl", "scipy", "matplotlib", "skimage", "pycolmap", "plyfile"}
     code = "import clsplat, sys; print(*sys.modules)"
@@ -154,20 +190,20 @@ def test_import_is_light():
 
 def test_no_path_of_a_machine():
     if not (ROOT / ".git").exists() or shutil.which("git") is None:
-        pytest.skip("not a git checkout: what belongs to the project cannot be told from what lies beside it")
+        pytest.skip("not a git checkout: the files of the project are not known")
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     pattern = re.compile(r"(?<![\w./:~-])/(?:home|root|Users|work|mnt|media|srv)/\w|\b[A-Z]:\\\w")
     found = []
     for name in filter(None, listed.split("\0")):
         try:
             text = (ROOT / name).read_text(encoding="utf-8")
-        except (UnicodeDecodeError, FileNotFoundError):  # a picture; deleted, but not committed yet
+        except (UnicodeDecodeError, FileNotFoundError):  # a picture, or a deleted file
             continue
         found += [f"{name}: {match[0]}" for match in pattern.finditer(text)]
     assert not found, found
 
 
-# What each file's header documents, with values it allows.
+# Defines that the header of each file documents, with allowed values.
 DEFINES = {
     "adam": {},
     "dropout": {},

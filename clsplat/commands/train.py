@@ -245,7 +245,7 @@ class Demo:
         """Run the command."""
         from clsplat.demo import make_photos
         from clsplat.render import render_views
-        from clsplat.show.pictures import side_by_side
+        from clsplat.show.comparisons import side_by_side
         from clsplat.training.preparation import prepare
 
         if self.out.exists() and any(self.out.iterdir()):

@@ -7,7 +7,7 @@ from typing import Any
 from urllib.parse import quote
 
 from clsplat.atomic import replacing
-from clsplat.show.pictures import DIFFERENCE_MAX, palette
+from clsplat.show.comparisons import DIFFERENCE_MAX, palette
 
 METRICS = {
     "psnr": ("PSNR", "dB", 2, "higher"),

@@ -1,14 +1,14 @@
-"""Directives that generate parts of pages from the package during the build, so that both always agree.
+"""Sphinx directives that generate parts of pages from the package, so that both always agree.
 
 ``{constants}``: table of clsplat/constants.py.
 ``{config} NAME``: table of a dataclass of clsplat/config.py.
 ``{command} NAME``: output of ``clsplat NAME --help``.
-``{presets}``: settings of each preset.
+``{presets}``: table of the settings of each preset.
 ``{bench_kernels} FILE [WORKLOAD]``: results of ``clsplat bench kernels -o FILE``, or the stages of one workload.
 ``{bench_knobs} FILE``: table of ``clsplat bench knobs -o FILE``.
 ``{bench_stability} FILE``: rows and charts that ``make bench-stability`` wrote to the folder of FILE.
-``{bench_quality} FILE [COST]``: place and date at which ``clsplat bench quality`` measured the records in FILE, or
-charts and table of one cost.
+``{bench_quality} FILE [COST]``: environment of the records of ``clsplat bench quality`` in FILE, or charts and table
+of one cost.
 ``{published_quality}``: chart and table of the original paper.
 """
 
@@ -42,7 +42,7 @@ HEADER_RULE = "|---"
 
 
 def _docstring(statement: ast.stmt | None) -> str | None:
-    """Text of a string statement, such as the docstring below a constant, on one line."""
+    """Text of a string statement, such as the docstring of a constant, on one line."""
     if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
         if isinstance(statement.value.value, str):
             return " ".join(statement.value.value.split())
@@ -50,7 +50,7 @@ def _docstring(statement: ast.stmt | None) -> str | None:
 
 
 def _prose(text: str) -> str:
-    """Convert the plain text of a docstring to Markdown: escape everything except code spans."""
+    """Convert the plain text of a docstring to Markdown: everything except code spans is escaped."""
     parts = re.split(r"(``.+?``|`.+?`)", text)
     return "".join(p if i % 2 else re.sub(r"([\\*_<>|\[\]$])", r"\\\1", p) for i, p in enumerate(parts))
 
@@ -120,7 +120,7 @@ def config_table(name: str) -> str:
 
 
 def _flags(settings: dict[str, Any], within: str = "") -> list[str]:
-    """Settings in the notation of the command line."""
+    """Command line options for settings."""
     texts = []
     for name, value in settings.items():
         if isinstance(value, dict):
@@ -131,8 +131,8 @@ def _flags(settings: dict[str, Any], within: str = "") -> list[str]:
 
 
 def presets_table() -> str:
-    """Markdown table of the presets with the equivalent flags."""
-    rows = [_row("preset", "equivalent flags"), HEADER_RULE * 2 + "|"]
+    """Markdown table of the presets, with equivalent options."""
+    rows = [_row("preset", "the same as"), HEADER_RULE * 2 + "|"]
     for name in presets.PRESETS:
         settings = presets.read_settings(presets.FOLDER / f"{name}.json")
         rows.append(_row(_code(name), " ".join(map(_code, _flags(settings)))))
@@ -140,7 +140,7 @@ def presets_table() -> str:
 
 
 def help_text(command: str) -> str:
-    """Output of ``clsplat COMMAND --help`` on a terminal of 100 columns without colours."""
+    """Output of ``clsplat COMMAND --help`` on a terminal with 100 columns, without colours."""
     text = io.StringIO()
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "100"
@@ -153,7 +153,7 @@ def help_text(command: str) -> str:
 
 
 class Table(SphinxDirective):
-    """Base class: parse Markdown that is generated from a module."""
+    """Base of directives that parse Markdown generated from a module."""
 
     def parse(self, text: str, module: ModuleType) -> list[nodes.Node]:
         self.env.note_dependency(module.__file__)
@@ -186,7 +186,7 @@ class Presets(Table):
 
 
 class Command(SphinxDirective):
-    """``{command} NAME``; NAME can be a command and a sub-command."""
+    """``{command} NAME``. The name of a sub-command follows that of its command."""
 
     required_arguments = 1
     final_argument_whitespace = True
@@ -199,7 +199,7 @@ class Command(SphinxDirective):
 
 
 class BenchKernels(SphinxDirective):
-    """``{bench_kernels} FILE [WORKLOAD]``; FILE is relative to the page."""
+    """``{bench_kernels} FILE [WORKLOAD]``. The path of the file is relative to the page."""
 
     required_arguments = 1
     optional_arguments = 1
@@ -215,7 +215,7 @@ class BenchKernels(SphinxDirective):
 
 
 class BenchKnobs(SphinxDirective):
-    """``{bench_knobs} FILE``; FILE is relative to the page."""
+    """``{bench_knobs} FILE``. The path of the file is relative to the page."""
 
     required_arguments = 1
 
@@ -226,7 +226,7 @@ class BenchKnobs(SphinxDirective):
 
 
 class BenchStability(SphinxDirective):
-    """``{bench_stability} FILE``; FILE is relative to the page, and its charts are in the same folder."""
+    """``{bench_stability} FILE``. The path is relative to the page; the charts are in the folder of the file."""
 
     required_arguments = 1
 
@@ -243,23 +243,23 @@ class BenchStability(SphinxDirective):
 
 
 class Charts(SphinxDirective):
-    """Base class: draw charts while the pages are built."""
+    """Base of directives whose charts are drawn while the page is built."""
 
     def chart(self, figure: Figure, name: str, text: str) -> str:
-        """Write a picture to docs/generated; return its Markdown."""
+        """Write a chart to docs/generated, and return the Markdown that shows it."""
         folder = Path(self.env.srcdir) / "generated"
         folder.mkdir(exist_ok=True)
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
         return f"![{text}](/generated/{name}.svg)"
 
     def table(self, rows: list[list[str]]) -> str:
-        """Markdown of a table whose first row is the header."""
+        """Markdown of a table. The first row is the header."""
         head, *body = [_row(*map(_prose, row)) for row in rows]
         return "\n".join([head, HEADER_RULE * len(rows[0]) + "|", *body])
 
 
 class BenchQuality(Charts):
-    """``{bench_quality} FILE [COST]``; FILE is relative to the page."""
+    """``{bench_quality} FILE [COST]``. The path of the file is relative to the page."""
 
     required_arguments = 1
     optional_arguments = 1
@@ -276,7 +276,7 @@ class BenchQuality(Charts):
             return self.parse_text_to_nodes("\n\n".join(parts))
         cost, parts = self.arguments[1], []
         metrics = quality_summary.measured_metrics(finished)
-        for metric in metrics if cost == "seconds" else metrics[:1]:  # the table has them all
+        for metric in metrics if cost == "seconds" else metrics[:1]:  # the table has all metrics
             names = quality_summary.METRICS[metric].name, quality_summary.COSTS[cost].name
             text = f"{names[0]} against {names[1]}; the table below has the figures"
             figure = charts.quality_chart(finished, cost, metric)
@@ -293,7 +293,7 @@ class PublishedQuality(Charts):
 
     def run(self) -> list[nodes.Node]:
         self.env.note_dependency(str(charts.PUBLISHED))
-        text = "PSNR against training time as published in 2023; see the table below"
+        text = "PSNR against training time as published in 2023; the table below has the figures"
         picture = self.chart(charts.published_chart("psnr"), "quality-published", text)
         return self.parse_text_to_nodes(f"{picture}\n\n{self.table(charts.published_table())}")
 

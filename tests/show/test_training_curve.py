@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from test_pictures import read
+from test_comparisons import read
 
 from clsplat.errors import InputError
 from clsplat.show.training_curve import training_curve

@@ -242,7 +242,7 @@ NEEDLES = Experiment(
 )
 
 JACOBIAN = Experiment(
-    failure="Jacobian off the frustum and at the near plane",
+    failure="Jacobian outside the frustum and at the near plane",
     source="diff-gaussian-rasterization #75",
     remedy="slopes clamped to the enlarged image",
     test="tests/stability/test_projection.py::test_extents_stay_bounded_beside_the_image",

@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: renders, differences from the photos, and both side by side."""
+"""Pictures that compare renders with photos: single ones, their differences, and both side by side."""
 
 from pathlib import Path
 from typing import Any

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from clsplat.errors import InputError
-from clsplat.show.pictures import DIFFERENCE_MAX, save_difference, save_png, side_by_side
+from clsplat.show.comparisons import DIFFERENCE_MAX, save_difference, save_png, side_by_side
 
 
 def read(path):
