@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from clsplat.device import Device
 
 MODES = ("render", "depth", "alpha", "count")
-"""What a frame shows: colours, the expected depth, 1 - transmittance, or the number of Gaussians drawn per pixel."""
+"""Contents of a frame: colours, the expected depth, 1 - transmittance, or the number of Gaussians drawn per pixel."""
 
 
 def picture(
