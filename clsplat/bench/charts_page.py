@@ -1,4 +1,4 @@
-"""Charts of `clsplat bench quality` as files, and together on one page that needs no network."""
+"""Charts of `clsplat bench quality` as files, and together on one page that works without a network."""
 
 import base64
 import html

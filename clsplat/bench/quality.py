@@ -64,8 +64,8 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
     label = about["device"]["label"]
     records = read_records(results)
     missing = [cell for cell in cells if not _finished(cell, records, label)]
-    anew = [cell.key(label) for cell in missing]
-    write_records(results, [r for r in records if {name: r[name] for name in KEYS} not in anew])
+    stale = [cell.key(label) for cell in missing]
+    write_records(results, [r for r in records if {name: r[name] for name in KEYS} not in stale])
     say(f"{len(cells) - len(missing)} of {len(cells)} trainings are already finished")
     environment = {
         "driver": about["device"]["driver"],

@@ -1,4 +1,4 @@
-"""Ray-traced photos of a still life, with known cameras and geometry: a scene that needs no download.
+"""Ray-traced photos of a still life, with known cameras and geometry: a scene without a download.
 
 Belongs here: the photos, and the ray tracer that makes them. Does not belong here: splatting. The two share only the
 camera, so that the photos can test the splatting.

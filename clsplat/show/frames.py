@@ -11,7 +11,7 @@ from clsplat.metrics import to_uint8
 from clsplat.renderer import Renderer, download
 
 MODES = ("render", "depth", "alpha", "count")
-"""What a frame shows: colours, the expected depth, 1 - transmittance, or the number of Gaussians drawn per pixel."""
+"""Contents of a frame: colours, the expected depth, 1 - transmittance, or the number of Gaussians drawn per pixel."""
 
 
 def picture(renderer: Renderer, gaussians: Gaussians, camera: Camera, mode: str) -> tuple[NDArray[np.uint8], str]:

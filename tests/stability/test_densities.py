@@ -26,7 +26,7 @@ def test_training_goes_on_where_everything_has_become_transparent(device, tmp_pa
     assert all(np.isfinite(array).all() for array in gaussians.arrays().values())
 
 
-def test_what_no_pixel_shows_is_not_saved(device):
+def test_invisible_gaussians_are_not_saved(device):
     """gsplat #822: MCMC leaves dead Gaussians. Without those below ALPHA_MIN, every image has the same bits."""
     gaussians, camera = synthetic_scene(300, seed=1)
     gaussians = gaussians.astype(np.float32)

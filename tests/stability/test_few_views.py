@@ -26,7 +26,7 @@ def scene(device):
     return replace(scene, train=scene.train[:5:2], test=scene.test[:1], points=points, colors=colors)
 
 
-def test_three_photos_are_not_learned_by_heart(scene, device, tmp_path):
+def test_three_photos_do_not_overfit(scene, device, tmp_path):
     """Without the remedy, Gaussians are added until they show the noise of each photo."""
     psnr = {}
     plain = replace(CONFIG, iterations=400, max_gaussians=1000)

@@ -21,7 +21,7 @@ def test_opacities_that_decay_make_no_dip(device):
 
 
 @pytest.mark.parametrize("photos", [noise, checkerboard])
-def test_photos_that_nothing_explains_stay_under_the_cap(device, photos):
+def test_photos_of_noise_stay_under_the_cap(device, photos):
     """poison-splat (Lu et al. 2024): the gradients of each iteration cause more Gaussians."""
     scene = with_train(small_scene(device), photos)
     config = replace(CONFIG, iterations=150, adc=replace(CONFIG.adc, every=25))

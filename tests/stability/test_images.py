@@ -3,7 +3,7 @@
 from clsplat.bench.stability.images import ours, plain, right_kinds
 
 
-def test_each_kind_is_read_right_or_refused_by_name():
+def test_each_kind_is_read_correctly_or_refused_by_name():
     """A reader that only converts to RGB reads 16 bits as white, and ignores the orientation."""
     right, total = right_kinds(ours)
     assert right == total

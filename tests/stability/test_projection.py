@@ -17,7 +17,7 @@ from clsplat.testing import synthetic_scene
 
 
 @pytest.mark.parametrize("field", Gaussians.__dataclass_fields__)
-def test_a_poison_harms_nobody_else(device, field):
+def test_a_poison_harms_no_other_gaussian(device, field):
     """One NaN spreads through its tile, and through the gradients to the whole scene (Brush's fuzz tests)."""
     for k, value in enumerate(POISONS):
         mode = ("classic", "antialiased")[k % 2]
@@ -40,7 +40,7 @@ def test_needles_keep_their_determinant(device):
     np.testing.assert_allclose(*trace, rtol=1e-3)
 
 
-def test_extents_stay_bounded_beside_the_image(any_device):
+def test_extents_stay_bounded_outside_the_image(any_device):
     """Outside of the frustum, the affine approximation is unbounded (diff-gaussian-rasterization #75).
 
     Slopes are clamped to the enlarged image, also just behind the near plane.

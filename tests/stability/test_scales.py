@@ -10,7 +10,7 @@ from clsplat.render import render
 from clsplat.testing import synthetic_scene
 
 
-def test_seen_from_afar(device):
+def test_distance_does_not_change_the_mean_alpha(device):
     """The dilation by 0.3 px^2 enlarges everything that is smaller than a pixel (Mip-Splatting).
 
     With compensated opacity, the mean alpha of the image stays about the same.

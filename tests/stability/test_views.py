@@ -24,7 +24,7 @@ def test_the_regulariser_leaves_fewer_needles(device, shared):
     assert plain > 2 * regular
 
 
-def test_what_a_camera_nearly_touches_stays_out_of_the_image(any_device):
+def test_gaussians_next_to_a_camera_are_not_drawn(any_device):
     """A ball of 0.1 next to the camera, 0.1 in front of its plane and 50 degrees above its axis.
 
     Such a Gaussian covered a held-out photo of castle_p30. The affine projection is not valid there.

@@ -111,7 +111,7 @@ BLOW_UP = Experiment(
     failure="densification blow-up",
     source="poison-splat, Lu et al. 2024: 1.7 to 4 times the Gaussians",
     remedy="a hard cap, largest gradients first (`--max-gaussians`); a prediction of the memory (`--memory-limit`)",
-    test="tests/stability/test_growth.py::test_photos_that_nothing_explains_stay_under_the_cap",
+    test="tests/stability/test_growth.py::test_photos_of_noise_stay_under_the_cap",
     measure=_blow_up,
     figure="largest number of Gaussians in 400 iterations, from 40 points",
 )

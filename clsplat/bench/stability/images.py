@@ -83,7 +83,7 @@ KINDS = Experiment(
     failure="images of mixed size, orientation, EXIF rotation, 16-bit, grey, RGBA, CMYK, corrupt",
     source="issues of every implementation",
     remedy="each kind has a rule, and all others are refused, naming the file",
-    test="tests/stability/test_images.py::test_each_kind_is_read_right_or_refused_by_name",
+    test="tests/stability/test_images.py::test_each_kind_is_read_correctly_or_refused_by_name",
     measure=_kinds,
     figure="kinds of files that are read correctly, or refused by name if they must be",
 )

@@ -227,7 +227,7 @@ POISONING = Experiment(
     failure="zero quaternions, NaN, infinities, denormals in any parameter",
     source="Brush's fuzz tests; one NaN spreads through a tile, its gradients through the scene",
     remedy="Gaussians with values that are not finite are not drawn, and have no gradient",
-    test="tests/stability/test_projection.py::test_a_poison_harms_nobody_else",
+    test="tests/stability/test_projection.py::test_a_poison_harms_no_other_gaussian",
     measure=_poisoning,
     figure="combinations of five fields and nine values that affect the image, a gradient or another pixel",
 )
@@ -245,7 +245,7 @@ JACOBIAN = Experiment(
     failure="Jacobian outside the frustum and at the near plane",
     source="diff-gaussian-rasterization #75",
     remedy="slopes clamped to the enlarged image",
-    test="tests/stability/test_projection.py::test_extents_stay_bounded_beside_the_image",
+    test="tests/stability/test_projection.py::test_extents_stay_bounded_outside_the_image",
     measure=_jacobian,
     figure="extent of a ball 40 half images from the axis, relative to that of a ball on the axis; 0: not drawn",
 )

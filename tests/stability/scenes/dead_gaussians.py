@@ -31,7 +31,7 @@ DEAD = Experiment(
     failure="dead Gaussians left by MCMC",
     source="gsplat #822",
     remedy="Gaussians with an opacity below 1/255, which no pixel can show, are not saved",
-    test="tests/stability/test_densities.py::test_what_no_pixel_shows_is_not_saved",
+    test="tests/stability/test_densities.py::test_invisible_gaussians_are_not_saved",
     measure=_dead,
     figure=f"Gaussians with an opacity below 0.005, `mcmc` with {CAP} on fern",
 )

@@ -64,7 +64,7 @@ FLOATERS = Experiment(
     failure="floaters near cameras",
     source="a Gaussian that a camera nearly touches spreads over its whole image",
     remedy="a near plane at a tenth of the depth of a dataset's nearest points",
-    test="tests/stability/test_views.py::test_what_a_camera_nearly_touches_stays_out_of_the_image",
+    test="tests/stability/test_views.py::test_gaussians_next_to_a_camera_are_not_drawn",
     measure=_floaters,
     figure="PSNR of the worst held-out photo of castle_p30, 96x64, 600 iterations of `error` with 6000 Gaussians",
 )

@@ -84,7 +84,7 @@ OTHER_SCALES = Experiment(
     source="Mip-Splatting, Yu et al. 2024",
     remedy="opacity compensated for the dilation, `--mode antialiased`; no Gaussian thinner than the photos resolve, "
     "`--filter-3d`",
-    test="tests/stability/test_scales.py::test_seen_from_afar",
+    test="tests/stability/test_scales.py::test_distance_does_not_change_the_mean_alpha",
     measure=scales,
     figure="PSNR of held-out photos of fern at a quarter of the scale, trained at 120x90, 500 iterations",
 )

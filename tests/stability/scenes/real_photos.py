@@ -146,7 +146,7 @@ FEW_VIEWS = Experiment(
     failure="few views",
     source="DropGaussian: 19.4 to 20.2 dB",
     remedy="at most two Gaussians per point, fewer SH bands and dropout, set automatically (`--few.*`)",
-    test="tests/stability/test_few_views.py::test_three_photos_are_not_learned_by_heart",
+    test="tests/stability/test_few_views.py::test_three_photos_do_not_overfit",
     measure=_few_views,
     figure=f"PSNR of held-out photos of fern, 120x90, from 3 photos, {FEW_ITERATIONS} iterations",
 )
