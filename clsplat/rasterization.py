@@ -1,6 +1,6 @@
 """`rasterization`: gsplat's function of that name on OpenCL, forward only."""
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,6 +9,7 @@ from clsplat.camera import Camera, CameraModel
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
 from clsplat.renderer import Renderer, download
+from clsplat.stages import Splats
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -96,63 +97,102 @@ def rasterization(
     """
     means, viewmats, Ks = (np.asarray(a, dtype=np.float64) for a in (means, viewmats, Ks))
     colors = np.asarray(colors, dtype=np.float64)
-    n, cameras = len(means), len(viewmats)
-    if n == 0 or cameras == 0:
-        raise InputError(f"means, viewmats: expected at least one Gaussian and one camera, found {n} and {cameras}")
-    _check_shape("viewmats", viewmats, (cameras, 4, 4))
-    _check_shape("Ks", Ks, (cameras, 3, 3))
+    n, count = len(means), len(viewmats)
+    if n == 0 or count == 0:
+        raise InputError(f"means, viewmats: expected at least one Gaussian and one camera, found {n} and {count}")
     if sh_degree is None:
-        colors = np.broadcast_to(colors, (cameras, *colors.shape)) if colors.ndim == 2 else colors
-        _check_shape("colors", colors, (cameras, n, colors.shape[-1] if colors.ndim else 0))
-        sh: NDArray[Any] = np.zeros((n, 1, 3))
-        channels = colors.shape[2]
-    else:
-        sh, channels = colors, 3
+        colors = np.broadcast_to(colors, (count, *colors.shape)) if colors.ndim == 2 else colors
+        _check_shape("colors", colors, (count, n, colors.shape[-1] if colors.ndim else 0))
+    sh = np.zeros((n, 1, 3)) if sh_degree is None else colors
+    gaussians = _gaussians(means, scales, quats, opacities, sh)
+    if sh_degree is not None and not 0 <= sh_degree <= gaussians.sh_degree:
+        raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree} (what colors hold), found {sh_degree}")
+    if render_mode not in get_args(RenderMode):
+        raise InputError(f"render_mode: expected {', '.join(get_args(RenderMode))}, found {render_mode!r}")
+    cameras = _cameras(viewmats, Ks, width, height, camera_model, radial_coeffs)
+    channels = colors.shape[2] if sh_degree is None else 3
+    behind = np.zeros((count, channels)) if backgrounds is None else np.asarray(backgrounds, dtype=np.float64)
+    _check_shape("backgrounds", behind, (count, channels))
+
+    renderer = Renderer(device)
+    placed = renderer.place(gaussians)
+    parts: list[tuple[NDArray[Any], NDArray[Any], dict[str, Any]]] = []
+    for i, camera in enumerate(cameras):
+        splats = renderer.stages.project_fwd(
+            placed, camera, sh_degree or 0, antialiased=rasterize_mode == "antialiased"
+        )
+        values = colors[i] if sh_degree is None else download(splats.colors)
+        parts.append(_composited(renderer, splats, camera, values, behind[i], render_mode, tile_size))
+    renders, alphas, metas = zip(*parts, strict=True)
+    stacked: dict[str, Any] = {name: np.stack([meta[name] for meta in metas]) for name in metas[0]}
+    stacked |= {"width": width, "height": height, "tile_size": tile_size, "n_cameras": count}
+    return np.stack(renders), np.stack(alphas), stacked
+
+
+def _gaussians(means: Any, scales: ArrayLike, quats: ArrayLike, opacities: ArrayLike, sh: Any) -> Gaussians:
+    """Gaussians from activated parameters."""
     with np.errstate(divide="ignore"):  # opacities 0 and 1, scales 0
-        gaussians = Gaussians(
+        return Gaussians(
             means,
             np.log(np.asarray(scales, dtype=np.float64)),
             np.asarray(quats, dtype=np.float64),
             logit(np.asarray(opacities, dtype=np.float64)),
             sh,
         ).validate()
-    if sh_degree is not None and not 0 <= sh_degree <= gaussians.sh_degree:
-        raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree} (what colors hold), found {sh_degree}")
-    if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
-        raise InputError(f"render_mode: expected RGB, D, ED, RGB+D or RGB+ED, found {render_mode!r}")
-    if camera_model not in CAMERA_MODELS:
-        raise InputError(f"camera_model: expected {', '.join(CAMERA_MODELS)}, found {camera_model!r}")
-    distortions = np.zeros((cameras, 4)) if radial_coeffs is None else np.asarray(radial_coeffs, dtype=np.float64)
-    _check_shape("radial_coeffs", distortions, (cameras, 4))
-    behind = np.zeros((cameras, channels)) if backgrounds is None else np.asarray(backgrounds, dtype=np.float64)
-    _check_shape("backgrounds", behind, (cameras, channels))
 
-    renderer = Renderer(device)
-    stages, parameters = renderer.stages, renderer.place(gaussians)
-    renders, alphas, metas = [], [], []
-    for i in range(cameras):
-        intrinsics = Ks[i, 0, 0], Ks[i, 1, 1], Ks[i, 0, 2], Ks[i, 1, 2], width, height
-        camera = Camera(viewmats[i], *intrinsics, CAMERA_MODELS[camera_model], tuple(distortions[i].tolist()))
-        splats = stages.project_fwd(parameters, camera, sh_degree or 0, antialiased=rasterize_mode == "antialiased")
-        edge = max(width, height) if renderer.device is None else tile_size
-        bins = stages.bin_splats(splats, width, height, edge, gradients=False)
-        values = colors[i] if sh_degree is None else download(splats.colors)
-        values = _with_depth(values, download(splats.depths), render_mode)
-        background = np.zeros(values.shape[1])
-        if "RGB" in render_mode:
-            background[:channels] = behind[i]
-        image = stages.composite_fwd(splats._replace(colors=renderer.upload("colors", values)), bins, background)
-        render, alpha = np.array(download(image.rgb)), download(image.alpha)[:, :, None]
-        if "ED" in render_mode:
-            render[:, :, -1:] = np.divide(render[:, :, -1:], alpha, out=np.zeros_like(alpha), where=alpha > 0)
-        renders.append(render)
-        alphas.append(alpha)
-        tiles = np.bincount(download(bins.gauss_ids), minlength=n)
-        meta = {name: download(getattr(splats, name)) for name in ("means2d", "conics", "depths", "opacities")}
-        metas.append(meta | {"radii": np.ceil(download(splats.extents)).astype(np.int32), "tiles_per_gauss": tiles})
-    stacked: dict[str, Any] = {name: np.stack([meta[name] for meta in metas]) for name in metas[0]}
-    stacked |= {"width": width, "height": height, "tile_size": tile_size, "n_cameras": cameras}
-    return np.stack(renders), np.stack(alphas), stacked
+
+def _cameras(
+    viewmats: NDArray[Any], Ks: NDArray[Any], width: int, height: int, model: str, radial_coeffs: ArrayLike | None
+) -> list[Camera]:
+    """Cameras from gsplat's arguments."""
+    count = len(viewmats)
+    _check_shape("viewmats", viewmats, (count, 4, 4))
+    _check_shape("Ks", Ks, (count, 3, 3))
+    if model not in CAMERA_MODELS:
+        raise InputError(f"camera_model: expected {', '.join(CAMERA_MODELS)}, found {model!r}")
+    distortions = np.zeros((count, 4)) if radial_coeffs is None else np.asarray(radial_coeffs, dtype=np.float64)
+    _check_shape("radial_coeffs", distortions, (count, 4))
+    return [
+        Camera(
+            viewmat,
+            K[0, 0],
+            K[1, 1],
+            K[0, 2],
+            K[1, 2],
+            width,
+            height,
+            CAMERA_MODELS[model],
+            tuple(distortion.tolist()),
+        )
+        for viewmat, K, distortion in zip(viewmats, Ks, distortions, strict=True)
+    ]
+
+
+def _composited(
+    renderer: Renderer,
+    splats: Splats,
+    camera: Camera,
+    values: NDArray[Any],
+    behind: NDArray[Any],
+    render_mode: RenderMode,
+    tile_size: int,
+) -> tuple[NDArray[Any], NDArray[Any], dict[str, Any]]:
+    """Image, alpha and meta of one camera, from the values (N, D) of the splats."""
+    edge = max(camera.width, camera.height) if renderer.device is None else tile_size
+    bins = renderer.stages.bin_splats(splats, camera.width, camera.height, edge, gradients=False)
+    values = _with_depth(values, download(splats.depths), render_mode)
+    background = np.zeros(values.shape[1])
+    if "RGB" in render_mode:
+        background[: len(behind)] = behind
+    colored = splats._replace(colors=renderer.upload("colors", values))
+    image = renderer.stages.composite_fwd(colored, bins, background)
+    render, alpha = np.array(download(image.rgb)), download(image.alpha)[:, :, None]
+    if "ED" in render_mode:
+        render[:, :, -1:] = np.divide(render[:, :, -1:], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+    meta = {name: download(getattr(splats, name)) for name in ("means2d", "conics", "depths", "opacities")}
+    meta["radii"] = np.ceil(download(splats.extents)).astype(np.int32)
+    meta["tiles_per_gauss"] = np.bincount(download(bins.gauss_ids), minlength=len(meta["depths"]))
+    return render, alpha, meta
 
 
 def _with_depth(values: NDArray[Any], depths: NDArray[Any], render_mode: str) -> NDArray[Any]:

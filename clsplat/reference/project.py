@@ -150,13 +150,8 @@ def project_bwd(
     opacities = sigmoid(g.logit_opacities)
     factor = np.ones_like(opacities)
     if antialiased:
-        ratio = f["det0"] / f["det"]
-        factor = np.sqrt(np.maximum(ratio, COMPENSATION_MIN**2))
-        v_ratio = np.where(ratio > COMPENSATION_MIN**2, v_opacities * opacities * 0.5 / factor, 0)
-        adjugate0 = np.stack([f["cov"][:, 1, 1], -f["cov"][:, 0, 1], -f["cov"][:, 0, 1], f["cov"][:, 0, 0]], axis=1)
-        adjugate0 = adjugate0.reshape(-1, 2, 2)
-        adjugate = adjugate0 + BLUR * np.eye(2)
-        v_cov += (v_ratio / f["det"])[:, None, None] * (adjugate0 - ratio[:, None, None] * adjugate)
+        factor, v_compensated = _compensation_bwd(f, v_opacities * opacities)
+        v_cov += v_compensated
 
     # cov = root root^T, root = jacobian view rotation diag(scales)
     v_root = 2 * v_cov @ f["root"]
@@ -175,11 +170,7 @@ def project_bwd(
         v_p += f["onward"] * v_colors[:, 3:]
 
     v_color = np.where(f["color"] > 0, v_colors[:, :3], 0)
-    v_basis = np.einsum("nkc,nc->nk", g.sh[:, : f["basis"].shape[1]], v_color)
-    distance = np.linalg.norm(f["offset"], axis=1, keepdims=True)
-    direction = f["offset"] / distance
-    v_direction = np.einsum("nk,nkd->nd", v_basis, sh_basis_jacobian(direction, sh_degree))
-    v_offset = (v_direction - direction * (direction * v_direction).sum(axis=1, keepdims=True)) / distance
+    v_offset = _direction_bwd(f, v_color, sh_degree)
 
     n = len(gaussians)
     result = Gaussians(
@@ -195,19 +186,51 @@ def project_bwd(
     result.sh[shown] = v_sh
     if not camera_grad:
         return result, None
+    return result, _camera_bwd(f, camera, v_view + v_p.T @ g.means, v_p, v_offset, v_means2d, v_jacobian)
 
+
+def _compensation_bwd(f: dict[str, Any], v_factor: Array) -> tuple[Array, Array]:
+    """Compensation of the opacities for the blur, (N,), and its part in the gradients of the 2D covariances."""
+    ratio = f["det0"] / f["det"]
+    factor = np.sqrt(np.maximum(ratio, COMPENSATION_MIN**2))
+    v_ratio = np.where(ratio > COMPENSATION_MIN**2, v_factor * 0.5 / factor, 0)
+    adjugate0 = np.stack([f["cov"][:, 1, 1], -f["cov"][:, 0, 1], -f["cov"][:, 0, 1], f["cov"][:, 0, 0]], axis=1)
+    adjugate0 = adjugate0.reshape(-1, 2, 2)
+    adjugate = adjugate0 + BLUR * np.eye(2)
+    return factor, (v_ratio / f["det"])[:, None, None] * (adjugate0 - ratio[:, None, None] * adjugate)
+
+
+def _direction_bwd(f: dict[str, Any], v_color: Array, sh_degree: int) -> Array:
+    """Gradients with respect to the offsets of the means from the camera, (N, 3), by the view dependence alone."""
+    v_basis = np.einsum("nkc,nc->nk", f["g"].sh[:, : f["basis"].shape[1]], v_color)
+    distance = np.linalg.norm(f["offset"], axis=1, keepdims=True)
+    direction = f["offset"] / distance
+    v_direction = np.einsum("nk,nkd->nd", v_basis, sh_basis_jacobian(direction, sh_degree))
+    return (v_direction - direction * (direction * v_direction).sum(axis=1, keepdims=True)) / distance
+
+
+def _camera_bwd(
+    f: dict[str, Any],
+    camera: Camera,
+    v_rotation: Array,
+    v_p: Array,
+    v_offset: Array,
+    v_means2d: Array,
+    v_jacobian: Array,
+) -> CameraGrads:
+    """Gradients with respect to viewmat and intrinsics, from those by what depends on them."""
     v_viewmat = np.zeros((4, 4))
-    v_viewmat[:3, :3] = v_view + v_p.T @ g.means
+    v_viewmat[:3, :3] = v_rotation
     v_viewmat[:3, 3] = v_p.sum(axis=0)
-    if orthographic:
+    if camera.model == "orthographic":
         v_viewmat[2, :3] += v_offset.sum(axis=0)
     else:  # position = -view^-1 translation
-        v_translation = -np.linalg.solve(view.T, -v_offset.sum(axis=0))
+        v_translation = -np.linalg.solve(camera.viewmat[:3, :3].T, -v_offset.sum(axis=0))
         v_viewmat[:3, :3] += np.outer(v_translation, camera.position)
         v_viewmat[:3, 3] += v_translation
     v_intrinsics = np.einsum("nic,ni->c", f["means2d_by"], v_means2d)
     v_intrinsics += np.einsum("nijc,nij->c", f["jacobian_by"], v_jacobian)
-    return result, CameraGrads(v_viewmat, v_intrinsics)
+    return CameraGrads(v_viewmat, v_intrinsics)
 
 
 def project_bwd_adam(

@@ -196,7 +196,7 @@ class TestOneTraining:
         assert [r["seconds"] for r in records] == [2 * r["iteration"] for r in records]
 
     def test_frames_per_second_is_of_the_median(self, trained, device, monkeypatch):
-        cell, scene, _, _ = trained
+        _, scene, _, _ = trained
         clock = SimpleNamespace(now=0.0)
         monkeypatch.setattr(
             quality, "time", SimpleNamespace(perf_counter=lambda: clock.now, process_time=lambda: clock.now)
@@ -281,7 +281,10 @@ class TestBench:
         by_scene = {}
         for r in read_records(path):
             by_scene.setdefault(r["scene"], []).append(r)
-        assert [r["failed"].startswith("cannot read corrupt/3.png: ") for r in by_scene["corrupt"]] == [True, True]
+        assert [r["failed"].startswith("cannot read corrupt/3.png as an image") for r in by_scene["corrupt"]] == [
+            True,
+            True,
+        ]
         assert ["found none" in r["failed"] for r in by_scene["empty"]] == [True, True]
         assert ["held-out" in r["failed"] for r in by_scene["one:test_every=0"]] == [True, True]
         assert sum("fps" in r for r in by_scene["one"]) == 2
