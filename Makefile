@@ -4,7 +4,7 @@ PYTHON = python
 
 # Run the default tests: a few minutes on two cores.
 test:
-	$(PYTHON) -m pytest
+	$(PYTHON) -m pytest -n auto
 
 # Run the slow tests: trainings of minutes each.
 test-slow:
