@@ -9,14 +9,14 @@
 // to the gradients of its logarithm. The third penalty depends on the effective ranks (adam.h). For it, runs of
 // ln(scales) consist of whole rows. Each penalty is 0 for the other fields.
 //
-// Buffers, `total` values each: in gradients; in and out parameters, first (m), second (v).
+// Buffers, `total` values each: in and out parameters; in gradients; in and out first (m), second (v).
 #include "common.h"
 #include "adam.h"
 
 __kernel void adam_step(const uint total, const uint stride, const uint width, const uint split,
                         const real split_rate, const real rate, const real opacity_penalty, const real scale_penalty,
-                        const real erank_penalty, const Adam adam, const __global real *gradients,
-                        __global real *parameters, __global real *first, __global real *second) {
+                        const real erank_penalty, const Adam adam, __global real *parameters,
+                        const __global real *gradients, __global real *first, __global real *second) {
     const size_t begin = get_global_id(0) * stride;
     if (begin >= total)
         return;

@@ -20,6 +20,9 @@
 //   v_x  is the gradient with respect to x; v_camera[groups,16] holds a partial sum per work-group of the gradient
 //        with respect to rotation (9, row-major), translation (3) and fx, fy, cx, cy.
 //
+// Arguments of every kernel: numbers and structs; the Gaussians' fields, Adam's moments, the splats' fields and the
+// gradients, each in the order of its container (clsplat/gaussians.py, clsplat/stages.py); results.
+//
 // -DCHANNELS=3|4      4: the depth is composited as a fourth channel
 // -DANTIALIASED=0|1   1: opacity compensation
 // -DCAMERA_GRAD=0|1   1: the backward kernels also write v_camera; requires -DGROUP, the work-group size
@@ -203,7 +206,7 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
 // is exact for discs (cf. Radl et al. 2024, "StopThePop", equation 10, for the Gaussian without blur).
 __kernel void project_disparities(const uint n, const Camera camera, const __global real *means,
                                   const __global real *log_scales, const __global real *quats,
-                                  const __global real *extents, const __global real *conics,
+                                  const __global real *conics, const __global real *extents,
                                   __global real *disparities) {
     const size_t i = get_global_id(0);
     if (i >= n)
@@ -320,12 +323,11 @@ static inline void sum_camera(const FootprintGrad *v, __local real *partial, __g
 
 __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
                           const __global real *means, const __global real *log_scales, const __global real *quats,
-                          const __global real *logit_opacities, const __global real *extents,
-                          const __global real *conics, const __global real *colors, const __global real *sh,
-                          const __global real *v_means2d, const __global real *v_conics,
-                          const __global real *v_opacities, const __global real *v_colors, __global real *v_means,
-                          __global real *v_log_scales, __global real *v_quats, __global real *v_logit_opacities,
-                          __global real *v_sh
+                          const __global real *logit_opacities, const __global real *sh, const __global real *conics,
+                          const __global real *extents, const __global real *colors, const __global real *v_means2d,
+                          const __global real *v_conics, const __global real *v_opacities,
+                          const __global real *v_colors, __global real *v_means, __global real *v_log_scales,
+                          __global real *v_quats, __global real *v_logit_opacities, __global real *v_sh
 #if CAMERA_GRAD
                           ,
                           __global real *v_camera
@@ -357,15 +359,14 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
 
 // project_bwd and the step of Adam (adam.cl) in one pass, with the gradients in registers.
 __kernel void project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
-                               const Adam adam, const __global real *extents, const __global real *conics,
-                               const __global real *colors, const __global real *v_means2d,
-                               const __global real *v_conics, const __global real *v_opacities,
-                               const __global real *v_colors, __global real *means, __global real *log_scales,
-                               __global real *quats, __global real *logit_opacities, __global real *sh,
-                               __global real *means_1, __global real *log_scales_1, __global real *quats_1,
-                               __global real *logit_opacities_1, __global real *sh_1, __global real *means_2,
-                               __global real *log_scales_2, __global real *quats_2, __global real *logit_opacities_2,
-                               __global real *sh_2
+                               const Adam adam, __global real *means, __global real *log_scales, __global real *quats,
+                               __global real *logit_opacities, __global real *sh, __global real *means_1,
+                               __global real *log_scales_1, __global real *quats_1, __global real *logit_opacities_1,
+                               __global real *sh_1, __global real *means_2, __global real *log_scales_2,
+                               __global real *quats_2, __global real *logit_opacities_2, __global real *sh_2,
+                               const __global real *conics, const __global real *extents, const __global real *colors,
+                               const __global real *v_means2d, const __global real *v_conics,
+                               const __global real *v_opacities, const __global real *v_colors
 #if CAMERA_GRAD
                                ,
                                __global real *v_camera

@@ -29,7 +29,7 @@ def adam_step(
     """
     struct = adam_struct(step, device.real)
     for name in SHAPES:
-        arrays = [getattr(c, name) for c in (gradients, gaussians, first, second)]
+        arrays = [getattr(c, name) for c in (gaussians, gradients, first, second)]
         total = arrays[0].size
         if name == "sh":
             stride, width, split = 3 * gaussians.sh.shape[1], 3 * (step.sh_degree + 1) ** 2, 3

@@ -83,7 +83,7 @@ def project_disparities(device: Device, gaussians: Gaussians, camera: Camera, sp
     """
     n, g = len(gaussians), gaussians
     result = device.empty("disparities", (n, 3))
-    arguments = [n, camera_struct(camera, device.real), g.means, g.log_scales, g.quats, splats.extents, splats.conics]
+    arguments = [n, camera_struct(camera, device.real), g.means, g.log_scales, g.quats, splats.conics, splats.extents]
     defines = {"CHANNELS": splats.colors.shape[1], "ANTIALIASED": 0, "CAMERA_GRAD": 0, "LENS": lens_define(camera)}
     device.launch("project", "project_disparities", (n,), [*arguments, result], defines=defines)
     return result
@@ -120,18 +120,8 @@ def project_bwd(
     n, g = len(gaussians), gaussians
     empty: dict[str, Any] = {name: device.empty(f"v_{name}", array.shape) for name, array in g.arrays().items()}
     v = Gaussians(**empty)
-    arguments = [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree]
-    arguments += [
-        g.means,
-        g.log_scales,
-        g.quats,
-        g.logit_opacities,
-        splats.extents,
-        splats.conics,
-        splats.colors,
-        g.sh,
-    ]
-    arguments += [*v_splats, *v.arrays().values()]
+    arguments = [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree, *g.arrays().values()]
+    arguments += [splats.conics, splats.extents, splats.colors, *v_splats, *v.arrays().values()]
     defines = {
         "CHANNELS": splats.colors.shape[1],
         "ANTIALIASED": int(antialiased),
@@ -192,7 +182,7 @@ def project_bwd_adam(
     -------
     v_camera : CameraGrads or None
     """
-    fields = [splats.extents, splats.conics, splats.colors, *v_splats]
+    fields = [splats.conics, splats.extents, splats.colors, *v_splats]
     arrays = [array for part in (gaussians, *moments) for array in part.arrays().values()]
     arguments = [
         len(gaussians),
@@ -200,8 +190,8 @@ def project_bwd_adam(
         gaussians.sh.shape[1],
         step.sh_degree,
         adam_struct(step, device.real),
-        *fields,
         *arrays,
+        *fields,
     ]
     defines = {
         "CHANNELS": splats.colors.shape[1],
