@@ -6,8 +6,9 @@
 // Splats are visited by depth (scheme "global", after a sort of all splats) or by index (scheme "per_tile", which
 // sorts the list of each tile afterwards). A stable distribution to the tiles keeps this order within each list.
 // Steps, with the stages scan and sort in between:
-//   bin_prepare  keys[N], depths as integers with the same order, invisible splats last; ellipses[N], see ellipse.h
-//   bin_identity or (sort)  order[N], the splats in the order of the visits
+//   bin_prepare  keys[N], depths as integers with the same order, invisible splats last; ellipses[N], see ellipse.h;
+//                with `by_index` also order[N], the splats in the order of the visits
+//   (sort)       order[N] of scheme "global"
 // On a CPU, a counting sort by tile. Work-item w has the w-th run of splats, and its own counters:
 //   bin_histogram  counters[W,T], entries per run and tile; counts[N], number of tiles of splat order[i] (GRADIENTS)
 //   bin_totals     totals[T], entries per tile; the counters become the numbers of entries of the preceding runs
@@ -104,9 +105,9 @@ typedef uint depth_key;
 
 // The bits of positive floating-point numbers have the same order as the numbers. A work-item takes eight splats,
 // because on CPUs a vector logarithm is faster than a scalar one.
-__kernel void bin_prepare(const uint n, const __global real *means2d, const __global real *conics,
+__kernel void bin_prepare(const uint n, const int by_index, const __global real *means2d, const __global real *conics,
                           const __global real *depths, const __global real *extents, const __global real *opacities,
-                          __global depth_key *keys, __global Ellipse *ellipses) {
+                          __global depth_key *keys, __global Ellipse *ellipses, __global uint *order) {
     const uint begin = 8 * get_global_id(0);
     if (begin >= n)
         return;
@@ -120,13 +121,9 @@ __kernel void bin_prepare(const uint n, const __global real *means2d, const __gl
         const real2 extent = (real2)(extents[2 * i], extents[2 * i + 1]);
         keys[i] = extent.x > 0 ? AS_KEY(depths[i]) : LAST;
         ellipses[i] = ellipse_of(centre, load3(conics, i), ((const real *)&r2)[i - begin], extent);
+        if (by_index)
+            order[i] = i;
     }
-}
-
-__kernel void bin_identity(const uint n, __global uint *order) {
-    const uint i = get_global_id(0);
-    if (i < n)
-        order[i] = i;
 }
 
 // The run of a work-item. Runs are taken from both ends alternately: in an order by depth the last runs hold the

@@ -54,13 +54,13 @@ def bin_splats(
     keys = device.empty("depth keys", n, np.uint32 if device.real == np.float32 else np.uint64)
     bits = 8 * keys.dtype.itemsize
     ellipses = device.empty("ellipses", (n, 8))
-    arguments = [n, splats.means2d, splats.conics, splats.depths, splats.extents, splats.opacities, keys, ellipses]
+    # The global scheme gets its order from the sort; it passes a buffer that the kernel does not touch.
+    order = keys if by_depth else device.empty("order", n, np.uint32)
+    geometry = [splats.means2d, splats.conics, splats.depths, splats.extents, splats.opacities]
+    arguments = [n, int(not by_depth), *geometry, keys, ellipses, order]
     device.launch("bin", "bin_prepare", (-(-n // 8),), arguments, defines=defines)
     if by_depth:
         _, order = argsort(device, keys, bits)
-    else:
-        order = device.empty("order", n, np.uint32)
-        device.launch("bin", "bin_identity", (n,), [n, order], defines=defines)
 
     geometry = [width, height, order, ellipses]
     distribute = _counting_sort if device.is_cpu else _radix_sort
