@@ -112,7 +112,7 @@ class Viewer:
             import viser
         except ImportError as error:
             raise InputError(
-                "viewer: expected the package viser, found none: pip install 'clsplat[viewer]'"
+                "cannot start the viewer: the package viser is missing; install it with pip install 'clsplat[viewer]'"
             ) from error
 
         self._renderer, self._focus = renderer, start.focus

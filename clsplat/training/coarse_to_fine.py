@@ -1,4 +1,4 @@
-"""Coarse to fine: training begins on smaller photos, whose steps cost in proportion to their pixels."""
+"""Coarse to fine: training starts with smaller photos, whose steps cost less."""
 
 from dataclasses import replace
 
@@ -10,9 +10,9 @@ from clsplat.scene import View
 
 
 def factor_at(iteration: int, config: TrainConfig) -> int:
-    """By which the photos' edges are divided in an iteration, counted from 1: halved at equal intervals down to 1.
+    """Divisor of the photos' edges in an iteration, counted from 1. It is halved at equal intervals down to 1.
 
-    Chen et al. 2025, "DashGaussian", schedule the resolution as well; they find its steps in the photos' spectra.
+    Chen et al. 2025, "DashGaussian", derive the schedule of the resolution from the photos' spectra instead.
     """
     span = config.coarse.until * config.iterations
     if iteration > span:
@@ -22,9 +22,9 @@ def factor_at(iteration: int, config: TrainConfig) -> int:
 
 
 def shrunk(view: View, factor: int) -> View:
-    """The same view with edges divided by `factor`, rounded: means over boxes of pixels, and the camera to them.
+    """Reduce a view: divide its edges by `factor` (rounded), average boxes of pixels, and adapt the camera.
 
-    A pixel counts where all that it is the mean of counts.
+    A pixel counts if all the pixels that it averages count.
     """
     if factor == 1:
         return view

@@ -1,4 +1,4 @@
-"""The Gaussians that training starts from: one per sparse point, or random ones where there are no points."""
+"""The first Gaussians: one per sparse point, or random ones where there are no points."""
 
 from dataclasses import replace
 
@@ -14,20 +14,20 @@ from clsplat.randomness import stream
 from clsplat.scene import Scene
 
 NEIGHBOURS = 3
-"""Neighbours whose mean squared distance is a Gaussian's first variance (original)."""
+"""Number of neighbours whose mean squared distance is a Gaussian's first variance (original)."""
 
 OPACITY = 0.1
-"""A Gaussian's first opacity where the configuration says none (original)."""
+"""Default opacity of the first Gaussians (original)."""
 
 RANDOM_POINTS = 100_000
-"""Gaussians of a random start whose number nobody names (original)."""
+"""Default number of Gaussians of a random start (original)."""
 
 VARIANCE_MIN = 1e-7
-"""Smallest such variance, in squared world units: duplicates would otherwise start with scale 0 (original)."""
+"""Smallest first variance, squared world units; without it, duplicate points would have scale 0 (original)."""
 
 
 def initialize(scene: Scene, config: InitConfig, seed: int, cap: int | None = None) -> Gaussians:
-    """Gaussians to start from: `from_points` where the scene has points, otherwise `random`.
+    """Make the first Gaussians: `from_points` if the scene has points, otherwise `random`.
 
     Parameters
     ----------
@@ -36,9 +36,9 @@ def initialize(scene: Scene, config: InitConfig, seed: int, cap: int | None = No
     config : InitConfig
         Opacity, degree of the spherical harmonics, number and extent of random Gaussians.
     seed : int
-        Of the random ones, and of the choice of points.
+        Seed of the random Gaussians and of the choice of points.
     cap : int, optional
-        The most Gaussians: of more points, so many are drawn.
+        Largest number of Gaussians; of more points, this number is drawn.
 
     Returns
     -------
@@ -62,7 +62,7 @@ def initialize(scene: Scene, config: InitConfig, seed: int, cap: int | None = No
 
 
 def start_count(scene: Scene, config: InitConfig, cap: int | None) -> int:
-    """How many Gaussians `initialize` makes."""
+    """Number of Gaussians that `initialize` makes."""
     wanted = len(scene.points) or _random_points(config)
     return wanted if cap is None else min(wanted, cap)
 
@@ -72,22 +72,22 @@ def _random_points(config: InitConfig) -> int:
 
 
 def from_points(points: ArrayLike, colors: ArrayLike, config: InitConfig) -> Gaussians:
-    """One isotropic Gaussian per point, as large as the distance to its neighbours (paper, section 5.1).
+    """Make one isotropic Gaussian per point, as large as the distance to its neighbours (paper, section 5.1).
 
     Parameters
     ----------
     points : (P, 3)
         In world units, near the origin; P at least 1.
     colors : (P, 3) uint8
-        Their colours.
+        Colours of the points.
     config : InitConfig
         Opacity and degree of the spherical harmonics.
 
     Returns
     -------
     Gaussians
-        P of them, float32. The standard deviation is the root mean square distance to the 3 nearest other points, to
-        fewer where there are fewer, and 1 for a single point.
+        P Gaussians, float32. Their standard deviation is the root mean square distance to the 3 nearest other points
+        (to all others if there are fewer), and 1 for a single point.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def from_points(points: ArrayLike, colors: ArrayLike, config: InitConfig) -> Gau
 
 
 def random(cameras: list[Camera], config: InitConfig, seed: int) -> Gaussians:
-    """Gaussians of random positions and colours in a box around the point that the cameras look at.
+    """Make Gaussians with random positions and colours in a box around the point that the cameras look at.
 
     Parameters
     ----------
@@ -113,14 +113,14 @@ def random(cameras: list[Camera], config: InitConfig, seed: int) -> Gaussians:
     config : InitConfig
         Number, size of the box, opacity and degree of the spherical harmonics.
     seed : int
-        The same seed gives the same Gaussians.
+        Seed of positions and colours.
 
     Returns
     -------
     Gaussians
-        `config.random_points` of them, RANDOM_POINTS where that is None, float32, uniform in the cube around
-        `focus_point` whose half edge is `config.random_extent` times the cameras' mean distance from it; sized as by
-        `from_points`.
+        `config.random_points` Gaussians (default: RANDOM_POINTS), float32. Positions are uniform in a cube around
+        `focus_point`, whose half edge is `config.random_extent` times the cameras' mean distance from it. Scales are
+        as in `from_points`.
 
     Raises
     ------

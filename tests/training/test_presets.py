@@ -120,7 +120,7 @@ def test_files_that_are_no_settings(tmp_path, content, expected):
 
 
 def test_missing_files_and_presets(tmp_path: Path):
-    with pytest.raises(InputError, match=r"nothing\.json: expected a configuration that can be read"):
+    with pytest.raises(InputError, match=r"cannot read .*nothing\.json: No such file"):
         load_config(tmp_path / "nothing.json")
     with pytest.raises(InputError, match=r"--preset: expected one of fast, .*found 'slow'"):
         load_preset("slow")

@@ -19,13 +19,13 @@ from clsplat.errors import InputError
 FOLDER = Path(__file__).parent
 
 PRESETS = tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
-"""Names that `load_preset` knows."""
+"""Names of the presets."""
 
 YAML = (".yaml", ".yml")
-"""Suffixes of files that are read as such."""
+"""Suffixes of files in YAML; other files are JSON."""
 
 DATA_PATH = "data_path"
-"""What config.json says besides the configuration: where the dataset was."""
+"""Key in config.json for the path of the dataset, which is not a part of the configuration."""
 
 Settings = TypeVar("Settings")
 
@@ -33,7 +33,7 @@ EXPECTED = {int: "an integer", float: "a finite number", str: "text", bool: "tru
 
 
 def load_preset(name: str) -> TrainConfig:
-    """The configuration that ``--preset`` names.
+    """Read a preset by its name.
 
     Raises
     ------
@@ -51,13 +51,13 @@ def load_config(path: Path) -> TrainConfig:
     Parameters
     ----------
     path : Path
-        Nested as config.json is; what it leaves out has its default.
+        Nested as config.json is; missing settings have their defaults.
 
     Raises
     ------
     InputError
-        If the file cannot be read or is no object of settings, if `TrainConfig` has no such setting, or if a value is
-        not of its type or none of its choices; the message names file and setting.
+        If the file cannot be read or is not an object of settings, if `TrainConfig` has no such setting, or if a value
+        has another type or is not among its choices; the message names file and setting.
     """
     settings = read_settings(path)
     settings.pop(DATA_PATH, None)
@@ -65,7 +65,7 @@ def load_config(path: Path) -> TrainConfig:
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """The object in a file of JSON or, by its suffix, YAML, each key of which stands there once."""
+    """Read the object in a file of JSON or, by its suffix, YAML; each key must occur once."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         names = [name for name, _ in pairs]
@@ -75,7 +75,7 @@ def read_settings(path: Path) -> dict[str, Any]:
         return dict(pairs)
 
     class Loader(yaml.SafeLoader):
-        """Whose objects are as those of JSON."""
+        """YAML loader that makes the same objects as JSON."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
             return once(
@@ -89,7 +89,7 @@ def read_settings(path: Path) -> dict[str, Any]:
         else:
             settings = json.loads(text, object_pairs_hook=once)
     except OSError as error:
-        raise InputError(f"{path}: expected a configuration that can be read, found: {error.strerror}") from error
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise InputError(f"{path}: expected JSON, found: {error}") from error
     except (yaml.YAMLError, RecursionError) as error:
@@ -100,22 +100,22 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def with_settings(base: Settings, settings: dict[str, Any], source: str, within: str = "") -> Settings:
-    """A configuration with some settings changed.
+    """Change some settings of a configuration.
 
     Parameters
     ----------
     base : a dataclass of clsplat.config
     settings : dict
-        Names to values, nested as the dataclasses are; what is left out stays as in `base`.
+        Values by name, nested as the dataclasses are; missing settings stay as in `base`.
     source : str
-        Where the settings come from, for messages: a file, say.
+        Origin of the settings in messages, such as a file.
     within : str
-        The name of `base` within the whole, with its dot.
+        Name of `base` within the whole configuration, with a dot at the end.
 
     Raises
     ------
     InputError
-        If there is no such setting, or a value is not of its type or none of its choices.
+        If there is no such setting, or a value has another type or is not among its choices.
     """
     hints = get_type_hints(type(base))
     known = {field.name for field in fields(base)}  # type: ignore[arg-type]
@@ -137,11 +137,11 @@ def with_settings(base: Settings, settings: dict[str, Any], source: str, within:
 
 
 def _checked(value: Any, hint: Any, where: str) -> Any:
-    """A value of JSON as a setting of the type that `hint` says."""
+    """Check a value of JSON against the type of a setting, and return it."""
     choices = get_args(hint) if get_origin(hint) is not Literal else ()
     for kind in choices or (hint,):
         if get_origin(kind) is Literal:
-            # 1 == True == 1.0, but only one of them is the choice.
+            # 1 == True == 1.0, but only one of them is a valid choice.
             if any(value == choice and type(value) is type(choice) for choice in get_args(kind)):
                 return value
         elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
