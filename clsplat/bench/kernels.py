@@ -17,7 +17,7 @@ from clsplat.config import RenderConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.renderer import Renderer
 from clsplat.stages import FUNCTIONS
-from clsplat.training.loop import Training
+from clsplat.training.session import Training
 
 WARM_UP = 2
 """Number of untimed steps of each kind at the start. They build kernels and fill the pool of buffers."""

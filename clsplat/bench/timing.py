@@ -10,11 +10,10 @@ from clsplat.config import OptimConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.scene import Scene
 from clsplat.training.densify import STRATEGIES
-from clsplat.training.loop import Training
 from clsplat.training.optimizer import Moments
 from clsplat.training.rows import Rows
+from clsplat.training.session import Training, step
 from clsplat.training.state import State
-from clsplat.training.step import step
 
 ITERATION = 3001
 """Iteration of a default run that is timed: it trains all bands of the spherical harmonics and collects the

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Container, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,7 @@ from clsplat.atomic import replacing
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.training.checkpoint import CHECKPOINT, save_state
-
-if TYPE_CHECKING:
-    from clsplat.training.loop import Training
+from clsplat.training.session import Training
 
 LOG = "log.jsonl"
 """File name of the log in the folder of a run."""
@@ -42,7 +40,7 @@ class Recorder:
 
     def __init__(
         self,
-        training: "Training",
+        training: Training,
         out: Path,
         log: Append,
         progress: Append,
@@ -58,7 +56,7 @@ class Recorder:
         self._losses: list[float] = []
         self._started = time.perf_counter() - training.state.seconds
 
-    def after(self, training: "Training", loss: float) -> None:
+    def after(self, training: Training, loss: float) -> None:
         """Record an iteration of the training itself."""
         state, config = training.state, training.config
         if not np.isfinite(loss):
@@ -84,11 +82,11 @@ class Recorder:
         self._tell(training, loss)
         self._started += time.perf_counter() - left
 
-    def after_fork(self, fork: "Training", loss: float) -> None:
+    def after_fork(self, fork: Training, loss: float) -> None:
         """Report an iteration of a fork, which is neither logged nor saved."""
         self._tell(fork, loss)
 
-    def _tell(self, shown: "Training", loss: float) -> None:
+    def _tell(self, shown: Training, loss: float) -> None:
         state = self._training.state
         about = {"iteration": state.iteration, "loss": loss, "num_gaussians": len(shown.state.gaussians)}
         gaussians = shown.state.shown(shown.renderer) if shown.state.filter else shown.state.gaussians

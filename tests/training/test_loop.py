@@ -25,9 +25,9 @@ from clsplat.training.checkpoint import load_state, save_state
 from clsplat.training.contributions import contributions
 from clsplat.training.densify import STRATEGIES, Contributions, Edit, Survey
 from clsplat.training.densify.error_guided import ErrorGuided
-from clsplat.training.loop import Training, train
+from clsplat.training.loop import train
+from clsplat.training.session import Training, step, view_at
 from clsplat.training.state import initial_state, start_config
-from clsplat.training.step import step, view_at
 
 SIZE = (40, 32)
 EACH_STRATEGY = pytest.mark.parametrize("strategy", STRATEGIES)
@@ -244,7 +244,7 @@ def test_training_goes_from_small_photos_to_whole_ones(
 ) -> None:
     """What is trained on and what growth is decided by; resumed at the second size, to the same bits."""
     sizes: dict[int, set[tuple[int, ...]]] = {}
-    module = sys.modules["clsplat.training.loop"]
+    module = sys.modules["clsplat.training.session"]
 
     def recorded(training: Training, view: View) -> float:
         sizes.setdefault(view.camera.width, set()).add(view.image.shape)
@@ -284,7 +284,7 @@ def test_small_photos_train_while_the_size_is_sought(
         seen.append((view.camera.width, view.mask is not None))
         return step(training, view)
 
-    monkeypatch.setattr(sys.modules["clsplat.training.loop"], "step", recorded)
+    monkeypatch.setattr(sys.modules["clsplat.training.session"], "step", recorded)
     train(scene, replace(CONFIG, size="auto", coarse=CoarseConfig(factor=2)), tmp_path, device)
     assert set(seen) == {(20, True), (40, True), (40, False)}
 
@@ -309,7 +309,7 @@ def test_each_round_surveys_photos_of_its_own(
         return contributions(renderer, gaussians, views, *rest)
 
     monkeypatch.setattr(ErrorGuided, "edit", watched)
-    monkeypatch.setattr(sys.modules["clsplat.training.loop"], "contributions", recorded)
+    monkeypatch.setattr(sys.modules["clsplat.training.session"], "contributions", recorded)
     config = replace(with_strategy("error"), error=ErrorConfig(every=10, views=5))
     train(scene, config, tmp_path, device)
     assert len(rounds) == 5 - 1  # after iterations 10 to 40, before 0.8 of 60

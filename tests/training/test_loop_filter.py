@@ -12,7 +12,8 @@ from clsplat.renderer import fetch
 from clsplat.training.autosize import search
 from clsplat.training.checkpoint import load_state
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
-from clsplat.training.loop import Training, train
+from clsplat.training.loop import train
+from clsplat.training.session import Training
 from clsplat.training.state import initial_state
 
 FILTERED = replace(CONFIG, filter_3d=True)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,17 +24,15 @@ from clsplat.training.autosize.rule import (
     validation_times,
 )
 from clsplat.training.autosize.validation import split, validate
+from clsplat.training.session import Training
 from clsplat.training.smoothing_filter import SmoothingFilter
 from clsplat.training.state import State
 
-if TYPE_CHECKING:
-    from clsplat.training.loop import Training
-
-After = Callable[["Training", float], None]
+After = Callable[[Training, float], None]
 """Called after each iteration with the training and the loss."""
 
 
-def search_size(training: "Training", after: After, after_fork: After) -> None:
+def search_size(training: Training, after: After, after_fork: After) -> None:
     """Run a training until the number of its Gaussians is settled.
 
     Parameters
@@ -62,7 +59,7 @@ def search_size(training: "Training", after: After, after_fork: After) -> None:
             training.state = replace(training.state, search=search)
 
 
-def _decide(training: "Training", search: Search, iteration: int, after_fork: After) -> State:
+def _decide(training: Training, search: Search, iteration: int, after_fork: After) -> State:
     """End the current trial, decide the next phase, train the smaller side of its trial. Returns the new state."""
     training.state.move(None)  # one side of a trial at a time is on the device
     state, trials = replace(training.state), search.trials
@@ -86,7 +83,7 @@ def _decide(training: "Training", search: Search, iteration: int, after_fork: Af
     return here.state
 
 
-def _train_small_side(training: "Training", phase: Decision, iteration: int, after: After) -> SmallSide:
+def _train_small_side(training: Training, phase: Decision, iteration: int, after: After) -> SmallSide:
     """Fork a training and train the fork to the end of the trial: with the same Gaussians, or with the costliest.
 
     The rows of the training are on the host.
@@ -106,7 +103,7 @@ def _train_small_side(training: "Training", phase: Decision, iteration: int, aft
     return SmallSide(side.state.rows.on(None), _candidate(side, end, validated))
 
 
-def _degrees(training: "Training", iteration: int) -> list[Candidate]:
+def _degrees(training: Training, iteration: int) -> list[Candidate]:
     """Candidates for the degree of the spherical harmonics, of those that are trained."""
     state, config, renderer = training.state, training.config, training.renderer
     gaussians, views = state.shown(renderer), _validation_views(training)
@@ -116,19 +113,19 @@ def _degrees(training: "Training", iteration: int) -> list[Candidate]:
     ]
 
 
-def _validation_views(training: "Training") -> list[View]:
+def _validation_views(training: Training) -> list[View]:
     """Views with their validation blocks alone, corrected by what this training has learned about each photo."""
     return training.state.corrected(split(training.scene.train)[1])
 
 
-def _validate(training: "Training") -> list[float]:
+def _validate(training: Training) -> list[float]:
     """PSNR of each validation view, dB."""
     state, renderer = training.state, training.renderer
     degree = state.sh_degree(state.iteration, training.config)
     return validate(state.shown(renderer), _validation_views(training), renderer, degree)
 
 
-def _candidate(training: "Training", iteration: int, validated: list[list[float]]) -> Candidate:
+def _candidate(training: Training, iteration: int, validated: list[list[float]]) -> Candidate:
     state = training.state
     degree = state.sh_degree(state.iteration, training.config)
     return candidate(iteration, len(state.gaussians), degree, validated, training.config)

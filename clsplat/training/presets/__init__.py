@@ -56,8 +56,8 @@ def load_config(path: Path) -> TrainConfig:
     Raises
     ------
     InputError
-        If the file cannot be read or is not an object of settings, if `TrainConfig` has no such setting, or if a value
-        has another type or is not among its choices; the message names file and setting.
+        If the file cannot be read or is not an object of settings, if `TrainConfig` has no such setting, or if a
+        value has another type or is not among its choices; the message names file and setting.
     """
     settings = read_settings(path)
     settings.pop(DATA_PATH, None)

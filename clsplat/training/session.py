@@ -1,0 +1,197 @@
+"""A training session: iterations of algorithm 1 of Kerbl et al. 2023, which can be run up to a point and forked."""
+
+import warnings
+from collections.abc import Callable
+from copy import copy
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.constants import ALPHA_MIN
+from clsplat.gaussians import Gaussians, logit
+from clsplat.randomness import stream
+from clsplat.renderer import Renderer, fetch
+from clsplat.scene import Scene, View
+from clsplat.stages import Dropout
+from clsplat.training.autosize.validation import split
+from clsplat.training.coarse_to_fine import factor_at, shrunk
+from clsplat.training.contributions import contributions
+from clsplat.training.corrections import compare, example, learn_pose
+from clsplat.training.densify import Contributions, Edit
+from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
+from clsplat.training.optimizer import Optimizer, adam_settings
+from clsplat.training.rows import Rows
+from clsplat.training.state import State
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+
+class Training:
+    """A training that can be run up to an iteration, and forked.
+
+    Parameters
+    ----------
+    scene : Scene
+        With at least one photo to train on.
+    config : TrainConfig
+    device : Device
+    state : State
+        The state to go on from.
+    """
+
+    def __init__(self, scene: Scene, config: TrainConfig, device: "Device", state: State):
+        self.scene, self.config, self.device, self.state = scene, config, device, state
+        self.renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
+        self.optimizer = Optimizer(self.renderer, config.optimizer)
+        self.photos = Photos(device)
+        self._views: list[View] = scene.train
+        self._views_of = 1, False  # the divisor of their edges, and whether blocks of them validate
+        if state.filter and state.filter.pixels is not None:  # of a checkpoint
+            state.filter.pixels = self.renderer.upload("pixel sizes", state.filter.pixels)
+
+    @cached_property
+    def need(self) -> Footprint:
+        """Device memory that the training takes."""
+        return Footprint.of(self.scene, self.config, self.device)
+
+    def fork(self, state: State) -> "Training":
+        """A training of the same scene that goes on from another state."""
+        result = copy(self)
+        result.state = state
+        return result
+
+    def run_until(self, last: int, after: Callable[["Training", float], None]) -> None:
+        """Run the iterations up to `last`, and call `after` with the training and the loss after each."""
+        if self.state.iteration < last:
+            self.state.move(self.optimizer.home)
+        while self.state.iteration < last:
+            after(self, self.advance())
+
+    def advance(self) -> float:
+        """Run one iteration, and the edit that is due after it. Returns the loss."""
+        iteration = self.state.iteration + 1
+        self._choose_views(iteration)
+        intersections = self.state.intersections or INTERSECTIONS
+        in_use = self.need.total(len(self.state.gaussians), intersections)
+        self.photos.keep_within(self.device.memory_limit - in_use)
+        self.refresh_filter()
+        loss = step(self, view_at(iteration, self._views, self.config.seed))
+        if self.state.strategy.due(iteration):
+            self.densify(self._cap())
+        if self.state.filter and self.state.filter.due(iteration):
+            self._measure_filter()
+        return loss
+
+    def _choose_views(self, iteration: int) -> None:
+        """Take the photos of an iteration: at their size then, without blocks that validate."""
+        wanted = factor_at(iteration, self.config), bool(self.state.search and self.state.search.validates(iteration))
+        if self._views_of != wanted:
+            factor, validates = self._views_of = wanted
+            views = split(self.scene.train)[0] if validates else self.scene.train
+            self._views, self.photos = [shrunk(view, factor) for view in views], Photos(self.device)
+
+    def refresh_filter(self) -> None:
+        """Measure the pixel sizes of the 3D filter, if there is one and its rows have changed."""
+        if self.state.filter and self.state.filter.pixels is None:
+            self._measure_filter()
+
+    def _measure_filter(self) -> None:
+        assert self.state.filter
+        self.state.filter.measure(self.renderer.stages, self.renderer.place(self.state.gaussians), self._views)
+
+    def _cap(self) -> int:
+        """Largest number of Gaussians after the next edit.
+
+        It is the user's limit, or what fits the device, or what the search allows; with too few photos for a search,
+        the present number.
+        """
+        fitting = self.need.most_gaussians(self.device.memory_limit, self.state.intersections)
+        cap, n = min(self.config.max_gaussians or fitting, fitting), len(self.state.gaussians)
+        if self.config.size == "auto":
+            return min(cap, self.state.search.most if self.state.search else n)
+        if n >= fitting:
+            warnings.warn(f"no more than {fitting} Gaussians fit the memory: growth stops", stacklevel=2)
+        return cap
+
+    def densify(self, cap: int) -> None:
+        """Make the edit that is due after the last iteration.
+
+        Not a part of `step`, whose arrays of the old size must be freed before those of the new one are allocated.
+        """
+        self.state.change_rows(self._edited(cap))
+        self.state.move(self.optimizer.home)
+
+    def _edited(self, cap: int) -> Rows:
+        state = self.state
+        shown = fetch(state.shown(self.renderer)) if state.filter else None
+        surveyed = shown or state.gaussians
+        sh_degree = state.sh_degree(state.iteration, self.config)
+
+        def survey(count: int) -> Contributions:
+            order = stream(self.config.seed, "surveyed views", state.iteration).permutation(len(self._views))
+            chosen = state.corrected([self._views[i] for i in order[:count]])
+            found = contributions(self.renderer, surveyed, chosen, sh_degree)
+            return found._replace(share=len(chosen) / len(self._views))
+
+        state.move(None)
+        edit = state.strategy.edit(state.iteration, state.gaussians, cap, survey)
+        if edit.reset_opacities and shown:
+            reset_shown(edit, state.gaussians, shown)
+        return state.rows.after(edit)
+
+
+def step(training: Training, view: View) -> float:
+    """Take one step: render a view, compare it with its photo, differentiate, update. Returns the loss."""
+    state, config, renderer, optimizer = training.state, training.config, training.renderer, training.optimizer
+    iteration = state.iteration + 1
+    progress = (iteration - 1) / max(config.iterations - 1, 1)
+    sh_degree = state.sh_degree(iteration, config)
+    dropout = Dropout(config.dropout * progress, config.seed, iteration) if config.dropout else None
+    seen = example(view, iteration, state, training.photos, config, renderer)
+
+    gaussians = state.shown(renderer)
+    run = renderer.forward(gaussians, seen.camera, sh_degree, background=seen.background, dropout=dropout)
+    loss, v_image = compare(run.image, seen, progress, state, config, renderer)
+    v_splats = renderer.backward_to_splats(run, v_image)
+
+    strategy, size = state.strategy, (seen.camera.width, seen.camera.height)
+    if strategy.watches(iteration):
+        statistics = optimizer.bring(run.splats.extents), optimizer.bring(v_splats.means2d)
+        strategy.observe(optimizer.stages, *statistics, *size)
+    penalties = (*strategy.penalties(len(gaussians)), config.optim.erank_penalty / len(gaussians))
+    settings = adam_settings(iteration, progress, state.extent, config.optim, sh_degree, penalties)
+    v_camera = optimizer.step(
+        state.gaussians, state.moments, state.filter, run, v_splats, settings, camera_grad=state.poses is not None
+    )
+    learn_pose(seen, v_camera, progress, state, config)
+    strategy.perturb(optimizer.stages, state.gaussians, iteration, settings.rates["means"])
+    state.intersections = max(state.intersections, run.bins.gauss_ids.shape[0] / len(gaussians))
+    state.iteration = iteration
+    return loss
+
+
+def view_at(iteration: int, views: list[View], seed: int) -> View:
+    """The view of an iteration, counted from 1: every epoch takes all views in an order of its own."""
+    epoch, position = divmod(iteration - 1, len(views))
+    return views[stream(seed, "order of the views", epoch).permutation(len(views))[position]]
+
+
+def reset_shown(edit: Edit, gaussians: Gaussians, shown: Gaussians) -> None:
+    """Lower to the reset's value the opacities that are shown under the 3D filter, and not those that train.
+
+    Otherwise the filter would lower them further, and a Gaussian that becomes invisible has no gradient.
+
+    Parameters
+    ----------
+    edit : Edit
+        A reset; its opacities are changed in place.
+    gaussians, shown : Gaussians
+        Before the edit: as they train, and under the filter.
+    """
+    before = gaussians.opacities[edit.rows]
+    raised = edit.gaussians.opacities * before / np.maximum(shown.opacities[edit.rows], ALPHA_MIN)
+    most = np.minimum(before, 1 - 1e-6)  # whose logit is finite
+    edit.gaussians.logit_opacities[:] = logit(np.clip(raised, edit.gaussians.opacities, most))
