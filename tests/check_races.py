@@ -225,7 +225,9 @@ def pipeline(device, compositor, tile_size):
     v = rng.normal(size=(21, 37, 3))
     for opacity_logit, scale in ((-2, 1), (5, 3)):
         gaussians = scene(160, opacity_logit, scale)
-        found, expected = (render(gaussians, camera, config, d, background=(0.1, 0.5, 0.9)) for d in (device, None))
+        found, expected = (
+            render(gaussians, camera, config, where, background=(0.1, 0.5, 0.9)) for where in (device, "reference")
+        )
         np.testing.assert_allclose(found.rgb, expected.rgb, atol=1e-12)
         v_found, v_expected = (r.backward(v, viewmat_grad=True) for r in (found, expected))
         for name, array in v_expected.gaussians.arrays().items():

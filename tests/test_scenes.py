@@ -8,6 +8,7 @@ from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.dataset import load_scene
 from clsplat.device import Device
 from clsplat.evaluate import mean_metrics
+from clsplat.renderer import Renderer
 from clsplat.training.loop import train
 
 
@@ -28,6 +29,7 @@ def test_held_out_quality(
     scene = load_scene(shared / "data" / name, data)
     config = TrainConfig(strategy="adc", size="fixed", iterations=iterations, data=data)
     gaussians = train(scene, config, tmp_path, device)
-    figures = mean_metrics(gaussians, scene.test, config.render, device, BACKGROUNDS[data.background])
+    renderer = Renderer(device, config.render, BACKGROUNDS[data.background])
+    figures = mean_metrics(gaussians, scene.test, renderer)
     print(name, figures, len(gaussians))
     assert figures["psnr"] > psnr

@@ -4,7 +4,7 @@
 """
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,9 @@ from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
 from clsplat.dataset import load_scene
 from clsplat.device import Device
 from clsplat.formats import load_gaussians
-from clsplat.pruning.compaction import Judge
+from clsplat.pruning.compaction import LossMeter
 from clsplat.pruning.prices import price, removal_order
+from clsplat.renderer import Renderer
 
 LOSSES = (0.1, 0.5, 1.0)
 
@@ -35,22 +36,22 @@ class Arguments:
 def main() -> None:
     arguments = tyro.cli(Arguments, description=Arguments.__doc__)
     gaussians, mode, _ = load_gaussians(arguments.scene)
-    n, device, config = len(gaussians), Device(), replace(RenderConfig(), mode=mode)
-    background = BACKGROUNDS[arguments.data.background]
+    n = len(gaussians)
+    renderer = Renderer(Device(), RenderConfig(mode=mode), BACKGROUNDS[arguments.data.background])
     scene = None if arguments.photos is None else load_scene(arguments.photos, arguments.data)
     command = Compact(arguments.scene, Path("-"), photos=arguments.photos, data_config=arguments.data)
-    priced, judging = command._views(gaussians, scene, config, device)
-    judge = Judge(gaussians, judging, arguments.photos is not None, config, device, background)
+    pricing, evaluation = command._views(gaussians, scene, renderer)
+    measured = LossMeter(gaussians, evaluation, arguments.photos is not None, renderer)
 
     def fewest(order: np.ndarray, loss: float) -> int:
         low, high = 1, n
         while high / low > 1.01 and high > low + 1:
             middle = int(np.sqrt(low * high))
-            low, high = (low, middle) if judge(gaussians.take(np.sort(order[:middle]))) <= loss else (middle, high)
+            low, high = (low, middle) if measured(gaussians.take(np.sort(order[:middle]))) <= loss else (middle, high)
         return high
 
     started = time.perf_counter()
-    prices = price(gaussians, priced, config, device, background)
+    prices = price(gaussians, pricing, renderer)
     once = time.perf_counter() - started
     orders = {
         "opacity": np.argsort(-gaussians.opacities, kind="stable"),
@@ -59,11 +60,11 @@ def main() -> None:
     }
 
     def done(left: object) -> bool:
-        return judge(left) > LOSSES[-1]
+        return measured(left) > LOSSES[-1]
 
-    orders["price, in rounds"] = removal_order(gaussians, priced, done, config, device, background)
+    orders["price, in rounds"] = removal_order(gaussians, pricing, done, renderer)
     seconds = time.perf_counter() - started
-    print(f"{arguments.scene.name}: {n} Gaussians, {len(priced)} views price, {len(judging)} judge")
+    print(f"{arguments.scene.name}: {n} Gaussians, {len(pricing)} views price, {len(evaluation)} measure the loss")
     print(f"prices once {once:.0f} s, in rounds {seconds:.0f} s")
     for name, order in orders.items():
         counts = [fewest(order, loss) for loss in LOSSES]
