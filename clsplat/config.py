@@ -92,7 +92,7 @@ class InitConfig:
     """Half edge of the box of a random start, as a fraction of the cameras' mean distance from the point they look
     at. For NeRF-synthetic scenes (distance 4) the box is that of the original within 3 %."""
     opacity: float | None = None
-    """Opacity of the first Gaussians. Default: 0.1 for the strategy adc, 0.5 for the others."""
+    """Opacity of the first Gaussians. Default: the strategy's, which is 0.1 for adc, 0.5 for mcmc and error."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """Highest degree of the spherical harmonics."""
 

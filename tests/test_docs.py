@@ -68,11 +68,19 @@ def test_every_constant_says_why():
 
 def test_every_stage_has_a_page_with_twin_and_kernel():
     stages = {getattr(ops, name).__module__.rsplit(".", 1)[1] for name in FUNCTIONS}
+    index = (DOCS / "stages" / "index.md").read_text()
     for stage in stages:
+        assert f"\n{stage}\n" in index, stage
         page = (DOCS / "stages" / f"{stage}.md").read_text()
         assert f"literalinclude}} ../../clsplat/reference/{stage}.py" in page, stage
         kernels = [p.name for p in (ROOT / "cl").glob(f"{stage}*.cl")]
         assert kernels and all(f"literalinclude}} ../../cl/{name}" in page for name in kernels), stage
+
+
+def test_every_function_of_a_stage_is_listed():
+    page = (DOCS / "api" / "stages.rst").read_text()
+    for name in FUNCTIONS:
+        assert f"\n.. autofunction:: {name}\n" in page, name
 
 
 def test_every_header_is_on_a_page():

@@ -46,11 +46,10 @@ class Info:
 
 def scene_lines(path: Path) -> list[str]:
     """Describe a file of Gaussians."""
-    from clsplat.formats import load_gaussians, suffix_of
-    from clsplat.formats.anatomy import ANATOMIES
+    from clsplat.formats import FORMATS, load_gaussians, suffix_of
 
     gaussians, mode, offset = load_gaussians(path)
-    anatomy = ANATOMIES[suffix_of(path) or ".sog"](path)
+    anatomy = FORMATS[suffix_of(path) or ".sog"].anatomy(path)
     size = path.stat().st_size if suffix_of(path) else sum(anatomy.parts.values())
     low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
     first, middle, last = np.percentile(gaussians.means, [1, 50, 99], axis=0)

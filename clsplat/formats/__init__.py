@@ -1,4 +1,4 @@
-"""Files of Gaussians: a reader and a writer for each format in `FORMATS`.
+"""Files of Gaussians: a reader, a writer and an anatomy for each format in `FORMATS`.
 
 Belongs here: one module per format, and what formats share: `validity` (all of them), `quantisation` and `codebook`
 (the compact ones), `ply_container` (the two in PLY), `anatomy` (bytes by part). Does not belong here: photos, cameras
@@ -7,12 +7,21 @@ and datasets (`clsplat.dataset`), and pruning a scene until it fits (`clsplat.pr
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.config import Mode
 from clsplat.errors import InputError
+from clsplat.formats.anatomy import (
+    Anatomy,
+    compressed_ply_anatomy,
+    ply_anatomy,
+    sog_anatomy,
+    splat_anatomy,
+    spz_anatomy,
+)
 from clsplat.formats.compressed_ply import load_compressed_ply, save_compressed_ply
 from clsplat.formats.ply import load_ply, save_ply
 from clsplat.formats.sog import META, load_sog, save_sog
@@ -20,19 +29,28 @@ from clsplat.formats.splat import load_splat, save_splat
 from clsplat.formats.spz import load_spz, save_spz
 from clsplat.gaussians import Gaussians
 
-__all__ = ["FORMATS", "load_gaussians", "save_gaussians"]
+__all__ = ["FORMATS", "Format", "load_gaussians", "save_gaussians"]
 
 Loader = Callable[[str | Path], tuple[Gaussians, Mode, NDArray[np.float64]]]
 Saver = Callable[[str | Path, Gaussians, Mode, ArrayLike | None], None]
 
-# Suffix of the file name -> (load, save). If several suffixes fit, the longest is used.
-FORMATS: dict[str, tuple[Loader, Saver]] = {
-    ".ply": (load_ply, save_ply),
-    ".compressed.ply": (load_compressed_ply, save_compressed_ply),
-    ".splat": (load_splat, save_splat),
-    ".spz": (load_spz, save_spz),
-    ".sog": (load_sog, save_sog),
+
+class Format(NamedTuple):
+    """The functions of a format: reader, writer, and what ``clsplat info`` shows of a file."""
+
+    load: Loader
+    save: Saver
+    anatomy: Callable[[Path], Anatomy]
+
+
+FORMATS: dict[str, Format] = {
+    ".ply": Format(load_ply, save_ply, ply_anatomy),
+    ".compressed.ply": Format(load_compressed_ply, save_compressed_ply, compressed_ply_anatomy),
+    ".splat": Format(load_splat, save_splat, splat_anatomy),
+    ".spz": Format(load_spz, save_spz, spz_anatomy),
+    ".sog": Format(load_sog, save_sog, sog_anatomy),
 }
+"""Formats by the suffix of the file name. If several suffixes fit, the longest is used."""
 
 
 def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
@@ -60,7 +78,7 @@ def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float6
         If no format has this suffix, or the file is not a valid file of its format; the message names it.
     """
     unpacked = Path(path).is_dir() or Path(path).name == META
-    return load_sog(path) if unpacked else _format(path)[0](path)
+    return load_sog(path) if unpacked else _format(path).load(path)
 
 
 def save_gaussians(
@@ -89,7 +107,7 @@ def save_gaussians(
     UserWarning
         If the format cannot hold the mode, the offset, bands of the spherical harmonics or some values.
     """
-    _format(path)[1](path, gaussians, mode, offset)
+    _format(path).save(path, gaussians, mode, offset)
 
 
 def suffix_of(path: str | Path) -> str:
@@ -98,7 +116,7 @@ def suffix_of(path: str | Path) -> str:
     return max((suffix for suffix in FORMATS if name[1:].endswith(suffix)), key=len, default="")
 
 
-def _format(path: str | Path) -> tuple[Loader, Saver]:
+def _format(path: str | Path) -> Format:
     suffix = suffix_of(path)
     if not suffix:
         raise InputError(

@@ -1,6 +1,7 @@
 """The anatomy of a file of Gaussians: format and version, bytes by part, comments.
 
-The functions expect files that `clsplat.formats.load_gaussians` has read without an error.
+There is a function for each format in `clsplat.formats.FORMATS`. The functions expect files that
+`clsplat.formats.load_gaussians` has read without an error.
 """
 
 import gzip
@@ -8,7 +9,6 @@ import json
 import struct
 import zipfile
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ class Anatomy:
     comments: list[str] = field(default_factory=list)
 
 
-def _ply(path: Path) -> Anatomy:
+def ply_anatomy(path: Path) -> Anatomy:
     with open(path, "rb") as file:
         header = read_header(path, file)
     kind = {"<": "binary, little endian", ">": "binary, big endian", "=": "text"}[header.order]
@@ -65,7 +65,7 @@ def _part_of(column: str) -> str:
     return next((name for name, columns in groups.items() if column in columns), "other properties")
 
 
-def _compressed_ply(path: Path) -> Anatomy:
+def compressed_ply_anatomy(path: Path) -> Anatomy:
     with open(path, "rb") as file:
         header = read_header(path, file)
     elements, rows, order = header.elements, header.rows, header.order
@@ -82,13 +82,13 @@ def _compressed_ply(path: Path) -> Anatomy:
     return Anatomy("compressed PLY (PlayCanvas)", parts, comments=header.comments)
 
 
-def _splat(path: Path) -> Anatomy:
+def splat_anatomy(path: Path) -> Anatomy:
     count = path.stat().st_size // splat.ROW.itemsize
     names = {"means": "means", "scales": "scales", "rgb": "colours", "opacity": "opacities", "quats": "quaternions"}
     return Anatomy(".splat (antimatter15)", {name: count * splat.ROW[key].itemsize for key, name in names.items()})
 
 
-def _spz(path: Path) -> Anatomy:
+def spz_anatomy(path: Path) -> Anatomy:
     names = ("means", "opacities", "colours (sh of band 0)", "scales", "quaternions", "sh above band 0")
     data = path.read_bytes()
     zipped = data[:2] == b"\x1f\x8b"
@@ -107,7 +107,7 @@ def _spz(path: Path) -> Anatomy:
     return Anatomy(f"SPZ (Niantic), version {version}, {packing}", parts, packed=zipped, comments=comments)
 
 
-def _sog(path: Path) -> Anatomy:
+def sog_anatomy(path: Path) -> Anatomy:
     if path.is_dir() or path.name == sog.META:
         folder, kind = path if path.is_dir() else path.parent, "in a folder"
         meta = json.loads((folder / sog.META).read_bytes())
@@ -128,13 +128,3 @@ def _sog(path: Path) -> Anatomy:
 def _pictures(meta: dict[str, Any]) -> list[str]:
     groups = (meta[group] for group in ("means", "scales", "quats", "sh0", "shN") if group in meta)
     return [name for group in groups for name in group["files"]]
-
-
-ANATOMIES: dict[str, Callable[[Path], Anatomy]] = {
-    ".ply": _ply,
-    ".compressed.ply": _compressed_ply,
-    ".splat": _splat,
-    ".spz": _spz,
-    ".sog": _sog,
-}
-"""Functions by the suffixes of `clsplat.formats.FORMATS`."""

@@ -48,6 +48,15 @@ BOUNDS = {
         np.ptp(g.sh[:, 1:]) / 256 if g.sh_degree else 0,
     ),
 }
+
+# What each format stores in addition: the rendering mode, the world offset, bands of sh above 0.
+HOLDS = {
+    ".ply": {"mode", "offset", "sh"},
+    ".compressed.ply": {"mode", "offset", "sh"},
+    ".splat": set(),
+    ".spz": {"mode", "sh"},
+    ".sog": {"mode", "offset", "sh"},
+}
 SLACK = 1 + 1e-4
 """Factor on the bounds, in addition to 1e-6, since the arithmetic is float32."""
 

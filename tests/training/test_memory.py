@@ -8,9 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from every_strategy import with_rounds
 
 from clsplat.camera import Camera
-from clsplat.config import AdcConfig, ErrorConfig, McmcConfig, OptimConfig, RenderConfig, TrainConfig
+from clsplat.config import AdcConfig, OptimConfig, RenderConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
@@ -132,16 +133,9 @@ def test_a_start_that_does_not_fit_says_what_would() -> None:
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_growth_stops_where_memory_ends(tmp_path: Path, strategy: str) -> None:
     scene = make_scene(1500, 96, 64)
-    adc = AdcConfig(start=1, every=5, grad_threshold=1e-7, stop_fraction=1)
-    config = TrainConfig(
-        size="fixed",
-        iterations=30,
-        strategy=strategy,
-        max_gaussians=12_000,
-        adc=adc,
-        mcmc=McmcConfig(start=1, every=5),
-        error=ErrorConfig(start=1, every=5, stop_fraction=1),
-    )
+    adc = AdcConfig(grad_threshold=1e-7)
+    config = TrainConfig(size="fixed", iterations=30, strategy=strategy, max_gaussians=12_000, adc=adc)
+    config = with_rounds(config, start=1, every=5, stop_fraction=1)
     free = Device()
     grown = len(train(scene, config, tmp_path, free))
     limit = round(free.memory_peak / 2)

@@ -1,8 +1,9 @@
 """Schedule of strategies that grow to a cap: iterations of the rounds, and the number of Gaussians after each."""
 
 from math import ceil, sqrt
+from typing import Protocol
 
-from clsplat.config import ErrorConfig, McmcConfig, TrainConfig
+from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 
 TRIAL_LENGTH = 0.05
@@ -25,6 +26,21 @@ def growth_window(config: TrainConfig) -> int:
     return max(round(TRIAL_LENGTH * config.iterations), GROWTH_SHORTEST)
 
 
+class Growth(Protocol):
+    """Settings of a schedule, such as `clsplat.config.McmcConfig`."""
+
+    @property
+    def start(self) -> int: ...
+    @property
+    def stop_fraction(self) -> float: ...
+    @property
+    def every(self) -> int: ...
+    @property
+    def growth(self) -> float: ...
+    @property
+    def full_fraction(self) -> float: ...
+
+
 class Schedule:
     """Rounds at equal intervals, and growth by equal factors: to the cap, or by `TRIAL_GROWTH` in a window with
     ``--size auto``.
@@ -35,7 +51,7 @@ class Schedule:
         If there is no cap to grow to.
     """
 
-    def __init__(self, config: TrainConfig, settings: McmcConfig | ErrorConfig) -> None:
+    def __init__(self, config: TrainConfig, settings: Growth) -> None:
         if config.max_gaussians is None and config.size == "fixed":
             raise InputError(
                 f"--max-gaussians: expected with --strategy {config.strategy}, which grows to that number, found "
