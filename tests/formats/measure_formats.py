@@ -15,11 +15,10 @@ import tyro
 
 from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
 from clsplat.dataset import load_scene
-from clsplat.device import Device
 from clsplat.evaluate import mean_metrics
 from clsplat.formats import FORMATS, load_gaussians, save_gaussians
 from clsplat.metrics import psnr, to_uint8
-from clsplat.render import render
+from clsplat.renderer import Renderer, download
 
 
 @dataclass(frozen=True)
@@ -37,15 +36,14 @@ def main() -> None:
     arguments = tyro.cli(Arguments, description=Arguments.__doc__)
     gaussians, mode, _ = load_gaussians(arguments.scene)
     scene = load_scene(arguments.dataset, arguments.data)
-    device, config = Device(), RenderConfig(mode=mode)
-    background = BACKGROUNDS[arguments.data.background]
+    renderer = Renderer(None, RenderConfig(mode=mode), BACKGROUNDS[arguments.data.background])
 
     def renders(candidate):
-        images = (render(candidate, v.camera, config, device, background=background).rgb for v in scene.test)
-        return [to_uint8(image).astype(np.float32) / 255 for image in images]
+        images = (renderer.forward(candidate, v.camera, gradients=False).image.rgb for v in scene.test)
+        return [to_uint8(download(image)).astype(np.float32) / 255 for image in images]
 
     def score(candidate):
-        return mean_metrics(candidate, scene.test, config, device, background)["psnr"]
+        return mean_metrics(candidate, scene.test, renderer)["psnr"]
 
     before, reference, degree = renders(gaussians), score(gaussians), gaussians.sh_degree
     print(f"{arguments.scene}: {len(gaussians)} Gaussians, SH degree {degree}, PSNR {reference:.2f} dB\n")
