@@ -19,8 +19,9 @@ def info(path, capsys):
     """Run `clsplat info`; return the rows of the table by name, and the whole text."""
     main(["info", str(path)])
     text = capsys.readouterr().out
-    rows = (line.strip().split("  ", 1) for line in text.splitlines() if line.startswith("  "))
-    return {name: value.strip() for name, value in rows}, text
+    rows = [line.strip().split("  ", 1) for line in text.splitlines() if line.startswith("  ")]
+    # A part of a file may have the name of a row of the table, which precedes it.
+    return {name: value.strip() for name, value in reversed(rows)}, text
 
 
 @pytest.fixture
