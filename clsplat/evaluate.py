@@ -50,7 +50,7 @@ def mean_metrics(
     def compare(_: int, view: View, image: NDArray[np.uint8]) -> list[float | None]:
         return [metric(image, view.image, view.mask) for metric in metrics]
 
-    figures = zip(*_compared(compare, gaussians, list(views), renderer or Renderer()), strict=True)
+    figures = zip(*compared(compare, gaussians, list(views), renderer or Renderer()), strict=True)
     return {m.__name__: _mean(values) for m, values in zip(metrics, figures, strict=True)}
 
 
@@ -109,7 +109,7 @@ def evaluate(
         size = {"width": view.camera.width, "height": view.camera.height}
         return {"name": view.name, **metrics, **size, **files}
 
-    records = _compared(compare, gaussians, views, renderer)
+    records = compared(compare, gaussians, views, renderer)
 
     result = {
         "mean": {metric: _mean([r[metric] for r in records]) for metric in ("psnr", "psnr_fitted", "ssim", "flip")},
@@ -126,18 +126,19 @@ def evaluate(
     return result
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if len(known) == len(values) else None
-
-
-def _compared(
+def compared(
     compare: Callable[[int, View, NDArray[np.uint8]], Result],
     gaussians: Gaussians,
     views: list[View],
     renderer: Renderer,
 ) -> list[Result]:
-    """Call `compare` for each view, with its index and its render in 8 bits, on threads."""
+    """Call `compare` for each view, with its index, the view and its render in 8 bits, on threads; list the results.
+
+    Raises
+    ------
+    InputError
+        If there is no view, or a view's photo is not of its camera's size.
+    """
     if not views:
         raise InputError("views: expected at least one view to evaluate, found none")
     for view in views:
@@ -148,6 +149,11 @@ def _compared(
     images = (to_uint8(rendering.rgb) for rendering in renderings(renderer, gaussians, cameras))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(compare, range(len(views)), views, images))
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
 
 
 def _file_names(views: list[View]) -> list[str]:

@@ -145,7 +145,8 @@ class Quality:
 
     data: tyro.conf.Positional[tuple[str, ...]]
     """Datasets, as for `train`. Options for reading the photos follow a colon: lego:background=white,
-    fern:downscale=2."""
+    fern:downscale=2. So do options for a variant: thin=4 (every 4th training photo), arc=0.2 (the end of the path is
+    held out), points=0.1 (a tenth of the sparse points)."""
     methods: tuple[str, ...] = ("paper-7k", "fast")
     """Presets of `train`, or configuration files as for its --config."""
     budgets: tuple[str, ...] = ("own",)
@@ -153,6 +154,8 @@ class Quality:
     40000."""
     iterations: tuple[int, ...] = ()
     """Numbers of iterations; default: that of each method."""
+    seeds: tuple[int, ...] = ()
+    """Seeds, each of which repeats all trainings; default: that of each method."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("clsplat-quality")
     """Folder for results.jsonl and the charts. Finished trainings in it are not repeated; failed ones are."""
     device: str | None = None
@@ -167,7 +170,7 @@ class Quality:
         from clsplat.bench.results import FILE
         from clsplat.device import Device, select_device
 
-        cells = make_cells(self.data, self.methods, self.budgets, self.iterations, self.memory_limit)
+        cells = make_cells(self.data, self.methods, self.budgets, self.iterations, self.memory_limit, self.seeds)
         device = Device(select_device(self.device))
         _say(f"device: {device.label}")
         try:

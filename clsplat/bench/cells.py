@@ -3,10 +3,12 @@
 import json
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+from clsplat.bench.captures import Capture
 from clsplat.bench.results import Record
 from clsplat.config import DataConfig, TrainConfig
 from clsplat.errors import InputError
@@ -18,14 +20,18 @@ AUTO = "auto"
 OWN = "own"
 """Name of the budget that keeps the cap of the method's own settings."""
 
+CAPTURE = tuple(field.name for field in fields(Capture))
+"""Options of a dataset that make a variant of it; all others are for reading it."""
+
 
 @dataclass(frozen=True)
 class Source:
-    """A dataset with the options for reading it. `name` identifies it in results."""
+    """A dataset, the options for reading it, and the variant of it. `name` identifies all of them in results."""
 
     name: str
     path: Path
     data: DataConfig
+    capture: Capture
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,7 @@ class Cell:
             "method": self.method,
             "max_gaussians": self.config.max_gaussians,
             "iterations": self.config.iterations,
+            "seed": self.config.seed,
             "device": device,
         }
 
@@ -51,25 +58,28 @@ class Cell:
         """Description for messages."""
         cap = self.config.max_gaussians
         limit = "" if cap is None else f", at most {cap:,} Gaussians"
-        return f"{self.source.name}, {self.method}{limit}, {self.config.iterations:,} iterations"
+        seed = f", seed {self.config.seed}" if self.config.seed else ""
+        return f"{self.source.name}, {self.method}{limit}, {self.config.iterations:,} iterations{seed}"
 
 
 def parse_source(text: str) -> Source:
-    """Parse a dataset of the command line: FOLDER, or FOLDER:downscale=2:background=white.
+    """Parse a dataset of the command line: FOLDER, or FOLDER:downscale=2:background=white:thin=4.
 
     Raises
     ------
     InputError
-        If an option is not a setting of `DataConfig`, or its value is invalid.
+        If an option is a setting of neither `DataConfig` nor `Capture`, or its value is invalid.
     """
     # Colons before the first option belong to the path, for example after the letter of a drive.
     match = re.fullmatch(r"(.+?)((?::\w+=[^:]*)*)", text, flags=re.DOTALL)
     if match is None:
         raise InputError(f"data: expected a folder, found {text!r}")
     options = dict(option.split("=", 1) for option in match[2].split(":")[1:])
-    data = with_settings(DataConfig(), {name: _value(value) for name, value in options.items()}, text)
+    values = {name: _value(value) for name, value in options.items()}
+    variant = {name: values.pop(name) for name in CAPTURE if name in values}
+    data = with_settings(DataConfig(), values, f"{text} (variants: {', '.join(CAPTURE)})")
     path = Path(match[1])
-    return Source(path.resolve().name + match[2], path, data)
+    return Source(path.resolve().name + match[2], path, data, with_settings(Capture(), variant, text))
 
 
 def _value(text: str) -> Any:
@@ -114,8 +124,9 @@ def make_cells(
     budgets: Iterable[str],
     iterations: Iterable[int],
     memory_limit: str | None = None,
+    seeds: Iterable[int] = (),
 ) -> list[Cell]:
-    """All combinations of scene, method, budget and number of iterations, without duplicates.
+    """All combinations of seed, scene, method, budget and number of iterations, in this order, without duplicates.
 
     Parameters
     ----------
@@ -129,6 +140,9 @@ def make_cells(
         Numbers of iterations. If empty, the number of each method.
     memory_limit : str, optional
         As in `TrainConfig`.
+    seeds : iterable of int
+        Seeds. If empty, the seed of each method. An interrupted bench has finished all trainings of the first seed
+        before those of the next one.
 
     Raises
     ------
@@ -139,23 +153,26 @@ def make_cells(
     for number in iterations:
         if number < 1:
             raise InputError(f"--iterations: expected 1 or more, found {number}")
+    for given in (seeds := list(seeds)):
+        if given < 0:
+            raise InputError(f"--seeds: expected 0 or more, found {given}")
     named_sources = _distinct([parse_source(text) for text in dict.fromkeys(sources)], lambda s: s.name, "data")
     named_methods = _distinct([parse_method(text) for text in dict.fromkeys(methods)], lambda m: m[0], "--methods")
-    for source in named_sources:
-        for method, base in named_methods:
-            for budget in budgets:
-                for number in iterations or [base.iterations]:
-                    config = replace(
-                        base,
-                        iterations=number,
-                        max_gaussians=parse_budget(budget, base.max_gaussians),
-                        data=source.data,
-                        # Checkpoints cost time: write one only at the end, which is not timed.
-                        checkpoint_every=number,
-                        device=None,
-                        memory_limit=memory_limit,
-                    )
-                    cells.append(Cell(source, method, config))
+    for of_cell in product(seeds or (None,), named_sources, named_methods, list(budgets)):
+        seed, source, (method, base), budget = of_cell
+        for number in iterations or [base.iterations]:
+            config = replace(
+                base,
+                iterations=number,
+                max_gaussians=parse_budget(budget, base.max_gaussians),
+                seed=base.seed if seed is None else seed,
+                data=source.data,
+                # Checkpoints cost time: write one only at the end, which is not timed.
+                checkpoint_every=number,
+                device=None,
+                memory_limit=memory_limit,
+            )
+            cells.append(Cell(source, method, config))
     return list(dict.fromkeys(cells))
 
 

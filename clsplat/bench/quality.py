@@ -1,6 +1,5 @@
 """Quality against time, Gaussians, bytes and memory: trainings by several methods, measured while they run."""
 
-import math
 import tempfile
 import time
 import warnings
@@ -13,20 +12,19 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from clsplat.bench.captures import captured
 from clsplat.bench.cells import Cell, Source, differences
+from clsplat.bench.coverage import rare_pixels
 from clsplat.bench.environment import describe
+from clsplat.bench.measures import Masks, frames_per_second, measure, rare_share, training_psnr
 from clsplat.bench.results import KEYS, Record, append_record, read_records, write_records
-from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.dataset import load_scene
 from clsplat.device import Device
 from clsplat.errors import ClsplatError, InputError
-from clsplat.evaluate import mean_metrics
-from clsplat.formats import save_gaussians
 from clsplat.gaussians import Gaussians
-from clsplat.metrics import flip, psnr, ssim
-from clsplat.render import renderings
 from clsplat.renderer import Renderer, fetch
-from clsplat.scene import Scene, View
+from clsplat.scene import Scene
 from clsplat.training.loop import train
 from clsplat.training.preparation import prepare
 
@@ -38,9 +36,6 @@ FIRST_SAMPLE = 1 / 50
 
 WARM_UP = 4
 """Number of iterations of a separate training before the clock starts. Drivers finish kernels at their first run."""
-
-FRAMES = 5
-"""Number of times that each held-out view is rendered for the rate of frames."""
 
 
 def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[str], None]) -> None:
@@ -74,8 +69,7 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
         "commit": about["software"]["commit"],
         "load": about["load"],
     }
-    source: Source | None = None
-    scene: Scene | ClsplatError | None = None
+    reader = Reader()
     for number, cell in enumerate(missing, start=1):
         say(f"[{number}/{len(missing)}] {cell.label}")
 
@@ -85,13 +79,9 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
             append_record(results, key | values | environment | {"date": now})
 
         try:
-            if cell.source != source:
-                source, scene = cell.source, None  # frees the memory of the previous photos
-                scene = _load(source)
-            if not isinstance(scene, Scene):
-                raise scene or ClsplatError(f"cannot read {cell.source.path}, see above")
-            start, config = prepare(source.path, cell.config, device, scene=scene)
-            last = run_cell(config, start, device, record)
+            scene, rare = reader.read(cell.source)
+            start, config = prepare(cell.source.path, cell.config, device, scene=scene)
+            last = run_cell(config, start, device, record, rare)
             flips = "" if last["flip"] is None else f", FLIP {last['flip']:.3f}"
             say(
                 f"    {last['psnr']:.2f} dB, SSIM {last['ssim']:.3f}{flips}; {last['seconds']:.0f} s, "
@@ -103,13 +93,42 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
             say(f"    failed: {reason}")
 
 
-def _load(source: Source) -> Scene | ClsplatError:
-    """The scene, or the error that each of its cells reports, without another attempt."""
-    try:
-        scene = load_scene(source.path, source.data)
-    except ClsplatError as error:
-        return error
-    return scene if scene.test else InputError(f"{source.path}: expected held-out photos to measure on, found none")
+Variant = tuple[Scene, Masks | None]
+
+
+class Reader:
+    """Reads datasets and makes variants of them. The last dataset and the last variant are kept."""
+
+    def __init__(self) -> None:
+        self._dataset: tuple[Path, DataConfig, Scene] | None = None
+        self._source: Source | None = None
+        self._variant: Variant | ClsplatError | None = None
+
+    def read(self, source: Source) -> Variant:
+        """Make the variant of a dataset, and find its rare pixels.
+
+        An error is raised again, without another attempt, for as long as the same source is read.
+        """
+        if source != self._source:
+            self._source, self._variant = source, None
+            try:
+                self._variant = self._make(source)
+            except ClsplatError as error:
+                self._variant = error
+        if not isinstance(self._variant, tuple):
+            raise self._variant or ClsplatError(f"cannot read {source.path}, see above")
+        return self._variant
+
+    def _make(self, source: Source) -> Variant:
+        if self._dataset is None or self._dataset[:2] != (source.path, source.data):
+            self._dataset = None  # frees the memory of the previous photos
+            self._dataset = source.path, source.data, load_scene(source.path, source.data)
+        whole = self._dataset[2]
+        scene = captured(whole, source.capture)
+        if not scene.test:
+            raise InputError(f"{source.path}: expected held-out photos to measure on, found none")
+        # All points of the dataset: which pixels are rare does not depend on the points from which training starts.
+        return scene, rare_pixels(scene, whole.points)
 
 
 def _reason(error: Exception, path: Path) -> str:
@@ -123,8 +142,14 @@ def _finished(cell: Cell, records: list[Record], device: str) -> bool:
     return any("fps" in r and {k: r.get(k) for k in wanted} == wanted for r in records)
 
 
-def run_cell(config: TrainConfig, scene: Scene, evaluator: Device, record: Callable[[Record], None]) -> Record:
-    """Run one training, and return its last sample, which also has the rate of frames.
+def run_cell(
+    config: TrainConfig,
+    scene: Scene,
+    evaluator: Device,
+    record: Callable[[Record], None],
+    rare: Masks | None = None,
+) -> Record:
+    """Run one training, and return its last sample, which also has the PSNR of training photos and the frame rate.
 
     Parameters
     ----------
@@ -135,11 +160,13 @@ def run_cell(config: TrainConfig, scene: Scene, evaluator: Device, record: Calla
         Renders the held-out views. It is not the `Device` that trains, whose memory is measured.
     record : callable
         Receives each sample.
+    rare : list of (H, W) bool, optional
+        Pixels of each held-out photo whose PSNR is measured apart.
     """
     from clsplat.training.memory import parse_bytes
 
     limit = None if config.memory_limit is None else parse_bytes(config.memory_limit, "--memory-limit")
-    facts = _facts(scene)
+    facts = _facts(scene, rare)
     at = sample_iterations(config.iterations)
     renderer = Renderer(evaluator, config.render, BACKGROUNDS[config.data.background])
     device = Device(evaluator.cl_device, memory_limit=limit)
@@ -158,7 +185,7 @@ def run_cell(config: TrainConfig, scene: Scene, evaluator: Device, record: Calla
             now = np.array([clock() for clock in clocks])
             seconds, cpu_seconds = map(float, now - started - evaluating)
             values = facts | {"iteration": iteration, "seconds": seconds, "cpu_seconds": cpu_seconds}
-            values |= measure(fetch(gaussians), scene.test, renderer, out)
+            values |= measure(fetch(gaussians), scene.test, renderer, out, rare)
             values |= {"memory_bytes": device.memory_peak}
             evaluating += np.array([clock() for clock in clocks]) - now
             return values
@@ -178,48 +205,24 @@ def run_cell(config: TrainConfig, scene: Scene, evaluator: Device, record: Calla
                 scene, config, out, device, evaluate=evaluate, evaluate_after=set(at[:-1]), progress=progress
             )
         values = sample(config.iterations, gaussians)
+        values |= training_psnr(gaussians, scene.train, renderer)
         values |= {"fps": frames_per_second(gaussians, scene.test, renderer)}
         record(values)
     return values
 
 
-def _facts(scene: Scene) -> Record:
-    """Numbers of photos, and their largest size."""
+def _facts(scene: Scene, rare: Masks | None) -> Record:
+    """Numbers of photos, their largest size, and the fraction of held-out pixels that are rare."""
     views = scene.train + scene.test
     return {
         "train": len(scene.train),
         "test": len(scene.test),
         "width": max(view.camera.width for view in views),
         "height": max(view.camera.height for view in views),
+        "rare": rare_share(scene.test, rare),
     }
 
 
 def sample_iterations(iterations: int) -> list[int]:
     """Iterations after which samples are taken: a geometric sequence that includes the last iteration."""
     return sorted({int(i) for i in np.rint(np.geomspace(max(1, FIRST_SAMPLE * iterations), iterations, SAMPLES))})
-
-
-def measure(gaussians: Gaussians, views: list[View], renderer: Renderer, folder: Path) -> Record:
-    """Quality on held-out views, number of Gaussians, and sizes of files, which are written to `folder`."""
-    figures = mean_metrics(gaussians, views, renderer, metrics=(psnr, ssim, flip))
-    sizes = {}
-    for suffix in ("ply", "spz"):
-        path = folder / f"sample.{suffix}"
-        save_gaussians(path, gaussians, renderer.config.mode)
-        sizes[f"{suffix}_bytes"] = path.stat().st_size
-    finite = {name: value if value is not None and math.isfinite(value) else None for name, value in figures.items()}
-    return {"num_gaussians": len(gaussians), "sh_degree": gaussians.sh_degree, **sizes, **finite}
-
-
-def frames_per_second(gaussians: Gaussians, views: list[View], renderer: Renderer) -> float:
-    """Reciprocal of the median time from a camera to its image in the host's memory, 1/s."""
-    cameras = [view.camera for view in views]
-    # One round more than is timed: the first one includes work that the device does only once.
-    images = renderings(renderer, gaussians, cameras * (FRAMES + 1))
-    seconds = []
-    while True:
-        started = time.perf_counter()
-        if next(images, None) is None:
-            break
-        seconds.append(time.perf_counter() - started)
-    return 1 / float(np.median(seconds[len(cameras) :]))

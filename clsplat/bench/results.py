@@ -12,7 +12,7 @@ Record = dict[str, Any]
 FILE = "results.jsonl"
 """Name of the file."""
 
-KEYS = ("scene", "method", "max_gaussians", "iterations", "device")
+KEYS = ("scene", "method", "max_gaussians", "iterations", "seed", "device")
 """Entries of every record. Records that agree in all of them belong to one training."""
 
 

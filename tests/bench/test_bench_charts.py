@@ -32,7 +32,14 @@ SCENES = ("fox:downscale=2", "lego:background=white")
 
 
 def record(scene="fox", method="fast", cap=None, iterations=8, device="here", **values):
-    key = {"scene": scene, "method": method, "max_gaussians": cap, "iterations": iterations, "device": device}
+    key = {
+        "scene": scene,
+        "method": method,
+        "max_gaussians": cap,
+        "iterations": iterations,
+        "seed": 0,
+        "device": device,
+    }
     about = {"driver": "3", "compute_units": 2, "version": "1", "commit": "abc", "load": 0.5, "date": "2026-11-21T10"}
     return key | about | values
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from test_cli import fails, run, write_dataset
 
-from clsplat.bench import quality
+from clsplat.bench import measures, quality
+from clsplat.bench.captures import Capture
 from clsplat.bench.cells import Cell, differences, make_cells, parse_budget, parse_method, parse_source
 from clsplat.bench.quality import run_cell, run_cells, sample_iterations
 from clsplat.bench.quality_summary import COSTS
@@ -50,12 +51,20 @@ class TestCells:
         assert source.data == DataConfig(background="white", test_every=4)
         assert parse_source("C:/photos").path == Path("C:/photos")
         assert parse_source("C:/photos:downscale=2").data == DataConfig(downscale=2)
+        variant = parse_source("lego:thin=4:downscale=2:points=0.5")
+        assert (variant.data, variant.capture) == (DataConfig(downscale=2), Capture(thin=4, points=0.5))
+        assert source.capture == Capture()
 
     @pytest.mark.parametrize(
         ("text", "expected"),
         [
             ("a:downscal=2", "downscal: expected one of background"),
             ("a:downscale=3", "downscale: expected 1, 2, 4, 8"),
+            ("a:thinn=3", "variants: thin, arc, points.*thinn: expected one of"),
+            ("a:thin=0.5", "thin: expected"),
+            ("a:thin=0", "thin: expected 1 or more, found 0"),
+            ("a:arc=1", "arc: expected a fraction of the photos, .* found 1"),
+            ("a:points=0", "points: expected a fraction of the points, .* found 0"),
         ],
     )
     def test_invalid_options_are_refused(self, text, expected):
@@ -92,6 +101,14 @@ class TestCells:
         assert len(cells) == len(expected)
         assert [c.source.name for c in cells] == sorted(c.source.name for c in cells), "photos are read once"
         assert all(c.config.data.downscale == (2 if c.source.name != "b" else 1) for c in cells)
+
+    def test_all_trainings_of_a_seed_come_first(self):
+        cells = make_cells(["a", "b"], ["fast", "paper-7k"], ["own"], [], seeds=[5, 3])
+        assert [(c.config.seed, c.source.name, c.method) for c in cells] == [
+            (seed, scene, method) for seed in (5, 3) for scene in "ab" for method in ("fast", "paper-7k")
+        ]
+        with pytest.raises(InputError, match="--seeds: expected 0 or more, found -1"):
+            make_cells(["a"], ["fast"], ["own"], [], seeds=[0, -1])
 
     def test_a_methods_own_iterations(self):
         (cell,) = make_cells(["a"], ["paper-30k"], ["own"], [])
@@ -143,7 +160,8 @@ class TestOneTraining:
     def test_samples_are_where_they_should_be(self, trained):
         _, _, records, _ = trained
         assert [r["iteration"] for r in records] == sample_iterations(ITERATIONS)
-        assert ["fps" in r for r in records] == [False] * (len(records) - 1) + [True]
+        for name in ("fps", "train_psnr"):
+            assert [name in r for r in records] == [False] * (len(records) - 1) + [True]
         seconds = [r["seconds"] for r in records]
         assert seconds == sorted(seconds) and seconds[0] > 0
         assert all((r["train"], r["test"], r["width"], r["height"]) == (7, 2, 40, 32) for r in records)
@@ -176,6 +194,7 @@ class TestOneTraining:
             quality, "time", SimpleNamespace(perf_counter=lambda: clock.now, process_time=lambda: clock.now)
         )
         monkeypatch.setattr(quality, "frames_per_second", lambda *_: 1.0)
+        monkeypatch.setattr(quality, "training_psnr", lambda *_: {})
         some = Gaussians(*(np.zeros(0) for _ in range(5)))
 
         def training(scene, config, device, out, *, evaluate=None, evaluate_after=(), progress=None):
@@ -199,7 +218,7 @@ class TestOneTraining:
         _, scene, _, _ = trained
         clock = SimpleNamespace(now=0.0)
         monkeypatch.setattr(
-            quality, "time", SimpleNamespace(perf_counter=lambda: clock.now, process_time=lambda: clock.now)
+            measures, "time", SimpleNamespace(perf_counter=lambda: clock.now, process_time=lambda: clock.now)
         )
 
         def renderings(renderer, gaussians, cameras):
@@ -208,8 +227,8 @@ class TestOneTraining:
                 clock.now += 7.0 if i < len(scene.test) or i % 4 == 0 else 0.25
                 yield object()
 
-        monkeypatch.setattr(quality, "renderings", renderings)
-        assert quality.frames_per_second(None, scene.test, Renderer(device)) == 4.0
+        monkeypatch.setattr(measures, "renderings", renderings)
+        assert measures.frames_per_second(None, scene.test, Renderer(device)) == 4.0
 
 
 class TestBench:
@@ -250,10 +269,23 @@ class TestBench:
         path = tmp_path / "results.jsonl"
         records, _ = self.start(data, device, path, "plain")
         (cell,) = cells_of(data, "plain")
-        run_cells([replace(cell, config=replace(cell.config, seed=1))], device, path, lambda _: None)
+        changed = replace(cell, config=replace(cell.config, adc=AdcConfig(every=7)))
+        run_cells([changed], device, path, lambda _: None)
         again = read_records(path)
         assert len(again) == len(records)
-        assert all(r["settings"]["seed"] == 1 for r in again)
+        assert all(r["settings"]["adc"] == {"every": 7} for r in again)
+
+    def test_a_seed_keeps_the_records_of_the_others(self, data, device, tmp_path):
+        path = tmp_path / "results.jsonl"
+        records, _ = self.start(data, device, path, "plain")
+        cells = make_cells([str(data / "one")], [str(data / "plain.json")], ["own"], [], seeds=[0, 1])
+        said = []
+        run_cells(cells, device, path, said.append)
+        assert said[0].startswith("1 of 2 ")
+        again = read_records(path)
+        assert again[: len(records)] == records
+        assert [r["seed"] for r in again] == [0] * len(records) + [1] * len(records)
+        assert again[-1]["psnr"] != records[-1]["psnr"]
 
     def test_interruption_ends_it(self, data, device, tmp_path, monkeypatch):
         def interrupted(*_):
@@ -306,7 +338,7 @@ class TestBench:
 def test_the_file_of_results(tmp_path):
     path = tmp_path / "results.jsonl"
     assert read_records(path) == []
-    record = {"scene": "a", "method": "b", "max_gaussians": None, "iterations": 3, "device": "c"}
+    record = {"scene": "a", "method": "b", "max_gaussians": None, "iterations": 3, "seed": 0, "device": "c"}
     write_records(path, [record])
     append_record(path, record | {"psnr": 1.5})
     with path.open("a") as file:

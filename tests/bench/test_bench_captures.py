@@ -1,0 +1,280 @@
+"""Variants of scenes, the pixels that few training photos show, and the measures of overfitting."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_cli import write_dataset
+
+from clsplat.bench import measures
+from clsplat.bench.captures import STANDARD, Capture, arc, captured, thinned, with_fewer_points
+from clsplat.bench.cells import make_cells
+from clsplat.bench.coverage import rare_pixels
+from clsplat.bench.measures import measure, rare_share, training_psnr
+from clsplat.bench.quality import Reader, run_cells
+from clsplat.bench.results import read_records
+from clsplat.camera import Camera
+from clsplat.config import DataConfig
+from clsplat.dataset import load_scene
+from clsplat.errors import InputError
+from clsplat.metrics import psnr, to_uint8
+from clsplat.render import render
+from clsplat.renderer import Renderer
+from clsplat.scene import Scene, View
+from clsplat.testing import synthetic_scene
+
+WIDTH, HEIGHT = 70, 40
+WALL = 4.0
+
+
+def view(name, x=0.0, z=0.0, **camera):
+    """A photo from (x, 0, z), looking along z at a wall in the plane z = WALL."""
+    viewmat = np.eye(4)
+    viewmat[[0, 2], 3] = -x, -z
+    made = Camera(viewmat, 50, 50, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, **camera)
+    return View(name, made, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+
+
+def wall(spacing=0.05):
+    x, y = np.meshgrid(np.arange(-8, 8, spacing), np.arange(-4, 4, spacing))
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, WALL)], axis=1)
+
+
+def scene_of(train, test, points=None):
+    points = wall() if points is None else points
+    return Scene(train, test, points, np.arange(3 * len(points)).reshape(-1, 3).astype(np.uint8))
+
+
+def names(views):
+    return [v.name for v in views]
+
+
+@pytest.fixture
+def path():
+    """20 photos along a line, every 5th of them held out."""
+    views = [view(f"{i:02d}", x=0.1 * i) for i in range(20)]
+    return scene_of([v for i, v in enumerate(views) if i % 5], views[::5])
+
+
+class TestVariants:
+    def test_thinning_keeps_every_nth_training_photo(self, path):
+        found = thinned(path, 5)
+        assert names(found.train) == ["01", "07", "13", "19"]
+        assert found.test is path.test and found.points is path.points
+
+    def test_too_few_photos_are_refused(self, path):
+        assert len(thinned(path, 6).train) == 3
+        with pytest.raises(InputError, match="thin=8: expected at least 3 training photos to remain, found 2"):
+            thinned(path, 8)
+        with pytest.raises(InputError, match=r"arc=0\.9: expected at least 3 training photos to remain, found 2"):
+            arc(path, 0.9)
+
+    def test_an_arc_is_the_end_of_the_path(self, path):
+        found = arc(path, 0.2)
+        assert names(found.test) == ["16", "17", "18", "19"]
+        assert names(found.train) == [f"{i:02d}" for i in range(16)], "photos held out before are trained on"
+        assert len(arc(path, 0.001).test) == 1
+
+    def test_an_arc_includes_later_rounds_that_come_near(self):
+        line = [view(f"{i:02d}", x=0.1 * (i % 10)) for i in range(20)]
+        assert names(arc(scene_of(line, []), 0.2).test) == ["08", "09", "18", "19"]
+
+    def test_photos_of_one_place_stay_together(self):
+        pairs = [view(f"{i:02d}", x=0.1 * (i // 2)) for i in range(20)]
+        assert names(arc(scene_of(pairs, []), 0.25).test) == [f"{i:02d}" for i in range(14, 20)]
+
+    def test_fewer_points_are_spread_over_all(self, path):
+        found = with_fewer_points(path, 0.1)
+        assert len(found.points) == len(path.points) // 10
+        index = np.flatnonzero((path.points[:, None] == found.points[None, :5]).all(axis=2).any(axis=1))
+        assert index.tolist() == [0, 10, 20, 30, 40]
+        assert (found.colors[:5] == path.colors[index]).all()
+        assert found.train is path.train
+        some = scene_of(path.train, path.test, path.points[:7])
+        assert len(with_fewer_points(some, 0.3).points) == 2
+        assert len(with_fewer_points(some, 0.01).points) == 1
+        with pytest.raises(InputError, match=r"points=0\.5: expected a scene with sparse points"):
+            with_fewer_points(scene_of(path.train, path.test, np.zeros((0, 3))), 0.5)
+
+    def test_all_options_apply(self, path):
+        assert captured(path, Capture()) is path
+        found = captured(path, Capture(thin=4, arc=0.2, points=0.5))
+        assert names(found.train) == ["00", "04", "08", "12"]
+        assert (len(found.test), len(found.points)) == (4, len(path.points) // 2)
+
+    def test_kinds(self):
+        kinds = [capture.kind for capture in STANDARD]
+        assert kinds == ["full", "thinned", "thinned", "thinned", "arc", "fewer points"]
+        assert Capture(thin=2, points=0.5).kind == "thinned and fewer points"
+
+
+class TestRarePixels:
+    def test_pixels_that_two_photos_show_are_rare(self):
+        # At the wall a photo is 5.6 wide; each of these shows the part of the held-out one right of its left border.
+        train = [view(str(i), x=x) for i, x in enumerate((0.0, 0.8, 1.6, 3.2))]
+        (mask,) = rare_pixels(scene_of(train, [view("t")]), wall())
+        assert mask.shape == (HEIGHT, WIDTH)
+        border = 1.6 * 50 / WALL
+        assert mask[:, : int(border)].all() and not mask[:, int(border) + 1 :].any()
+        scene = scene_of(train[:2], [view("t")])
+        assert rare_pixels(scene, wall())[0].all(), "two photos are fewer than three"
+
+    def test_points_behind_the_wall_do_not_count(self):
+        behind = wall(0.1) * [3, 3, 3]
+        train = [view(str(i), x=x) for i, x in enumerate((0.0, 0.8, 1.6))]
+        scene = scene_of(train, [view("t")])
+        expected = rare_pixels(scene, wall())[0]
+        assert (rare_pixels(scene, np.concatenate([wall(), behind]))[0] == expected).all()
+        assert (rare_pixels(scene, behind)[0] != expected).any()
+
+    def test_a_photo_that_looks_away_does_not_count(self):
+        away = view("a")
+        away.camera.viewmat[:3, :3] = np.diag([-1, 1, -1])
+        near = [view("0"), view("1")]
+        assert rare_pixels(scene_of([*near, away], [view("t")]), wall())[0].all()
+        assert not rare_pixels(scene_of([*near, view("2")], [view("t")]), wall())[0].any()
+
+    def test_large_photos_are_compared_by_blocks(self):
+        sizes = {"width": 200, "height": 101}
+        train = [replace(v, camera=v.camera.resized(**sizes)) for v in (view("0", x=1.0), view("1", x=1.0))]
+        test = replace(view("t"), camera=view("t").camera.resized(**sizes))
+        scene = scene_of([*train, test], [test])
+        (mask,) = rare_pixels(scene, wall())
+        assert mask.shape == (101, 200)
+        border = 1.0 * test.camera.fx / WALL
+        assert abs(mask.sum(axis=1) - border).max() <= 1.5, "a block has 3 pixels"
+
+    def test_a_fisheye_has_no_rare_pixels_outside_its_circle(self):
+        fisheye = replace(view("f"), camera=replace(view("f").camera, model="fisheye", fx=18.0, fy=18.0))
+        shell = np.random.default_rng(0).normal(size=(4000, 3))
+        shell *= 3 / np.linalg.norm(shell, axis=1, keepdims=True)
+        scene = scene_of([replace(fisheye, name=n) for n in "abc"], [fisheye])
+        assert not rare_pixels(scene, shell)[0].any()
+        turned = replace(fisheye, camera=replace(fisheye.camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0])))
+        (mask,) = rare_pixels(scene_of([turned] * 3, [fisheye]), shell)
+        assert mask[HEIGHT // 2, WIDTH // 2], "only what lies ahead"
+        assert np.isfinite(fisheye.camera.rays(0.5, 0.5)).all() or not mask[0, 0]
+
+    def test_unknown_without_points(self):
+        scene = scene_of([view("0")], [view("t"), view("u", z=100.0)])
+        assert rare_pixels(scene, np.zeros((0, 3))) is None
+        assert rare_pixels(scene, wall()) is None, "the second photo shows none"
+
+
+@pytest.fixture(scope="module")
+def rendered(device):
+    """Gaussians, three photos that differ from their renders by known amounts, and the renderer."""
+    gaussians, camera = synthetic_scene(30, width=WIDTH, height=HEIGHT)
+    gaussians = gaussians.astype(np.float32)
+    image = to_uint8(render(gaussians, camera, device=device).rgb).astype(int)
+    photos = [np.clip(image + d, 0, 255).astype(np.uint8) for d in (3, 9, 5)]
+    return gaussians, [View(str(i), camera, photo) for i, photo in enumerate(photos)], image, Renderer(device)
+
+
+class TestMeasures:
+    def test_worst_is_the_lowest_psnr(self, rendered, tmp_path):
+        gaussians, views, image, renderer = rendered
+        each = [psnr(image.astype(np.uint8), v.image) for v in views]
+        found = measure(gaussians, views, renderer, tmp_path)
+        assert found["worst"] == each[1] == min(each)
+        assert found["psnr"] == pytest.approx(np.mean(each))
+        assert found["rare_psnr"] is None
+
+    def test_rare_psnr_is_over_the_pixels_of_all_views(self, rendered, tmp_path):
+        gaussians, views, image, renderer = rendered
+        rng = np.random.default_rng(0)
+        rare = [rng.random((HEIGHT, WIDTH)) < share for share in (0.5, 0.02, 0.0)]
+        errors = [((image - v.image) / 255)[m] ** 2 for v, m in zip(views, rare, strict=True)]
+        found = measure(gaussians, views, renderer, tmp_path, rare)
+        assert found["rare_psnr"] == pytest.approx(-10 * np.log10(np.concatenate(errors).mean()))
+        # A mask of the photo hides pixels.
+        mask = np.zeros((HEIGHT, WIDTH), bool)
+        mask[: HEIGHT // 2] = True
+        hidden = [replace(views[0], mask=mask), *views[1:]]
+        errors[0] = ((image - views[0].image) / 255)[rare[0] & mask] ** 2
+        found = measure(gaussians, hidden, renderer, tmp_path, rare)
+        assert found["rare_psnr"] == pytest.approx(-10 * np.log10(np.concatenate(errors).mean()))
+        assert rare_share(hidden, rare) == (rare[0] & mask).sum() / (2.5 * mask.size) + rare[1].sum() / (
+            2.5 * mask.size
+        )
+        assert rare_share(views, None) is None
+
+    def test_training_photos_are_evenly_spaced(self, rendered, monkeypatch):
+        gaussians, views, _, renderer = rendered
+        monkeypatch.setattr(measures, "TRAINING_PHOTOS", 3)
+        asked = []
+        monkeypatch.setattr(measures, "mean_metrics", lambda g, v, r, metrics: asked.append(v) or {"psnr": 1.0})
+        assert training_psnr(gaussians, list(range(9)), renderer) == {"train_psnr": 1.0}
+        training_psnr(gaussians, list(range(2)), renderer)
+        assert asked == [[0, 4, 8], [0, 1]]
+        monkeypatch.undo()
+        expected = measure_psnr(gaussians, views, renderer)
+        assert training_psnr(gaussians, views, renderer)["train_psnr"] == pytest.approx(expected)
+
+    def test_equal_images_are_no_number(self, rendered, tmp_path):
+        gaussians, views, image, renderer = rendered
+        equal = [replace(views[0], image=image.astype(np.uint8))]
+        found = measure(gaussians, equal, renderer, tmp_path, [np.ones((HEIGHT, WIDTH), bool)])
+        assert (found["psnr"], found["worst"], found["rare_psnr"]) == (None, None, None)
+        assert training_psnr(gaussians, equal, renderer) == {"train_psnr": None}
+
+
+def measure_psnr(gaussians, views, renderer):
+    return np.mean([psnr(render(gaussians, v.camera, device=renderer.device).rgb, v.image) for v in views])
+
+
+SMALL = {"iterations": 4, "init": {"random_points": 60, "sh_degree": 0, "triangulate": False}}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures")
+    write_dataset(folder / "one", 12)
+    (folder / "plain.json").write_text(json.dumps(SMALL))
+    return folder
+
+
+class TestBench:
+    def test_trainings_see_the_variant(self, data, device, tmp_path):
+        options = ["", ":thin=2", ":arc=0.25", ":thin=8", ":points=0.5"]
+        cells = make_cells([f"{data / 'one'}{o}" for o in options], [str(data / "plain.json")], ["own"], [])
+        run_cells(cells, device, tmp_path / "results.jsonl", lambda _: None)
+        records = {r["scene"]: r for r in read_records(tmp_path / "results.jsonl")}
+        photos = {name: (r.get("train"), r.get("test")) for name, r in records.items()}
+        assert photos["one"] == (10, 2)
+        assert photos["one:thin=2"] == (5, 2)
+        assert photos["one:arc=0.25"] == (9, 3)
+        assert "thin=8: expected at least 3" in records["one:thin=8"]["failed"]
+        assert "points=0.5: expected a scene with sparse points" in records["one:points=0.5"]["failed"]
+        last = records["one:arc=0.25"]
+        assert last["worst"] <= last["psnr"]
+        assert last["train_psnr"] > 0 and last["rare"] is None and last["rare_psnr"] is None
+
+    def test_photos_are_read_once_for_all_variants(self, data, monkeypatch):
+        read = []
+        monkeypatch.setattr(
+            "clsplat.bench.quality.load_scene", lambda path, config: read.append(path) or load_scene(path, config)
+        )
+        sources = [
+            c.source
+            for c in make_cells(
+                [f"{data / 'one'}{o}" for o in ("", ":thin=2", ":test_every=3")], ["fast"], ["own"], []
+            )
+        ]
+        reader = Reader()
+        scenes = [reader.read(source)[0] for source in (*sources[:2], *sources[:2], sources[2])]
+        assert len(read) == 2
+        assert [len(scene.train) for scene in scenes] == [10, 5, 10, 5, 8]
+        assert scenes[0].train[0].image is scenes[1].train[0].image
+
+    def test_rare_pixels_are_those_of_all_points(self, data, monkeypatch):
+        scene = load_scene(data / "one", DataConfig())
+        points = np.random.default_rng(0).uniform(-0.6, 0.6, (400, 3))
+        scene = replace(scene, points=points, colors=np.zeros((400, 3), np.uint8))
+        monkeypatch.setattr("clsplat.bench.quality.load_scene", lambda *_: scene)
+        cells = make_cells([f"{data / 'one'}{o}" for o in ("", ":points=0.1", ":thin=3")], ["fast"], ["own"], [])
+        whole, fewer, thin = (Reader().read(c.source) for c in cells)
+        assert len(fewer[0].points) == 40
+        assert all((a == b).all() for a, b in zip(whole[1], fewer[1], strict=True))
+        assert rare_share(thin[0].test, thin[1]) > rare_share(whole[0].test, whole[1])
