@@ -1,6 +1,7 @@
 PYTHON = python
 
-.PHONY: test test-slow stability fuzz lint docs check-races bench bench-knobs bench-quality bench-stability formats
+.PHONY: test test-slow stability fuzz lint docs check-races bench bench-knobs bench-quality bench-captures bench-stability \
+  formats
 
 # Run the default tests: a few minutes on two cores.
 test:
@@ -49,6 +50,16 @@ bench-quality:
 	  $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/quality
 	cp build/quality/results.jsonl docs/results/quality.jsonl
 	cp build/quality/time-psnr.svg docs/results/quality.svg
+
+# Measure the tables of docs/benchmarks.md on variants of scenes: make bench-captures DATA=folder of real scenes
+# DOWNSCALE=4. Finished trainings are not repeated. CAPTURE_SCENES selects scenes, METHODS methods, SEEDS seeds.
+CAPTURE_SCENES = fox_pinhole bonsai lego:background=white fern castle_p30 sceaux
+bench-captures:
+	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-captures DATA=..."; exit 2; }
+	$(PYTHON) -m clsplat bench captures \
+	  $(foreach scene,$(CAPTURE_SCENES),$(DATA)/$(scene)$(if $(DOWNSCALE),:downscale=$(DOWNSCALE))) --methods $(METHODS) \
+	  $(if $(SEEDS),--seeds $(SEEDS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/captures
+	cp build/captures/results.jsonl docs/results/captures.jsonl
 
 # Measure the knobs of docs/benchmarks.md: make bench-knobs WORKLOAD=10k-320x240 (default: 100k-640x480).
 bench-knobs:

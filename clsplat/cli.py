@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from clsplat.bench.bench_commands import Chart, Kernels, Knobs, Quality, Stability
+from clsplat.bench.bench_commands import Captures, Chart, Kernels, Knobs, Quality, Stability
 from clsplat.commands import console
 from clsplat.commands.compact import Compact
 from clsplat.commands.console import warn
@@ -24,6 +24,7 @@ BENCHMARKS = (
     Annotated[Kernels, tyro.conf.subcommand("kernels")]
     | Annotated[Knobs, tyro.conf.subcommand("knobs")]
     | Annotated[Quality, tyro.conf.subcommand("quality")]
+    | Annotated[Captures, tyro.conf.subcommand("captures")]
     | Annotated[Chart, tyro.conf.subcommand("chart")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
 )

@@ -4,13 +4,16 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from clsplat.bench.workloads import DEFAULT, KNOBS_DEFAULT, Workload, from_files, scaling_names, synthetic
 from clsplat.config import DataConfig, RenderConfig
 from clsplat.errors import ClsplatError, InputError
+
+if TYPE_CHECKING:
+    from clsplat.bench.cells import Cell
 
 CHART_SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -166,23 +169,74 @@ class Quality:
     def run(self) -> None:
         """Run the command."""
         from clsplat.bench.cells import make_cells
-        from clsplat.bench.quality import run_cells
-        from clsplat.bench.results import FILE
-        from clsplat.device import Device, select_device
 
         cells = make_cells(self.data, self.methods, self.budgets, self.iterations, self.memory_limit, self.seeds)
-        device = Device(select_device(self.device))
-        _say(f"device: {device.label}")
-        try:
-            self.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot create {self.out}: {error.strerror}") from error
-        try:
-            run_cells(cells, device, self.out / FILE, _say)
-        except KeyboardInterrupt:
-            _say(f"{self.out}: the same command continues after the last finished training")
-            raise
+        _train(cells, self.device, self.out)
         Chart(self.out).run()
+
+
+@dataclass(frozen=True)
+class Captures:
+    """Train on variants of scenes by several methods, to see which of them fit only the training photos.
+
+    The variants are: the scene as it is; every 2nd, 4th and 8th training photo; the end of the path held out; a tenth
+    of the sparse points.
+    """
+
+    data: tyro.conf.Positional[tuple[str, ...]]
+    """Datasets, as for `train`; two or more for a choice by rotation. Options for reading the photos follow a colon:
+    fern:downscale=4."""
+    methods: tuple[str, ...] = ("paper-7k", "fast")
+    """Presets of `train`, or configuration files as for its --config."""
+    iterations: tuple[int, ...] = ()
+    """Numbers of iterations; default: that of each method."""
+    seeds: tuple[int, ...] = (0, 1)
+    """Seeds. The noise of a figure comes from repetitions with several of them."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("clsplat-captures")
+    """Folder for results.jsonl and captures.md. Finished trainings in it are not repeated; failed ones are."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+    memory_limit: str | None = None
+    """Largest device memory of a training, such as 4GB."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.atomic import replacing
+        from clsplat.bench.captures_report import details, summary
+        from clsplat.bench.cells import OWN, make_cells, standard_variants
+        from clsplat.bench.results import FILE, read_records
+
+        data = [variant for text in self.data for variant in standard_variants(text)]
+        _train(
+            make_cells(data, self.methods, [OWN], self.iterations, self.memory_limit, self.seeds),
+            self.device,
+            self.out,
+        )
+        records = read_records(self.out / FILE)
+        text = summary(records)
+        with replacing(self.out / "captures.md") as file:
+            file.write(f"{text}\n\n{details(records)}\n".encode())
+        _say(f"all captures: {self.out / 'captures.md'}")
+        print(text)
+
+
+def _train(cells: "list[Cell]", device_name: str | None, out: Path) -> None:
+    """Run the trainings that are missing in the results in the folder `out`."""
+    from clsplat.bench.quality import run_cells
+    from clsplat.bench.results import FILE
+    from clsplat.device import Device, select_device
+
+    device = Device(select_device(device_name))
+    _say(f"device: {device.label}")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot create {out}: {error.strerror}") from error
+    try:
+        run_cells(cells, device, out / FILE, _say)
+    except KeyboardInterrupt:
+        _say(f"{out}: the same command continues after the last finished training")
+        raise
 
 
 @dataclass(frozen=True)

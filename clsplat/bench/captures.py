@@ -1,6 +1,6 @@
 """Captures: variants of a scene that show whether a method fits the scene or only its training photos."""
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -37,11 +37,23 @@ class Capture:
             raise InputError(f"points: expected a fraction of the points, above 0 and at most 1, found {self.points}")
 
     @property
+    def options(self) -> str:
+        """The settings as options of a dataset on the command line, each after a colon."""
+        return "".join(f":{name}={value:g}" for name, value in asdict(self).items() if value != DEFAULTS[name])
+
+    @property
     def kind(self) -> str:
         """Group of captures to which it belongs in tables."""
-        changed = [value != default for value, default in zip(astuple(self), astuple(Capture()), strict=True)]
-        names = [name for name, found in zip(("thinned", "arc", "fewer points"), changed, strict=True) if found]
-        return " and ".join(names) or "full"
+        return " and ".join(KINDS[name] for name, value in asdict(self).items() if value != DEFAULTS[name]) or FULL
+
+
+DEFAULTS = asdict(Capture())
+
+FULL = "full"
+"""Group of the scenes as they are."""
+
+KINDS = {"thin": "thinned", "arc": "arc", "points": "fewer points"}
+"""Groups of the variants, by the setting that makes them."""
 
 
 STANDARD = (Capture(), Capture(thin=2), Capture(thin=4), Capture(thin=8), Capture(arc=0.2), Capture(points=0.1))

@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from clsplat.bench.captures import Capture
+from clsplat.bench.captures import STANDARD, Capture
 from clsplat.bench.results import Record
 from clsplat.config import DataConfig, TrainConfig
 from clsplat.errors import InputError
@@ -80,6 +80,21 @@ def parse_source(text: str) -> Source:
     data = with_settings(DataConfig(), values, f"{text} (variants: {', '.join(CAPTURE)})")
     path = Path(match[1])
     return Source(path.resolve().name + match[2], path, data, with_settings(Capture(), variant, text))
+
+
+def standard_variants(text: str) -> list[str]:
+    """Datasets of the command line with each of the options of `clsplat.bench.captures.STANDARD`.
+
+    Raises
+    ------
+    InputError
+        As `parse_source`, or if the dataset already has options for a variant.
+    """
+    if parse_source(text).capture != Capture():
+        raise InputError(
+            f"{text}: expected no options for a variant ({', '.join(CAPTURE)}), which follow by themselves"
+        )
+    return [text + capture.options for capture in STANDARD]
 
 
 def _value(text: str) -> Any:

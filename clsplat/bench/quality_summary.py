@@ -1,7 +1,7 @@
 """Summaries of the results of `clsplat bench quality`: trainings, means over scenes, Pareto fronts and tables."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -65,13 +65,17 @@ TIMES = ("seconds", "cpu_seconds")
 
 @dataclass(frozen=True)
 class Run:
-    """A finished training. `samples` are in the order of their iterations; the last one is its end."""
+    """A finished training, or the mean of several, whose `seed` is None.
+
+    `samples` are in the order of their iterations; the last one is its end.
+    """
 
     scene: str
     method: str
     max_gaussians: int | None
     iterations: int
     samples: tuple[Record, ...]
+    seed: int | None = None
 
     @property
     def setting(self) -> str:
@@ -86,6 +90,17 @@ class Run:
 
 
 def runs(records: Iterable[Record]) -> list[Run]:
+    """Mean over the seeds of each setting on each scene, sample by sample, from its finished trainings."""
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in trainings(records):
+        groups.setdefault((run.scene, run.setting), []).append(run)
+    return [
+        group[0] if len(group) == 1 else replace(group[0], samples=_mean_samples(group), seed=None)
+        for group in groups.values()
+    ]
+
+
+def trainings(records: Iterable[Record]) -> list[Run]:
     """Finished trainings, in the order of the records. With several devices, names of methods include the device."""
     records = [record for record in records if "iteration" in record]
     several = len({record["device"] for record in records}) > 1
@@ -99,6 +114,7 @@ def runs(records: Iterable[Record]) -> list[Run]:
             max_gaussians=of_key[0]["max_gaussians"],
             iterations=of_key[0]["iterations"],
             samples=tuple(sorted(of_key, key=lambda record: int(record["iteration"]))),
+            seed=of_key[0]["seed"],
         )
         for of_key in groups.values()
         if any("fps" in record for record in of_key)

@@ -9,6 +9,8 @@
 ``{bench_stability} FILE``: rows and charts that ``make bench-stability`` wrote to the folder of FILE.
 ``{bench_quality} FILE [COST]``: environment of the records of ``clsplat bench quality`` in FILE, or charts and table
 of one cost.
+``{bench_captures} FILE [captures]``: means and rotation of the records of ``clsplat bench captures`` in FILE, or the
+table of all captures.
 ``{published_quality}``: chart and table of the original paper.
 """
 
@@ -32,7 +34,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from clsplat import cli, config, constants
-from clsplat.bench import charts, quality_summary, results
+from clsplat.bench import captures_report, charts, quality_summary, results
 from clsplat.bench import kernel_report as report
 from clsplat.bench.knob_report import knobs_text
 from clsplat.bench.stability import stability_report as stability
@@ -288,6 +290,24 @@ class BenchQuality(Charts):
         return "\n".join(f"* {_prose(sentence)}" for sentence in sentences)
 
 
+class BenchCaptures(SphinxDirective):
+    """``{bench_captures} FILE [captures]``. The path of the file is relative to the page."""
+
+    required_arguments = 1
+    optional_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        relative, path = self.env.relfn2path(self.arguments[0])
+        self.env.note_dependency(relative)
+        records = results.read_records(Path(path))
+        if not records:
+            raise self.error(f"{path}: expected records of clsplat bench captures, found none")
+        if len(self.arguments) > 1:
+            return self.parse_text_to_nodes(captures_report.details(records))
+        origins = "\n".join(f"* {_prose(line)}" for line in quality_summary.origins(records))
+        return self.parse_text_to_nodes(f"{origins}\n\n{captures_report.summary(records)}")
+
+
 class PublishedQuality(Charts):
     """``{published_quality}``"""
 
@@ -307,5 +327,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("bench_knobs", BenchKnobs)
     app.add_directive("bench_stability", BenchStability)
     app.add_directive("bench_quality", BenchQuality)
+    app.add_directive("bench_captures", BenchCaptures)
     app.add_directive("published_quality", PublishedQuality)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

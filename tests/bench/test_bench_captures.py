@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_cli import write_dataset
+from test_cli import fails, run, write_dataset
 
 from clsplat.bench import measures
 from clsplat.bench.captures import STANDARD, Capture, arc, captured, thinned, with_fewer_points
@@ -36,7 +36,7 @@ def view(name, x=0.0, z=0.0, **camera):
     return View(name, made, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
 
 
-def wall(spacing=0.05):
+def wall(spacing=0.1):
     x, y = np.meshgrid(np.arange(-8, 8, spacing), np.arange(-4, 4, spacing))
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, WALL)], axis=1)
 
@@ -121,7 +121,7 @@ class TestRarePixels:
         assert rare_pixels(scene, wall())[0].all(), "two photos are fewer than three"
 
     def test_points_behind_the_wall_do_not_count(self):
-        behind = wall(0.1) * [3, 3, 3]
+        behind = 3 * wall()
         train = [view(str(i), x=x) for i, x in enumerate((0.0, 0.8, 1.6))]
         scene = scene_of(train, [view("t")])
         expected = rare_pixels(scene, wall())[0]
@@ -224,7 +224,7 @@ def measure_psnr(gaussians, views, renderer):
     return np.mean([psnr(render(gaussians, v.camera, device=renderer.device).rgb, v.image) for v in views])
 
 
-SMALL = {"iterations": 4, "init": {"random_points": 60, "sh_degree": 0, "triangulate": False}}
+SMALL = {"iterations": 2, "init": {"random_points": 60, "sh_degree": 0, "triangulate": False}}
 
 
 @pytest.fixture(scope="module")
@@ -278,3 +278,36 @@ class TestBench:
         assert len(fewer[0].points) == 40
         assert all((a == b).all() for a, b in zip(whole[1], fewer[1], strict=True))
         assert rare_share(thin[0].test, thin[1]) > rare_share(whole[0].test, whole[1])
+
+
+def test_the_command(data, tmp_path, capsys, monkeypatch):
+    """Each standard variant of each scene, once."""
+
+    def run_cell(config, scene, device, record, rare):
+        figures = {"psnr": float(len(scene.train)), "ssim": 0.5, "flip": None, "worst": 1.0, "rare_psnr": None}
+        costs = {
+            "iteration": 2,
+            "seconds": 1.0,
+            "cpu_seconds": 1.0,
+            "num_gaussians": 5,
+            "train_psnr": 9.0,
+            "fps": 1.0,
+        }
+        record(figures | costs)
+        return figures | costs
+
+    monkeypatch.setattr("clsplat.bench.quality.run_cell", run_cell)
+    arguments = ["bench", "captures", data / "one", f"{data / 'one'}:test_every=4", "--methods", data / "plain.json"]
+    run(*arguments, "--seeds", 3, "-o", tmp_path / "out")
+    said = capsys.readouterr()
+    records = read_records(tmp_path / "out" / "results.jsonl")
+    assert {r["seed"] for r in records} == {3}
+    expected = {f"one{o}{c.options}" for o in ("", ":test_every=4") for c in STANDARD}
+    assert {r["scene"] for r in records} == expected
+    text = (tmp_path / "out" / "captures.md").read_text()
+    assert said.out.strip() in text and "| one:thin=4 | plain · 2 it | 3.00 | 0.500 |" in text
+    assert "requires two scenes" in said.out, "both are of the same scene"
+    finished = [r for r in records if "failed" not in r]
+    run(*arguments, "--seeds", 3, "-o", tmp_path / "out")
+    assert [r for r in read_records(tmp_path / "out" / "results.jsonl") if "failed" not in r] == finished
+    assert "no options for a variant" in fails(capsys, "bench", "captures", f"{data / 'one'}:arc=0.1")
