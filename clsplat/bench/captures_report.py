@@ -76,6 +76,9 @@ class Results:
         self.methods = list(dict.fromkeys(method for _, method in self._figures))
         self.common = [c for c in self.captures if all((c, method) in self._figures for method in self.methods)]
         """Captures that all methods finished. Means are over these, so that they can be compared."""
+        every = [found for of_key in self._figures.values() for found in of_key]
+        self.quantities = {n: q for n, q in QUANTITIES.items() if any(found[n] is not None for found in every)}
+        """Quantities that were measured at least once."""
 
     def values(self, capture: str, method: str, name: str) -> list[float]:
         """A quantity for each seed."""
@@ -136,12 +139,12 @@ def _table(head: list[str], rows: Iterable[list[str]]) -> str:
     return "\n".join([_row(head), "|---" * len(head) + "|", *map(_row, rows)])
 
 
-def _columns() -> list[str]:
-    return [q.name + (f", {q.unit}" if q.unit else "") for q in QUANTITIES.values()]
+def _columns(results: Results) -> list[str]:
+    return [q.name + (f", {q.unit}" if q.unit else "") for q in results.quantities.values()]
 
 
 def _cells(results: Results, captures: list[str], method: str) -> list[str]:
-    found = {name: results.mean(captures, method, name) for name in QUANTITIES}
+    found = {name: results.mean(captures, method, name) for name in results.quantities}
     return ["" if figure is None else figure.text(QUANTITIES[name]) for name, figure in found.items()]
 
 
@@ -150,7 +153,10 @@ def groups_text(results: Results) -> str:
     parts = []
     for kind, captures in kinds(results.common).items() if results.common else ():
         rows = [[method, *_cells(results, captures, method)] for method in results.methods]
-        parts += [f"**{kind[0].upper() + kind[1:]}**: {', '.join(captures)}", _table(["method", *_columns()], rows)]
+        parts += [
+            f"**{kind[0].upper() + kind[1:]}**: {', '.join(captures)}",
+            _table(["method", *_columns(results)], rows),
+        ]
     if missing := [capture for capture in results.captures if capture not in results.common]:
         parts.append(f"Not in the means, because not all methods have finished on them: {', '.join(missing)}.")
     return "\n\n".join(parts)
@@ -164,7 +170,7 @@ def captures_text(results: Results) -> str:
         for method in results.methods
         if results.values(capture, method, "num_gaussians")
     ]
-    return _table(["capture", "method", *_columns()], rows)
+    return _table(["capture", "method", *_columns(results)], rows)
 
 
 @dataclass(frozen=True)
