@@ -52,14 +52,15 @@ bench-quality:
 	cp build/quality/time-psnr.svg docs/results/quality.svg
 
 # Measure the tables of docs/benchmarks.md on variants of scenes: make bench-captures DATA=folder of real scenes
-# DOWNSCALE=4. Finished trainings are not repeated. CAPTURE_SCENES selects scenes, METHODS methods, SEEDS seeds.
+# DOWNSCALE=4. Finished trainings are not repeated. CAPTURE_SCENES selects scenes, METHODS methods, SEEDS seeds. The
+# stored results are those at the end of the trainings.
 CAPTURE_SCENES = fox_pinhole bonsai lego:background=white fern castle_p30 sceaux
 bench-captures:
 	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-captures DATA=..."; exit 2; }
 	$(PYTHON) -m clsplat bench captures \
 	  $(foreach scene,$(CAPTURE_SCENES),$(DATA)/$(scene)$(if $(DOWNSCALE),:downscale=$(DOWNSCALE))) --methods $(METHODS) \
 	  $(if $(SEEDS),--seeds $(SEEDS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/captures
-	cp build/captures/results.jsonl docs/results/captures.jsonl
+	grep -E '"(fps|failed)":' build/captures/results.jsonl > docs/results/captures.jsonl
 
 # Measure the knobs of docs/benchmarks.md: make bench-knobs WORKLOAD=10k-320x240 (default: 100k-640x480).
 bench-knobs:

@@ -57,11 +57,9 @@ class Figure:
 def figures(run: Run) -> Record:
     """The columns of a training; None where something was not measured."""
     found = {name: run.last.get(name) for name in QUANTITIES}
-    train, held_out = run.last.get("train_psnr"), run.last["psnr"]
-    best = [sample["psnr"] for sample in run.samples if sample["psnr"] is not None]
-    if held_out is not None:
-        found["gap"] = None if train is None else train - held_out
-        found["drop"] = held_out - max(best)
+    train, held_out, best = (run.last.get(name) for name in ("train_psnr", "psnr", "best"))
+    found["gap"] = None if train is None or held_out is None else train - held_out
+    found["drop"] = None if best is None or held_out is None else held_out - best
     return found
 
 

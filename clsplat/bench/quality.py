@@ -177,16 +177,19 @@ def run_cell(
         train(scene, replace(config, iterations=WARM_UP, strategy="adc", size="fixed"), out, device)
         clocks = time.perf_counter, time.process_time
         evaluating = np.zeros(2)
+        best: float | None = None
         pending = iter(at)
         started = np.array([clock() for clock in clocks])
 
         def sample(iteration: int, gaussians: Gaussians) -> Record:
-            nonlocal evaluating
+            nonlocal evaluating, best
             now = np.array([clock() for clock in clocks])
             seconds, cpu_seconds = map(float, now - started - evaluating)
             values = facts | {"iteration": iteration, "seconds": seconds, "cpu_seconds": cpu_seconds}
             values |= measure(fetch(gaussians), scene.test, renderer, out, rare)
-            values |= {"memory_bytes": device.memory_peak}
+            if values["psnr"] is not None:
+                best = values["psnr"] if best is None else max(best, values["psnr"])
+            values |= {"best": best, "memory_bytes": device.memory_peak}
             evaluating += np.array([clock() for clock in clocks]) - now
             return values
 

@@ -284,7 +284,14 @@ def test_the_command(data, tmp_path, capsys, monkeypatch):
     """Each standard variant of each scene, once."""
 
     def run_cell(config, scene, device, record, rare):
-        figures = {"psnr": float(len(scene.train)), "ssim": 0.5, "flip": None, "worst": 1.0, "rare_psnr": None}
+        figures = {
+            "psnr": float(len(scene.train)),
+            "ssim": 0.5,
+            "flip": None,
+            "worst": 1.0,
+            "rare_psnr": None,
+            "best": 9.0,
+        }
         costs = {
             "iteration": 2,
             "seconds": 1.0,

@@ -23,15 +23,18 @@ from clsplat.bench.quality_summary import runs, trainings
 from clsplat.errors import InputError
 
 
-def training(scene, method, psnr, seed=0, **last):
-    """Records of one training, whose PSNR was 1 dB higher, or as given, before its end."""
-    other = {"seed": seed, "ssim": psnr / 40, "flip": None, "worst": psnr - 3, "rare_psnr": None, "cpu_seconds": 10}
-    other |= {"num_gaussians": 1000, "seconds": 5}
-    before = last.pop("before", psnr + 1)
-    return [
-        record(scene, method, iteration=4, psnr=before, **other),
-        record(scene, method, iteration=8, psnr=psnr, **{**other, "train_psnr": psnr + 2, "fps": 9.0, **last}),
-    ]
+def training(scene, method, psnr, seed=0, **figures):
+    """The last record of a training, which fell by 1 dB."""
+    values = {"seed": seed, "iteration": 8, "psnr": psnr, "best": psnr + 1, "train_psnr": psnr + 2, "worst": psnr - 3}
+    values |= {
+        "ssim": psnr / 40,
+        "flip": None,
+        "rare_psnr": None,
+        "num_gaussians": 1000,
+        "cpu_seconds": 10,
+        "fps": 9.0,
+    }
+    return [record(scene, method, **{**values, **figures})]
 
 
 M, N = "m · 8 it", "n · 8 it"
@@ -53,16 +56,17 @@ def tables(text):
 
 
 def test_figures_of_a_training():
-    (run,) = trainings(training("a", "m", 20, before=20.5, rare_psnr=15.0))
+    (run,) = trainings(training("a", "m", 20, best=20.5, rare_psnr=15.0))
     found = figures(run)
     assert found["drop"] == -0.5 and found["gap"] == 2
     assert (found["worst"], found["rare_psnr"], found["flip"], found["cpu_seconds"]) == (17, 15, None, 10)
-    (run,) = trainings(training("a", "m", 20, before=19, train_psnr=None))
+    (run,) = trainings(training("a", "m", 20, best=20, train_psnr=None))
     assert figures(run)["drop"] == 0 and figures(run)["gap"] is None
 
 
 def test_seeds_are_averaged_for_charts():
     found = [*training("a", "m", 20), *training("a", "m", 23, seed=1), *training("a", "n", 9)]
+    found += [r | {"iteration": 4, "psnr": r["psnr"] + 1} for r in found]
     assert [run.seed for run in trainings(found)] == [0, 1, 0]
     mean, single = runs(found)
     assert [sample["psnr"] for sample in mean.samples] == [22.5, 21.5]

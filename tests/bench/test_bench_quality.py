@@ -162,6 +162,7 @@ class TestOneTraining:
         assert [r["iteration"] for r in records] == sample_iterations(ITERATIONS)
         for name in ("fps", "train_psnr"):
             assert [name in r for r in records] == [False] * (len(records) - 1) + [True]
+        assert [r["best"] for r in records] == np.maximum.accumulate([r["psnr"] for r in records]).tolist()
         seconds = [r["seconds"] for r in records]
         assert seconds == sorted(seconds) and seconds[0] > 0
         assert all((r["train"], r["test"], r["width"], r["height"]) == (7, 2, 40, 32) for r in records)
@@ -206,12 +207,14 @@ class TestOneTraining:
 
         def measured(*_):
             clock.now += 1000
-            return {"psnr": 1.0}
+            return {"psnr": falling.pop()}
 
+        falling = list(np.arange(quality.SAMPLES, dtype=float))
         monkeypatch.setattr(quality, "train", training)
         monkeypatch.setattr(quality, "measure", measured)
         records = []
         run_cell(cell.config, scene, device, records.append)
+        assert {r["best"] for r in records} == {quality.SAMPLES - 1.0}
         assert [r["seconds"] for r in records] == [2 * r["iteration"] for r in records]
 
     def test_frames_per_second_is_of_the_median(self, trained, device, monkeypatch):
