@@ -22,10 +22,17 @@ def scene() -> Gaussians:
     return gaussians
 
 
-def seeing(weights: np.ndarray, errors: np.ndarray, prices: np.ndarray | None = None, share: float = 1.0) -> Survey:
+def seeing(
+    weights: np.ndarray,
+    errors: np.ndarray,
+    prices: np.ndarray | None = None,
+    share: float = 1.0,
+    differences: np.ndarray | None = None,
+) -> Survey:
     def survey(views: int) -> Contributions:
         assert views == CONFIG.error.views
-        return Contributions(weights, errors, weights if prices is None else prices, share)
+        prices_ = weights if prices is None else prices
+        return Contributions(weights, errors, prices_, np.zeros(N) if differences is None else differences, share)
 
     return survey
 
@@ -104,6 +111,20 @@ def test_while_there_is_room_only_real_harm_goes() -> None:
     prices[:] = -share
     edit = strategy.edit(200, scene(), 2 * N, seeing(np.ones(N), errors, prices))
     assert len(np.setdiff1d(np.arange(N), edit.rows)) == CONFIG.error.replaced_most * N
+
+
+def test_removals_are_priced_together() -> None:
+    """Each of 20 equal Gaussians in one place is too bright for the photo by 2 of them: alone it would gain by going,
+    but with the others it would leave a hole. One elsewhere that is entirely wrong goes."""
+    difference, excess = 1.0, 2
+    prices, differences = np.full(N, 1.0), np.zeros(N)
+    prices[:20], differences[:20] = difference * (1 - 2 * excess), difference
+    prices[50], differences[50] = -100 * difference, difference
+    for cap in (N, 2 * N):
+        config = replace(CONFIG, error=ErrorConfig(replaced=0.0, replaced_most=0.2))
+        strategy = ErrorGuided(config, 1.0, N)
+        edit = strategy.edit(200, scene(), cap, seeing(np.ones(N), np.ones(N), prices, differences=differences))
+        assert np.setdiff1d(np.arange(N), edit.rows).tolist() == [50]
 
 
 @pytest.mark.parametrize(("share", "gone"), [(SHARE_MIN, 5), (0.99 * SHARE_MIN, 0)])

@@ -21,6 +21,11 @@ keep its variance along the axis: CHILD_SCALE^2 + CHILD_OFFSET^2 = 1."""
 CHILD_OPACITY = 1 / (2 * CHILD_SCALE)
 """Factor on the opacity of the children, which keeps the integral of the parent's opacity."""
 
+OTHERS = 8
+"""Number k of other removals with the same effect on the image that a price allows for. If d is that effect, and r the
+render less the photo, k + 1 of them change the squared error by 2 r d + (k + 1) d^2 each: the price of one alone,
+2 r d + d^2, and k times the difference d^2 (measured: docs/howto/strategies.md)."""
+
 HARM = 1.0
 """Fall of the error, in even shares of it, above which a Gaussian is removed while others grow (measured:
 docs/howto/strategies.md)."""
@@ -54,7 +59,9 @@ class ErrorGuided(Strategy):
     def edit(self, iteration: int, gaussians: Gaussians, cap: int, survey: Survey) -> Edit:
         """See `clsplat.training.densify.Strategy`."""
         n = len(gaussians)
-        weights, errors, prices, share = survey(self.config.views)
+        weights, errors, prices, differences, share = survey(self.config.views)
+        # Of many that are too bright in one place, each alone promises the gain that only the first removal brings.
+        prices = prices + OTHERS * differences
         target = self.schedule.count_after(iteration, n, cap)
         doomed = gaussians.opacities <= self.config.opacity_min
         # Gaussians that no photo of the survey shows may be needed by the others.

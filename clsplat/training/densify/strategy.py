@@ -25,13 +25,15 @@ class Contributions(NamedTuple):
     """Contributions of N Gaussians to some photos, summed over them.
 
     weights (N,): sums of the compositing weights; errors (N,): sums of weight times the pixel's squared error; prices
-    (N,): change of the squared error if the Gaussian alone is removed, negative if the error falls. Squared errors
-    are summed over RGB. share: fraction of the training photos that these are.
+    (N,): change of the squared error if the Gaussian alone is removed, negative if the error falls; differences (N,):
+    squared difference that this makes to the images. Squares are summed over RGB. share: fraction of the training
+    photos that these are.
     """
 
     weights: Array
     errors: Array
     prices: Array
+    differences: Array
     share: float = 1.0
 
 
