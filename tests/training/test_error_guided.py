@@ -10,7 +10,7 @@ from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations
 from clsplat.testing import synthetic_scene
 from clsplat.training.densify import Contributions, Survey
-from clsplat.training.densify.error_guided import HARM, SHARE_MIN, ErrorGuided, split
+from clsplat.training.densify.error_guided import HARM, MEMORY, SHARE_MIN, ErrorGuided, split
 
 N = 100
 CONFIG = TrainConfig(size="fixed", iterations=2000, strategy="error", max_gaussians=N)
@@ -109,6 +109,7 @@ def test_while_there_is_room_only_real_harm_goes() -> None:
     gone = np.setdiff1d(np.arange(N), strategy.edit(200, scene(), 2 * N, seeing(np.ones(N), errors, prices)).rows)
     assert gone.tolist() == [3, 4]
     prices[:] = -share
+    strategy = ErrorGuided(CONFIG, 1.0, N)
     edit = strategy.edit(200, scene(), 2 * N, seeing(np.ones(N), errors, prices))
     assert len(np.setdiff1d(np.arange(N), edit.rows)) == CONFIG.error.replaced_most * N
 
@@ -125,6 +126,27 @@ def test_removals_are_priced_together() -> None:
         strategy = ErrorGuided(config, 1.0, N)
         edit = strategy.edit(200, scene(), cap, seeing(np.ones(N), np.ones(N), prices, differences=differences))
         assert np.setdiff1d(np.arange(N), edit.rows).tolist() == [50]
+
+
+def test_what_earlier_surveys_showed_stays() -> None:
+    """Two Gaussians seem useless in the second survey, but the first showed the use of one of them."""
+    strategy = ErrorGuided(replace(CONFIG, error=ErrorConfig(replaced=0.0)), 1.0, N)
+    useful, prices = np.zeros(N), np.ones(N)
+    useful[7] = 1
+    strategy.edit(200, scene(), N, seeing(np.ones(N), np.zeros(N), prices, differences=useful))
+    prices[[7, 8]] = -1
+    edit = strategy.edit(300, scene(), N, seeing(np.ones(N), np.zeros(N), prices))
+    assert np.setdiff1d(np.arange(N), edit.rows).tolist() == [8]
+    assert strategy.statistics["differences"][7] == pytest.approx(MEMORY)
+
+
+def test_children_inherit_a_quarter_of_the_squared_effect() -> None:
+    strategy = ErrorGuided(CONFIG, 1.0, N)
+    differences = np.arange(N, dtype=np.float64)
+    edit = strategy.edit(200, scene(), 2 * N, seeing(np.ones(N), np.ones(N), differences=differences))
+    assert edit.fresh.any() and not edit.fresh.all()
+    expected = np.where(edit.fresh, 0.25, 1) * edit.rows
+    np.testing.assert_array_equal(strategy.statistics["differences"], expected.astype(np.float32))
 
 
 @pytest.mark.parametrize(("share", "gone"), [(SHARE_MIN, 5), (0.99 * SHARE_MIN, 0)])

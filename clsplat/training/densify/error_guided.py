@@ -22,9 +22,12 @@ CHILD_OPACITY = 1 / (2 * CHILD_SCALE)
 """Factor on the opacity of the children, which keeps the integral of the parent's opacity."""
 
 OTHERS = 8
-"""Number k of other removals with the same effect on the image that a price allows for. If d is that effect, and r the
-render less the photo, k + 1 of them change the squared error by 2 r d + (k + 1) d^2 each: the price of one alone,
+"""Number k of other removals with the same effect on the image that a price allows for. If d is that effect, and r
+the render less the photo, k + 1 of them change the squared error by 2 r d + (k + 1) d^2 each: the price of one alone,
 2 r d + d^2, and k times the difference d^2 (measured: docs/howto/strategies.md)."""
+
+MEMORY = 0.9
+"""Factor per round on the differences of earlier surveys. Ten rounds, which survey 100 photos, leave a third."""
 
 HARM = 1.0
 """Fall of the error, in even shares of it, above which a Gaussian is removed while others grow (measured:
@@ -42,8 +45,10 @@ class ErrorGuided(Strategy):
     densification in Gaussian splatting"). Those with the largest sums over some photos are split along their longest
     axis (Deng et al. 2025, "Improving densification in 3D Gaussian splatting", have such a split; the children here
     keep the parent's moments), up to a budget (Mallick et al. 2024, "Taming 3DGS"). At the cap, the Gaussians whose
-    removal raises the error least make room for others; their prices come from the stage removal. The strategy keeps
-    no statistics.
+    removal raises the error least make room for others; their prices come from the stage removal.
+
+    Statistics: differences (N,), the largest that the removal of a Gaussian made to the photos of a survey; earlier
+    surveys count less. They keep what only photos outside the present survey show.
     """
 
     start_opacity = 0.5  # as mcmc
@@ -51,6 +56,7 @@ class ErrorGuided(Strategy):
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         super().__init__(config, extent, n)
         self.config, self.schedule = config.error, Schedule(config, config.error)
+        self.statistics = {"differences": np.zeros(n, np.float32)}
 
     def due(self, iteration: int) -> bool:
         """See `clsplat.training.densify.Strategy`."""
@@ -60,8 +66,9 @@ class ErrorGuided(Strategy):
         """See `clsplat.training.densify.Strategy`."""
         n = len(gaussians)
         weights, errors, prices, differences, share = survey(self.config.views)
+        known = np.maximum(differences, MEMORY * self.statistics["differences"])
         # Of many that are too bright in one place, each alone promises the gain that only the first removal brings.
-        prices = prices + OTHERS * differences
+        prices = prices + OTHERS * known
         target = self.schedule.count_after(iteration, n, cap)
         doomed = gaussians.opacities <= self.config.opacity_min
         # Gaussians that no photo of the survey shows may be needed by the others.
@@ -72,6 +79,7 @@ class ErrorGuided(Strategy):
         doomed[seen[np.argsort(prices[seen], kind="stable")[: int(count)]]] = True
         live = np.flatnonzero(~doomed)
         if len(live) == 0:
+            self.statistics = {"differences": known.astype(np.float32)}
             return Edit(gaussians, np.arange(n), np.zeros(n, bool))
         wanted = max(0, target - len(live))
         blamed = live[np.argsort(-errors[live], kind="stable")[:wanted]]
@@ -79,7 +87,10 @@ class ErrorGuided(Strategy):
         kept = np.setdiff1d(live, parents)
         result = Gaussians.concatenate([gaussians.take(kept), *split(gaussians.take(parents))])
         rows = np.concatenate([kept, parents, parents])
-        return Edit(result, rows, np.arange(len(rows)) >= len(kept))
+        fresh = np.arange(len(rows)) >= len(kept)
+        # A child has half of the parent's effect on the image, and a quarter of its square.
+        self.statistics = {"differences": np.where(fresh, known[rows] / 4, known[rows]).astype(np.float32)}
+        return Edit(result, rows, fresh)
 
 
 def split(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
