@@ -36,7 +36,7 @@ def contributions(
     Contributions
     """
     n = len(gaussians)
-    result = Contributions(*(np.zeros(n) for _ in range(4)))
+    result = Contributions(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n))
     for view, run, residuals, removal in measure_removals(renderer, gaussians, views, sh_degree):
         squares = (residuals**2).sum(axis=2) * (1 if view.mask is None else view.mask)
         v_image = np.stack([squares, np.zeros_like(squares), np.zeros_like(squares)], axis=2)
