@@ -30,6 +30,7 @@ from clsplat.atomic import replacing
 from clsplat.config import Mode
 from clsplat.constants import SH_DEGREE_MAX
 from clsplat.errors import InputError
+from clsplat.formats.codebook import shared_rows
 from clsplat.formats.quantisation import (
     SQRT1_2,
     check_expansion,
@@ -130,6 +131,9 @@ def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
     """
     g = _turned(checked(path, gaussians))
     g = g.take(morton_order(g.means))
+    shared = shared_rows(g.sh[:, 1:].reshape(len(g), -1)) if g.sh_degree else None
+    if shared is not None:
+        g = g.take(np.argsort(shared[1], kind="stable"))
     warn_lost(path, offset=offset)
     n = len(g)
     bits = fractional_bits(path, g)

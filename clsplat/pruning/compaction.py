@@ -1,21 +1,24 @@
 """Compaction: the smallest version of a scene within a loss, or the best one within a number of bytes or Gaussians.
 
-A version has fewer Gaussians and fewer bands of spherical harmonics. Its loss is measured in views that did not price
-the Gaussians: decibels of PSNR, the mean over views of 10 log10(e'/e) with the mean squared errors e before and e'
-after. With photos both errors are measured. With the scene's own renders e is unknown: it is taken from
-`ASSUMED_PSNR`, and e' = e + the mean squared difference from the render, as if the two errors were independent.
+A version has fewer Gaussians, and spherical harmonics of a lower degree or of fewer different kinds. Its loss is
+measured in views that did not price the Gaussians: decibels of PSNR, the mean over views of 10 log10(e'/e) with the
+mean squared errors e before and e' after. With photos both errors are measured. With the scene's own renders e is
+unknown: it is taken from `ASSUMED_PSNR`, and e' = e + the mean squared difference from the render, as if the two
+errors were independent.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from clsplat.errors import InputError
+from clsplat.formats.codebook import PALETTE_MAX
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, to_uint8
-from clsplat.pruning.prices import removal_order, with_degree
+from clsplat.pruning.harmonics import curvatures, fitted_degree, with_shared_bands
+from clsplat.pruning.reductions import Reduction, reduce
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
 from clsplat.scene import View
@@ -35,6 +38,14 @@ PRECISION = 1.02
 
 TRIES = 6
 """Number of times that the target loss is lowered by the loss that the file format adds."""
+
+
+PALETTE_PARTS = (128, 32, 8)
+"""Mean numbers of Gaussians that share their harmonics above band 0, which are tried if the format gains by it
+(measured: docs/howto/compact.md)."""
+
+SHARING_MIN = 0.1
+"""Fraction of a file that must disappear if all harmonics above band 0 are equal, for palettes to be tried."""
 
 
 class LossMeter:
@@ -95,7 +106,7 @@ def compact(
     stored: Stored,
     renderer: Renderer,
 ) -> Compacted:
-    """Prune a scene and lower the degree of its spherical harmonics.
+    """Reduce the number of Gaussians of a scene, and the degree or the number of its spherical harmonics.
 
     Parameters
     ----------
@@ -118,47 +129,96 @@ def compact(
         If no version is within the limits; the message names the nearest one.
     """
     search = _Search(gaussians, loss, limits, stored)
-    search.order = removal_order(gaussians, views, search.far_enough, renderer)
+    search.reduction = reduce(gaussians, views, search.far_enough, renderer)
+    search.choices = [search.reduction.pool]
+    if limits.loss is not None or limits.bytes is not None:
+        search.choices = choices_of(
+            gaussians, search.reduction, views, search.degree, search.sharing_pays(), renderer
+        )
     if limits.loss is not None:
         return search.smallest(limits.loss)
-    degrees = range(gaussians.sh_degree + 1) if limits.bytes is not None else [gaussians.sh_degree]
-    versions = [search.measured(search.largest_number(degree), degree) for degree in degrees]
+    versions = [search.measured(search.largest_number(choice), choice) for choice in range(len(search.choices))]
     return min(versions, key=lambda version: version.loss)
 
 
-class _Search:
-    """Search among versions of a scene, by number of Gaussians and degree."""
+def choices_of(
+    gaussians: Gaussians, reduction: Reduction, views: list[View], highest: int, sharing: bool, renderer: Renderer
+) -> list[Gaussians]:
+    """The Gaussians of a reduction with cheaper harmonics, from the coarsest to the original ones.
 
-    order: np.ndarray
+    Parameters
+    ----------
+    gaussians, views, renderer
+        As given to `reduce`.
+    reduction : Reduction
+    highest : int
+        Highest degree of the spherical harmonics that the format stores.
+    sharing : bool
+        Whether Gaussians that share their harmonics save bytes; otherwise lower degrees are offered.
+
+    Returns
+    -------
+    list of Gaussians
+        Each has the rows of `reduction.pool`.
+    """
+    pool, n = reduction.pool, len(gaussians)
+    if not pool.sh_degree:
+        return [pool]
+    own = curvatures(gaussians, views, renderer)
+    curvature = np.concatenate([own, np.empty((len(pool) - n, own.shape[1]), np.float32)])
+    for row, pair in enumerate(reduction.parents, n):
+        curvature[row] = curvature[pair].sum(axis=0)
+    highest = min(highest, pool.sh_degree)
+    degrees = range(1) if sharing else range(highest + 1)
+    sizes = [min(max(n // part, 1), PALETTE_MAX) for part in PALETTE_PARTS] if sharing else []
+    return [
+        *(fitted_degree(pool, curvature, degree) for degree in degrees if degree < pool.sh_degree),
+        *(with_shared_bands(pool, curvature, size) for size in sizes),
+        *([pool] if highest == pool.sh_degree else []),
+    ]
+
+
+class _Search:
+    """Search among versions of a scene, by number of Gaussians and choice of harmonics."""
+
+    reduction: Reduction
+    choices: list[Gaussians]
 
     def __init__(self, gaussians: Gaussians, loss: LossMeter, limits: Limits, stored: Stored):
         self._gaussians, self._loss, self._limits, self._stored = gaussians, loss, limits, stored
-        self._bytes_each = stored(gaussians)[1] / len(gaussians)
+        again, self._bytes = stored(gaussians)
+        self.degree = again.sh_degree
+
+    def sharing_pays(self) -> bool:
+        """Whether the file becomes smaller if Gaussians share their harmonics."""
+        sh = self._gaussians.sh.copy()
+        sh[:, 1:] = 0
+        return self._stored(replace(self._gaussians, sh=sh))[1] < (1 - SHARING_MIN) * self._bytes
 
     def far_enough(self, left: Gaussians) -> bool:
-        """Whether pruning can stop at the Gaussians that are left."""
+        """Whether the reduction can stop at the Gaussians that are left."""
         limits = self._limits
         if limits.loss is not None:
             return self._loss(left) > limits.loss
-        most = [limits.gaussians, limits.bytes and limits.bytes / self._bytes_each]
+        most = [limits.gaussians, limits.bytes and limits.bytes / self._bytes * len(self._gaussians)]
         return len(left) <= min(m for m in most if m is not None)
 
-    def version(self, n: int, degree: int) -> Gaussians:
-        return with_degree(self._gaussians.take(np.sort(self.order[:n])), degree)
+    def version(self, n: int, choice: int) -> Gaussians:
+        return self.choices[choice].take(self.reduction.rows(n))
 
-    def measured(self, n: int, degree: int) -> Compacted:
-        version = self.version(n, degree)
+    def measured(self, n: int, choice: int) -> Compacted:
+        version = self.version(n, choice)
         again, size = self._stored(version)
         return Compacted(version, size, self._loss(again))
 
-    def largest_number(self, degree: int) -> int:
+    def largest_number(self, choice: int) -> int:
         """The largest number of Gaussians within the limits."""
         n = min(len(self._gaussians), self._limits.gaussians or len(self._gaussians))
         if self._limits.bytes is None:
             return n
         low, high = 0, n + 1  # fits, does not
         while high > low + 1 and (low == 0 or high / low > PRECISION):
-            size = self._stored(self.version(n, degree))[1]
+            size = self._stored(self.version(n, choice))[1]
             low, high = (n, high) if size <= self._limits.bytes else (low, n)
             # Bytes are nearly in proportion to Gaussians.
             n = min(max(round(0.995 * n * self._limits.bytes / size), low + 1), high - 1)
@@ -169,31 +229,32 @@ class _Search:
             )
         return low
 
-    def smallest_number(self, degree: int, loss: float) -> int | None:
+    def smallest_number(self, choice: int, loss: float) -> int | None:
         """The smallest number of Gaussians whose loss is within a limit; None if there is none."""
         low, high = 0, len(self._gaussians)
-        if self._loss(self.version(high, degree)) > loss:
+        if self._loss(self.version(high, choice)) > loss:
             return None
         while high > low + 1 and (low == 0 or high / low > PRECISION):
             n = max(int(np.sqrt(low * high)), low + 1) if low else high // 2
-            low, high = (n, high) if self._loss(self.version(n, degree)) > loss else (low, n)
+            low, high = (n, high) if self._loss(self.version(n, choice)) > loss else (low, n)
         return high
 
     def smallest(self, limit: float) -> Compacted:
         """The smallest file whose loss, rounding by the format included, is within the limit."""
-        numbers = {d: self.smallest_number(d, limit) for d in range(self._gaussians.sh_degree + 1)}
-        sizes = {d: self._stored(self.version(n, d))[1] for d, n in numbers.items() if n is not None}
-        degree, aim = min(sizes, key=lambda d: sizes[d]), limit
+        last = len(self.choices) - 1
+        numbers = {c: self.smallest_number(c, limit) for c in range(last + 1)}
+        sizes = {c: self._stored(self.version(n, c))[1] for c, n in numbers.items() if n is not None}
+        choice, aim = min(sizes, key=lambda c: sizes[c], default=last), limit
         for _ in range(TRIES):
-            n = self.smallest_number(degree, aim)
+            n = self.smallest_number(choice, aim)
             if n is None:
                 break
-            found = self.measured(n, degree)
+            found = self.measured(n, choice)
             if found.loss <= limit:
                 return self._within(found)
             aim -= found.loss - limit
-            degree = degree if self.smallest_number(degree, aim) else min(degree + 1, self._gaussians.sh_degree)
-        whole = self.measured(len(self._gaussians), self._gaussians.sh_degree)
+            choice = choice if self.smallest_number(choice, aim) else min(choice + 1, last)
+        whole = self.measured(len(self._gaussians), last)
         raise InputError(
             f"--max-psnr-loss: expected more than the {whole.loss:.3f} dB that the format costs without any pruning, "
             f"found {limit:g}; a format such as .sog or .ply loses less"

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.camera import Camera
 from clsplat.constants import ALPHA_MIN
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
@@ -33,13 +34,18 @@ class Prices(NamedTuple):
 
     errors (N,): change if the Gaussian alone is removed; negative if the error falls. differences (N,): the same with
     the render itself as the target. weights (N,): sums of the weight alpha T per pixel, 0 for a Gaussian that no view
-    shows. bands (N, D): column d, change if the Gaussian alone keeps the bands 0 to d of its spherical harmonics,
+    shows. squares (N,): the same of the squared weight. sights (N, 3): sums of the squared weight times the direction
+    from the camera; grains (N,): sums of the squared weight times the squared size of a pixel at the Gaussian, world
+    units. bands (N, D): column d, change if the Gaussian alone keeps the bands 0 to d of its spherical harmonics,
     whose degree is D.
     """
 
     errors: Array
     differences: Array
     weights: Array
+    squares: Array
+    sights: Array
+    grains: Array
     bands: Array
 
     @property
@@ -121,12 +127,19 @@ def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands:
     if not views or not len(gaussians):
         raise InputError(f"views, gaussians: expected at least one each, found {len(views)} and {len(gaussians)}")
     n, degree = len(gaussians), gaussians.sh_degree
-    total = Prices(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, degree)))
+    total = Prices(
+        np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros((n, degree))
+    )
     for view, _, residuals, part in measure_removals(renderer, gaussians, views, clamped=True):
         pixels = residuals[:, :, 0].size if view.mask is None else max(1, int(view.mask.sum()))
         total.errors[:] += part.errors / pixels
         total.differences[:] += part.differences / pixels
         total.weights[:] += part.weights / pixels
+        squares = part.squares / pixels
+        direction, size = sight(gaussians, view.camera)
+        total.squares[:] += squares
+        total.sights[:] += squares[:, None] * direction
+        total.grains[:] += squares * size**2
         if degree and bands:
             seen = np.flatnonzero(part.weights > 0)
             change = _color_changes(gaussians.take(seen), view.camera.position)
@@ -134,6 +147,14 @@ def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands:
             error = squares * (change**2).sum(axis=2) + 2 * np.einsum("ndc,nc->nd", change, pulls)
             total.bands[seen] += error / pixels
     return total
+
+
+def sight(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
+    """Unit vectors (N, 3) from a camera to Gaussians, and the sizes (N,) of a pixel there, world units."""
+    offsets = gaussians.means - camera.position
+    distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
+    size = np.ones_like(distances) if camera.model == "orthographic" else distances
+    return offsets / distances[:, None], size / camera.fx
 
 
 def _color_changes(gaussians: Gaussians, position: Array) -> Array:
