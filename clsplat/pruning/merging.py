@@ -22,13 +22,13 @@ Array = NDArray[Any]
 NEIGHBOURS = 4
 """Number of nearest Gaussians with which each one may be merged."""
 
-GRID = 5
+GRID = 9
 """Number of points per axis at which a merged Gaussian is compared with the two it replaces."""
 
-REACH = 2.5
-"""Largest coordinate of these points, standard deviations of the merged Gaussian; beyond it lie 2 % of its mass."""
+REACH = 3.0
+"""Largest coordinate of these points, standard deviations of the merged Gaussian; beyond it lies 1 % of its mass."""
 
-CHUNK = 1 << 14
+CHUNK = 1 << 13
 """Number of pairs that are compared at a time, which bounds the memory."""
 
 VISIBLE_MIN = 1e-3

@@ -64,8 +64,8 @@ def reduce(
     n = len(gaussians)
     pool, parents = gaussians, np.zeros((0, 2), np.intp)
     birth, death = np.zeros(n, np.intp), np.full(n, n)
-    alive, step = np.arange(n), 0
-    while True:
+    alive, known, step = np.arange(n), np.zeros(n), 0
+    while len(alive) > 1:
         current = pool.take(alive)
         prices = price(current, views, renderer, bands=False)
         count = len(alive) - int(ROUND * len(alive))
@@ -86,10 +86,11 @@ def reduce(
         known = np.full(len(pool), np.inf)
         known[alive] = prices.costs
         alive = np.concatenate([alive[death[alive] == n], new])
-        if len(alive) <= 1 or until(pool.take(alive)):
-            last = alive[np.argsort(known[alive], kind="stable")]
-            death[last] = step + 1 + np.arange(len(last))
-            return Reduction(pool, parents, birth, death)
+        if until(pool.take(alive)):
+            break
+    last = alive[np.argsort(known[alive], kind="stable")]
+    death[last] = step + 1 + np.arange(len(last))
+    return Reduction(pool, parents, birth, death)
 
 
 def cheapest(removals: Array, pairs: Array, merges: Array, count: int) -> tuple[Array, Array]:
