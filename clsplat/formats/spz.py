@@ -74,7 +74,8 @@ SH = (128.0, 128.0)
 
 SH_STEP = 4
 """Step of the bytes of the bands above 0, counted from 128; a coarser step compresses better. Other writers use 8 in
-band 1 and 16 above, which is coarser than the coefficients of most scenes. Measurement: docs/formats.md."""
+band 1 and 16 above, which is coarser than the coefficients of most scenes. Shared bands have steps of 1, since their
+repetitions take few bytes. Measurement: docs/formats.md."""
 
 SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """Signs by which the coefficients change when y and z change sign: the parity of the basis functions in y and z,
@@ -112,9 +113,10 @@ def load_spz(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
 def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", offset: ArrayLike | None = None) -> None:
     """Write Gaussians as an .spz file of version 3.
 
-    The Gaussians are sorted along a Z-order curve, which compresses better. Largest rounding errors: positions half
+    The Gaussians are sorted along a Z-order curve, which compresses better. Those that share their bands above 0
+    (`clsplat.formats.codebook.shared_rows`) come one after the other, with these bands at full precision. Largest rounding errors: positions half
     of 2^-b units (b: see `fractional_bits`), opacities 1/510, sh of band 0 1/76.5, log scales 1/32, quaternions
-    1/1445 for each component other than the largest, spherical harmonics above band 0 1/64. Ranges: sh of band 0
+    1/1445 for each component other than the largest, spherical harmonics above band 0 1/64 (shared: 1/256). Ranges: sh of band 0
     within ±3.33, log scales from -10 to 5.9375, spherical harmonics above band 0 within ±1; values outside are
     clamped with a warning. The offset is lost with a warning.
 
@@ -132,7 +134,7 @@ def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
     g = _turned(checked(path, gaussians))
     g = g.take(morton_order(g.means))
     shared = shared_rows(g.sh[:, 1:].reshape(len(g), -1)) if g.sh_degree else None
-    if shared is not None:
+    if shared is not None:  # equal bands next to each other
         g = g.take(np.argsort(shared[1], kind="stable"))
     warn_lost(path, offset=offset)
     n = len(g)
@@ -144,7 +146,7 @@ def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
         rounded(path, "sh of band 0", COLOR[0] * g.sh[:, 0] + COLOR[1], 255),
         rounded(path, "log_scales", LOG_SCALE[0] * g.log_scales + LOG_SCALE[1], 255),
         _pack(g.quats),
-        _sh_bytes(path, g.sh[:, 1:]),
+        _sh_bytes(path, g.sh[:, 1:], SH_STEP if shared is None else 1),
     ]
     flags = ANTIALIASED if mode == "antialiased" else 0
     with replacing(path) as out, gzip.GzipFile("", "wb", GZIP_LEVEL, out, mtime=0) as packed:
@@ -279,9 +281,9 @@ def _decode(
     return _turned(gaussians).astype(np.float32), "antialiased" if flags & ANTIALIASED else "classic", np.zeros(3)
 
 
-def _sh_bytes(path: str | Path, sh: Array) -> Array:
-    """Convert coefficients (N, K, 3) to bytes (N, 3 K): 128 plus a multiple of SH_STEP, which keeps 0 exact."""
-    steps = np.rint(SH[0] / SH_STEP * sh) * SH_STEP
+def _sh_bytes(path: str | Path, sh: Array, step: int) -> Array:
+    """Convert coefficients (N, K, 3) to bytes (N, 3 K): 128 plus a multiple of `step`, which keeps 0 exact."""
+    steps = np.rint(SH[0] / step * sh) * step
     return rounded(path, "sh above band 0", steps + SH[1], 255).reshape(len(sh), -1)
 
 
