@@ -26,10 +26,10 @@ from clsplat.pruning.prices import removal_order
 from clsplat.pruning.reductions import reduce
 from clsplat.renderer import Renderer
 
-SMALLEST = 0.3
+SMALLEST = 0.4
 """Fraction of the Gaussians at which the rounds end."""
 
-STEP = 1.04
+STEP = 1.05
 """Factor to which the number of Gaussians is found."""
 
 
