@@ -55,35 +55,30 @@ def nearest(book: Array, values: Array) -> Array:
     return np.searchsorted(middles, values).astype(np.uint8)
 
 
-def shared_rows(rows: Array) -> tuple[Array, Array] | None:
-    """Find the different rows of (N, D), and the index of each row's own, if there are few enough for a palette.
+def shared_rows(rows: Array, most: int) -> tuple[Array, Array] | None:
+    """Find the different rows of (N, D), and the index of each row's own, if there are at most `most`.
 
     Returns
     -------
     tuple or None
-        Different rows (P, D), in the order of their first appearance, and labels (N,); None if P exceeds
-        `palette_size`.
+        Different rows (P, D), in the order of their first appearance, and labels (N,); None if there are more.
     """
     # Rows with equal sums of their columns, multiplied by irregular factors, are equal but for rare coincidences.
     factors = np.sqrt(np.arange(2, rows.shape[1] + 2, dtype=np.float64))
     _, first, labels = np.unique(rows @ factors, return_index=True, return_inverse=True)
-    if len(first) > palette_size(len(rows)):
+    if len(first) > most:
         return None
     appearance = np.argsort(first, kind="stable")
     entries, labels = rows[first[appearance]], np.argsort(appearance)[labels]
     return (entries, labels) if np.array_equal(entries[labels], rows) else None
 
 
-def palette_size(n: int) -> int:
-    """Largest number of entries of the palette of n rows."""
-    return min(n, max(PALETTE_MIN, n // PALETTE_SHARE), PALETTE_MAX)
-
-
 def palette(rows: Array, weights: Array) -> tuple[Array, Array]:
     """Compute rows that approximate all rows, by weighted k-means on two levels.
 
     There are about sqrt(P) coarse cells. The number of entries in a cell is proportional to its share of the weights.
-    A row is compared with about 2 sqrt(P) entries instead of P, which bounds the time for a million rows.
+    A row is compared with about 2 sqrt(P) entries instead of P, which bounds the time for a million rows. Rows of
+    which few are different are kept as they are.
 
     Parameters
     ----------
@@ -101,10 +96,10 @@ def palette(rows: Array, weights: Array) -> tuple[Array, Array]:
     """
     n = len(rows)
     rows = np.ascontiguousarray(rows, np.float32)
-    shared = shared_rows(rows)
+    size = min(n, max(PALETTE_MIN, n // PALETTE_SHARE), PALETTE_MAX)
+    shared = shared_rows(rows, size)
     if shared is not None:
         return shared[0], shared[1].astype(np.uint16)
-    size = palette_size(n)
     count = round(size**0.5)
     step = max(1, n // (count * TRAINING))
     cells = _closest(rows, _means(rows[::step], weights[::step], count))

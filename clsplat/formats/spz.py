@@ -30,7 +30,7 @@ from clsplat.atomic import replacing
 from clsplat.config import Mode
 from clsplat.constants import SH_DEGREE_MAX
 from clsplat.errors import InputError
-from clsplat.formats.codebook import shared_rows
+from clsplat.formats.codebook import PALETTE_SHARE, shared_rows
 from clsplat.formats.quantisation import (
     SQRT1_2,
     check_expansion,
@@ -113,10 +113,10 @@ def load_spz(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
 def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", offset: ArrayLike | None = None) -> None:
     """Write Gaussians as an .spz file of version 3.
 
-    The Gaussians are sorted along a Z-order curve, which compresses better. Those that share their bands above 0
-    (`clsplat.formats.codebook.shared_rows`) come one after the other, with these bands at full precision. Largest rounding errors: positions half
-    of 2^-b units (b: see `fractional_bits`), opacities 1/510, sh of band 0 1/76.5, log scales 1/32, quaternions
-    1/1445 for each component other than the largest, spherical harmonics above band 0 1/64 (shared: 1/256). Ranges: sh of band 0
+    The Gaussians are sorted along a Z-order curve, which compresses better. Those that share their bands above 0 come
+    one after the other, if that is so for three on average. Largest rounding errors: positions half of 2^-b units (b:
+    see `fractional_bits`), opacities 1/510, sh of band 0 1/76.5, log scales 1/32, quaternions 1/1445 for each
+    component other than the largest, spherical harmonics above band 0 1/64 (shared ones 1/256). Ranges: sh of band 0
     within ±3.33, log scales from -10 to 5.9375, spherical harmonics above band 0 within ±1; values outside are
     clamped with a warning. The offset is lost with a warning.
 
@@ -133,7 +133,7 @@ def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
     """
     g = _turned(checked(path, gaussians))
     g = g.take(morton_order(g.means))
-    shared = shared_rows(g.sh[:, 1:].reshape(len(g), -1)) if g.sh_degree else None
+    shared = shared_rows(g.sh[:, 1:].reshape(len(g), -1), len(g) // PALETTE_SHARE) if g.sh_degree else None
     if shared is not None:  # equal bands next to each other
         g = g.take(np.argsort(shared[1], kind="stable"))
     warn_lost(path, offset=offset)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.formats import codebook
-from clsplat.formats.codebook import CODES, nearest, palette
+from clsplat.formats.codebook import CODES, nearest, palette, shared_rows
 
 
 @pytest.mark.parametrize("kind", ["normal", "uniform", "outlier", "two peaks"])
@@ -67,3 +67,24 @@ def test_equal_rows_make_no_trouble():
     rows = np.repeat(np.eye(3, dtype=np.float32), 2000, axis=0)
     entries, labels = palette(rows, np.ones(6000, np.float32))
     np.testing.assert_allclose(entries[labels], rows, atol=1e-6)
+
+
+def test_shared_rows_are_found():
+    rng = np.random.default_rng(0)
+    few = rng.normal(size=(50, 9)).astype(np.float32)
+    rows = few[rng.integers(50, size=6000)]
+    entries, labels = shared_rows(rows, 50)
+    np.testing.assert_array_equal(entries[labels], rows)
+    assert len(entries) == 50 and np.unique(labels, return_index=True)[1].tolist() == sorted(
+        np.unique(labels, return_index=True)[1]
+    ), "in the order of their first appearance"
+    assert shared_rows(rows, 49) is None
+
+
+def test_shared_rows_make_an_exact_palette():
+    rng = np.random.default_rng(0)
+    few = rng.normal(size=(1500, 9)).astype(np.float32)
+    rows = few[rng.integers(1500, size=6000)]
+    entries, labels = palette(rows, np.ones(6000, np.float32))
+    assert labels.dtype == np.uint16 and len(entries) <= 1500
+    np.testing.assert_array_equal(entries[labels], rows)

@@ -79,7 +79,7 @@ def test_shared_bands(device):
         found = with_shared_bands(gaussians, curvature, size)
         rows = found.sh[:, 1:].reshape(200, -1)
         assert len(np.unique(rows, axis=0)) <= size and found.sh.dtype == gaussians.sh.dtype
-        assert len(shared_rows(rows)[0]) == len(np.unique(rows, axis=0))
+        assert len(shared_rows(rows, 200)[0]) == len(np.unique(rows, axis=0))
         changes.append(change(gaussians, found))
     assert changes[2] < 0.5 * changes[1] < 0.25 * changes[0]
     again = with_shared_bands(gaussians, curvature, 100)
