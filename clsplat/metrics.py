@@ -68,10 +68,18 @@ def psnr_fitted(image: Array, truth: Array, mask: NDArray[np.bool_] | None = Non
     Parameters, result and errors are those of `psnr`. Up to rounding and clamping, the result is at least `psnr`.
     """
     a, b, mask = _prepare(image, truth, mask)
-    inputs, outputs = np.c_[a[mask], np.ones(mask.sum())], b[mask]
+    return psnr(colors_fitted(a, b, mask), b, mask)
+
+
+def colors_fitted(image: Array, truth: Array, mask: NDArray[np.bool_]) -> Array:
+    """Map the colours of an image (H, W, 3) by the affine map that brings its pixels in the mask closest to the truth.
+
+    Both are floats; the result is neither rounded nor clamped.
+    """
+    inputs, outputs = np.c_[image[mask], np.ones(mask.sum())], truth[mask]
     # Normal equations: 4 unknowns per channel, many pixels. The pseudo-inverse also handles flat images.
-    fit = np.linalg.pinv(inputs.T @ inputs) @ (inputs.T @ outputs)
-    return psnr(a @ fit[:3] + fit[3], b, mask)
+    fit: Array = np.linalg.pinv(inputs.T @ inputs) @ (inputs.T @ outputs)
+    return image @ fit[:3] + fit[3]
 
 
 def ssim(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> float:

@@ -213,7 +213,7 @@ def say_size(scene: "Scene", out: Path) -> None:
         say(f"size: {len(scene.train)} photos are too few to choose it from; it is what the strategy made")
         return
     size_chart(out / "size.json", out / "size.png")
-    say(f"size: chosen from {len(split(scene.train)[1])} validation photos; {out / 'size.png'} shows why")
+    say(f"size: chosen by {len(split(scene.train)[1])} photos that were held back; {out / 'size.png'} shows why")
 
 
 def evaluate_held_out(

@@ -13,6 +13,7 @@ from clsplat.scene import Scene
 from clsplat.training.autosize.explanation import write_report
 from clsplat.training.autosize.reduction import without_useless_bands
 from clsplat.training.autosize.search import search_size
+from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.preparation import open_device
@@ -116,6 +117,7 @@ def finish(training: Training, out: Path) -> Gaussians:
     gaussians = fetch(state.shown(training.renderer))
     state.move(None)  # what follows needs the device's memory
     if state.search:
-        write_report(out / "size.json", state.search, training.config)
+        held = [view.name for view in split(scene.train)[1]]
+        write_report(out / "size.json", state.search, training.config, held)
         gaussians = without_useless_bands(gaussians, state.corrected(scene.train), training.renderer)
     return without_invisible(gaussians)

@@ -48,7 +48,7 @@ class Training:
         self.optimizer = Optimizer(self.renderer, config.optimizer)
         self.photos = Photos(device)
         self._views: list[View] = scene.train
-        self._views_of = 1, False  # the divisor of their edges, and whether blocks of them validate
+        self._views_of = 1, False  # the divisor of their edges, and whether some are held back
         if state.filter and state.filter.pixels is not None:  # of a checkpoint
             state.filter.pixels = self.renderer.upload("pixel sizes", state.filter.pixels)
 
@@ -86,11 +86,11 @@ class Training:
         return loss
 
     def _choose_views(self, iteration: int) -> None:
-        """Take the photos of an iteration: at their size then, without blocks that validate."""
-        wanted = factor_at(iteration, self.config), bool(self.state.search and self.state.search.validates(iteration))
+        """Take the photos of an iteration: at their size then, without those that are held back."""
+        wanted = factor_at(iteration, self.config), bool(self.state.search and self.state.search.holds_back(iteration))
         if self._views_of != wanted:
-            factor, validates = self._views_of = wanted
-            views = split(self.scene.train)[0] if validates else self.scene.train
+            factor, holds_back = self._views_of = wanted
+            views = split(self.scene.train)[0] if holds_back else self.scene.train
             self._views, self.photos = [shrunk(view, factor) for view in views], Photos(self.device)
 
     def refresh_filter(self) -> None:

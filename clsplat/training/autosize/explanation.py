@@ -9,8 +9,8 @@ from clsplat.config import TrainConfig
 from clsplat.training.autosize.rule import SURE, Search, sh_bytes
 
 
-def write_report(path: Path, search: Search, config: TrainConfig) -> None:
-    """Write size.json: the rule, all trials and candidates, and the choice.
+def write_report(path: Path, search: Search, config: TrainConfig, held: list[str]) -> None:
+    """Write size.json: the rule, the names of the held-back photos, all trials and candidates, and the choice.
 
     least_share is the price per doubling as one of a single Gaussian. A doubling that gains p dB lowers the squared
     error by the fraction p ln(10)/10 and is ln(2) on the natural scale of N. The last Gaussian must therefore lower
@@ -18,8 +18,10 @@ def write_report(path: Path, search: Search, config: TrainConfig) -> None:
     """
     chosen = max(search.degrees, key=lambda p: p.worth)
     content = {
-        "rule": f"growth unless it loses more than {SURE:g} standard errors; pruning if it loses no more than "
-        "the price of its halvings; then the degree with the largest worth = psnr - price log2(bytes)",
+        "rule": f"growth that gains more than its price by {SURE:g} standard error; pruning that loses less than its "
+        "price by as much; then the degree with the largest worth = quality - price log2(bytes)",
+        "quality": "mean of PSNR and of SSIM in decibels on the held-back photos",
+        "held_back": held,
         "price": config.size_price,
         "least_share": config.size_price * log(10) / (10 * log(2)),
         "chosen": {"n": chosen.n, "sh_degree": chosen.sh_degree},
@@ -28,7 +30,7 @@ def write_report(path: Path, search: Search, config: TrainConfig) -> None:
                 "iteration": trial.larger.iteration,
                 "kind": "growth" if trial.grows else "pruning",
                 "n": [trial.smaller.n, trial.larger.n],
-                "psnr": [trial.smaller.psnr, trial.larger.psnr],
+                "quality": [trial.smaller.quality, trial.larger.quality],
                 "gain": trial.gain,
                 "standard_error": trial.standard_error,
                 "price": trial.price,
@@ -37,7 +39,7 @@ def write_report(path: Path, search: Search, config: TrainConfig) -> None:
             for trial in search.trials
         ],
         "degrees": [
-            {"sh_degree": p.sh_degree, "bytes": p.n * sh_bytes(p.sh_degree), "psnr": p.psnr, "worth": p.worth}
+            {"sh_degree": p.sh_degree, "bytes": p.n * sh_bytes(p.sh_degree), "quality": p.quality, "worth": p.worth}
             for p in search.degrees
         ],
     }
@@ -48,8 +50,8 @@ def write_report(path: Path, search: Search, config: TrainConfig) -> None:
 def size_chart(report: Path, path: Path) -> None:
     """Draw the choice of the number of Gaussians as a PNG.
 
-    Left, the validation PSNR against the number of Gaussians, with the two sides of each trial joined. Right, the
-    same against the bytes, for each degree of the spherical harmonics.
+    Left, the quality on the held-back photos against the number of Gaussians, with the two sides of each comparison
+    joined. Right, the same against the bytes, for each degree of the spherical harmonics.
 
     Parameters
     ----------
@@ -69,27 +71,25 @@ def size_chart(report: Path, path: Path) -> None:
     labelled: set[str] = set()
     for trial in content["trials"]:
         color, label = (grey, "growth") if trial["kind"] == "growth" else (blue, "pruning")
-        larger = trial["psnr"][1]
-        sides = [larger - trial["gain"], larger]  # by the gain that decided, not by the means over all photos
-        by_n.plot(trial["n"], sides, "-", color=color, label=None if label in labelled else label)
+        by_n.plot(trial["n"], trial["quality"], "-", color=color, label=None if label in labelled else label)
         labelled.add(label)
-        for n, quality in zip(trial["n"], sides, strict=True):
+        for n, quality in zip(trial["n"], trial["quality"], strict=True):
             by_n.plot(n, quality, "o", color=color, markerfacecolor=color if n == trial["taken"] else "white")
-        price = [sides[0], sides[0] + trial["price"]]
+        price = [trial["quality"][0], trial["quality"][0] + trial["price"]]
         name = f"price: {content['price']:g} dB per doubling"
         by_n.plot(trial["n"], price, "--", color=orange, linewidth=1, label=None if name in labelled else name)
         labelled.add(name)
     best = max(degrees, key=lambda p: p["worth"])
     by_n.axvline(chosen["n"], color=orange, linewidth=0.8, label=f"chosen: {chosen['n']:,}")
-    by_n.set_xlabel("Gaussians; two sides of a trial joined, the full one goes on")
-    by_n.set_ylabel("PSNR of the validation photos, dB")
-    by_bytes.plot([p["bytes"] / 1e6 for p in degrees], [p["psnr"] for p in degrees], "o-", color=green)
-    by_bytes.plot(best["bytes"] / 1e6, best["psnr"], "*", color=orange, markersize=15, zorder=4)
+    by_n.set_xlabel("Gaussians; two sides of a comparison joined, the full one goes on")
+    by_n.set_ylabel("quality on the held-back photos, dB")
+    by_bytes.plot([p["bytes"] / 1e6 for p in degrees], [p["quality"] for p in degrees], "o-", color=green)
+    by_bytes.plot(best["bytes"] / 1e6, best["quality"], "*", color=orange, markersize=15, zorder=4)
     for p in degrees:
         marker = ", chosen" if p is best else ""
         right = p is degrees[0]  # the curve lies right of the first point and left of the others
         place = {"xytext": (8 if right else -10, -4), "ha": "left" if right else "right"}
-        at = p["bytes"] / 1e6, p["psnr"]
+        at = p["bytes"] / 1e6, p["quality"]
         by_bytes.annotate(f"degree {p['sh_degree']}{marker}", at, textcoords="offset points", **place)
     by_bytes.set_xlabel("MB, without refitting")
     by_bytes.margins(x=0.3)

@@ -39,18 +39,13 @@ def costliest_rows(gaussians: Gaussians, left: float, views: list[View], rendere
 
 
 def unvalidated(gaussians: Gaussians, views: list[View], renderer: Renderer) -> list[View]:
-    """Some photos to price Gaussians by, with the render itself in the blocks that validate.
+    """Some photos to price Gaussians by, with the render itself in place of those that are held back.
 
-    Gaussians that are visible only there then have a price, but the pixels of the blocks have no part in it.
+    Gaussians that are visible only there then have a price, but these photos have no part in it.
     """
-    pairs = some(list(zip(views, split(views)[0], strict=True)))
-    renders = renderings(renderer, gaussians, [whole.camera for whole, _ in pairs])
-    return [
-        replace(whole, image=np.where(training.mask[:, :, None], whole.image, to_uint8(rendering.rgb)))
-        if training.mask is not None
-        else whole
-        for (whole, training), rendering in zip(pairs, renders, strict=True)
-    ]
+    held, priced = split(views)[1], some(views)
+    renders = iter(renderings(renderer, gaussians, [view.camera for view in priced if view in held]))
+    return [replace(v, image=to_uint8(next(renders).rgb)) if v in held else v for v in priced]
 
 
 def without_useless_bands(gaussians: Gaussians, views: list[View], renderer: Renderer) -> Gaussians:

@@ -1,4 +1,4 @@
-"""The search for the number of Gaussians: it drives a training from trial to trial."""
+"""The search for the number of Gaussians: it drives a training from window to window."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,22 +6,20 @@ from dataclasses import replace
 import numpy as np
 
 from clsplat.renderer import fetch
-from clsplat.scene import View
 from clsplat.training.autosize.reduction import costliest_rows
 from clsplat.training.autosize.rule import (
     Candidate,
-    Decision,
     Search,
     SmallSide,
     Trial,
     candidate,
     first_pruning,
+    growth_ends,
     halvings,
     most_grown,
-    most_identifiable,
     next_phase,
-    trial_bounds,
     validation_times,
+    window_bounds,
 )
 from clsplat.training.autosize.validation import split, validate
 from clsplat.training.session import Training
@@ -40,10 +38,10 @@ def search_size(training: Training, after: After, after_fork: After) -> None:
     training : Training
         With a search in its state, which may be a resumed one.
     after, after_fork : callable
-        Called after each iteration of the training, and of the smaller side of a trial. While the latter runs, the
+        Called after each iteration of the training, and of the pruned side of a trial. While the latter runs, the
         training's state stays as it was before the trial: an interruption loses the trial alone.
     """
-    bounds, times = trial_bounds(training.config), validation_times(training.config)
+    bounds, times = window_bounds(training.config), validation_times(training.config)
     for iteration in sorted(times.union(bounds)):
         search = training.state.search
         if search is None or search.settled:
@@ -51,52 +49,81 @@ def search_size(training: Training, after: After, after_fork: After) -> None:
         if iteration <= training.state.iteration:  # before the checkpoint that a run was resumed from
             continue
         training.run_until(iteration - 1, after)
-        if search.small_side:
+        if iteration in times and (search.grows or search.small_side):
             search = replace(search, validated=[*search.validated, _validate(training)])
-        if iteration in bounds:
-            training.state = _decide(training, search, iteration, after_fork)
-        else:
+        if iteration not in bounds:
             training.state = replace(training.state, search=search)
+        elif iteration < first_pruning(training.config):
+            training.state = _grown(training, search, iteration)
+        else:
+            training.state = _pruned(training, search, iteration, after_fork)
 
 
-def _decide(training: Training, search: Search, iteration: int, after_fork: After) -> State:
-    """End the current trial, decide the next phase, train the smaller side of its trial. Returns the new state."""
+def _grown(training: Training, search: Search, iteration: int) -> State:
+    """End a window of growth: compare with the last candidate that paid, and return to it where growth ends."""
+    if not search.grows:
+        return training.state
+    training.state.move(None)
+    state = replace(training.state)
+    if search.validated:
+        search = _compared(training, search, iteration)
+    if growth_ends(search, len(state.gaussians), iteration, training.config):
+        if search.small_side:
+            state = _continued(state, search.small_side)
+        search = replace(search, grows=False, small_side=None)
+    search = replace(search, most=len(state.gaussians), validated=[])
+    state.search = replace(search, most=most_grown(search, training.config))
+    return state
+
+
+def _compared(training: Training, search: Search, iteration: int) -> Search:
+    """The search after a comparison of the present Gaussians with the last candidate that paid."""
+    present, paid = _candidate(training, iteration, search.validated), search.small_side
+    trials = [*search.trials, Trial(True, paid.candidate, present)] if paid else search.trials
+    if paid is None or not trials[-1].takes_smaller:
+        rows = training.state.rows.take(np.arange(present.n))
+        return replace(search, trials=trials, small_side=SmallSide(rows, present))
+    return replace(search, trials=trials)
+
+
+def _pruned(training: Training, search: Search, iteration: int, after_fork: After) -> State:
+    """End a trial of pruning, decide the next phase, train the pruned side of its trial. Returns the new state."""
     training.state.move(None)  # one side of a trial at a time is on the device
     state, trials = replace(training.state), search.trials
     if search.small_side:
-        larger = _candidate(training, iteration, search.validated)
-        trials = [*trials, Trial(iteration < first_pruning(training.config), search.small_side.candidate, larger)]
+        trials = [*trials, Trial(False, search.small_side.candidate, _candidate(training, iteration, search.validated))]
         if trials[-1].takes_smaller:
-            state = replace(state, rows=search.small_side.rows, filter=state.filter and SmoothingFilter())
-    search = state.search = Search(len(state.gaussians), trials)
+            state = _continued(state, search.small_side)
+    search = state.search = Search(len(state.gaussians), False, trials)
     here = training.fork(state)  # an interruption of what follows leaves the training as it is
     here.refresh_filter()
-    most = most_identifiable(training.scene.train, training.config)
-    phase = next_phase(search, iteration, training.config, most)
+    phase = next_phase(search, iteration, training.config)
     if phase == "settle":
         search = replace(search, settled=iteration, degrees=_degrees(here, iteration))
         best = max(search.degrees, key=lambda c: c.worth).sh_degree
-        here.state.rows = here.state.rows.with_degree(best)
-    elif phase in ("try", "prune"):
-        search = replace(search, small_side=_train_small_side(here, phase, iteration, after_fork))
-    here.state.search = replace(search, most=most_grown(search, phase, training.config, most))
+        if best < len(search.degrees) - 1:
+            here.state.rows = here.state.rows.with_degree(best)
+    elif phase == "prune":
+        search = replace(search, small_side=_train_pruned(here, iteration, after_fork))
+    here.state.search = search
     return here.state
 
 
-def _train_small_side(training: Training, phase: Decision, iteration: int, after: After) -> SmallSide:
-    """Fork a training and train the fork to the end of the trial: with the same Gaussians, or with the costliest.
+def _continued(state: State, side: SmallSide) -> State:
+    """The state with the rows of the smaller candidate."""
+    return replace(state, rows=side.rows, filter=state.filter and SmoothingFilter())
 
-    The rows of the training are on the host.
-    """
+
+def _train_pruned(training: Training, iteration: int, after: After) -> SmallSide:
+    """Fork a training, prune the fork, and train it to the end of the trial. The rows of the training are on the
+    host."""
     state, config = training.state, training.config
-    rows = np.arange(len(state.gaussians))
-    if phase == "prune":
-        left = 2 ** -halvings(state.search.trials if state.search else [])
-        gaussians, views = fetch(state.shown(training.renderer)), state.corrected(training.scene.train)
-        rows = costliest_rows(gaussians, left, views, training.renderer)
+    left = 2 ** -halvings(state.search.trials if state.search else [])
+    gaussians, views = fetch(state.shown(training.renderer)), state.corrected(training.scene.train)
+    rows = costliest_rows(gaussians, left, views, training.renderer)
     side = training.fork(state.fork(state.rows.take(rows)))
     validated = []
-    end = next(bound for bound in trial_bounds(config) if bound > iteration)
+    end = next(bound for bound in window_bounds(config) if bound > iteration)
     for time in sorted(time for time in validation_times(config) if iteration < time <= end):
         side.run_until(time - 1, after)
         validated.append(_validate(side))
@@ -105,24 +132,18 @@ def _train_small_side(training: Training, phase: Decision, iteration: int, after
 
 def _degrees(training: Training, iteration: int) -> list[Candidate]:
     """Candidates for the degree of the spherical harmonics, of those that are trained."""
-    state, config, renderer = training.state, training.config, training.renderer
-    gaussians, views = state.shown(renderer), _validation_views(training)
-    return [
-        candidate(iteration, len(gaussians), degree, [validate(gaussians, views, renderer, degree)], config)
-        for degree in range(state.sh_degree(state.iteration, config) + 1)
-    ]
+    degrees = range(training.state.sh_degree(training.state.iteration, training.config) + 1)
+    n, config = len(training.state.gaussians), training.config
+    return [candidate(iteration, n, degree, [_validate(training, degree)], config) for degree in degrees]
 
 
-def _validation_views(training: Training) -> list[View]:
-    """Views with their validation blocks alone, corrected by what this training has learned about each photo."""
-    return training.state.corrected(split(training.scene.train)[1])
-
-
-def _validate(training: Training) -> list[float]:
-    """PSNR of each validation view, dB."""
+def _validate(training: Training, sh_degree: int | None = None) -> list[float]:
+    """Quality of each held-back photo, dB, with the trained degree of the spherical harmonics or another one."""
     state, renderer = training.state, training.renderer
-    degree = state.sh_degree(state.iteration, training.config)
-    return validate(state.shown(renderer), _validation_views(training), renderer, degree)
+    if sh_degree is None:
+        sh_degree = state.sh_degree(state.iteration, training.config)
+    held = split(training.scene.train)[1]
+    return validate(state.shown(renderer), held, renderer, sh_degree, fitted=state.exposures is not None)
 
 
 def _candidate(training: Training, iteration: int, validated: list[list[float]]) -> Candidate:

@@ -1,29 +1,26 @@
-"""Validation of a scene on blocks of pixels of some training photos."""
+"""Validation of a scene on photos that are held back from training."""
 
 from dataclasses import replace
 from math import log10
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.gaussians import Gaussians
-from clsplat.metrics import psnr, to_uint8
+from clsplat.metrics import colors_fitted, to_uint8
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
 from clsplat.scene import View
 
-VALIDATING = 12
-"""Training photos, evenly spaced by name, of which blocks validate. Every photo still trains in part, so that no
-viewpoint is missing."""
+HELD_SHARE = 1 / 8
+"""Fraction of the training photos that is held back, as evaluation holds back every eighth photo (Barron et al. 2022).
+With a smaller fraction decisions are less certain, with a larger one the others show less of the scene."""
 
-FEWEST_VALIDATING = 2
-"""Fewest photos with pixels that validate: the error of a mean cannot be estimated from one."""
+MOST_HELD = 16
+"""Most photos that are held back. More make a decision little more certain, and each validation longer."""
 
-BLOCKS = 8
-"""Blocks along each edge of a photo that validates."""
-
-EVERY_BLOCK = 4
-"""Spacing of the blocks that validate along a row; they move by two blocks in the next row and by one in the next
-photo."""
+FEWEST_HELD = 2
+"""Fewest photos that validate: the error of a mean cannot be estimated from one."""
 
 FEWEST_PHOTOS = 8
 """Fewest training photos with which the number of Gaussians is searched: fewer photos are all needed for training."""
@@ -34,35 +31,66 @@ sees, would otherwise seem to pay."""
 
 
 def split(views: list[View]) -> tuple[list[View], list[View]]:
-    """Divide photos into parts that train and parts that validate, by their masks.
+    """Divide photos into those that train and those that are held back to validate.
+
+    The photos that are held back are evenly spaced by name. They begin with the first one, which is often at an end
+    of the camera's path: a scene must also hold where few other photos look.
 
     Returns
     -------
-    training : list of View
-        All views; those that validate without their validation blocks.
-    validation : list of View
-        Views with their validation blocks alone; those without a pixel that counts are left out.
+    training, held : list of View
+        Photos without a pixel that counts are not held back.
     """
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(VALIDATING, len(views))).round().astype(int))
-    training, validation = list(views), []
-    for k, i in enumerate(chosen):
-        height, width = views[i].image.shape[:2]
-        row, column = np.arange(height)[:, None] * BLOCKS // height, np.arange(width) * BLOCKS // width
-        held = (column + 2 * row + k) % EVERY_BLOCK == 0
-        counts = np.ones((height, width), bool) if views[i].mask is None else views[i].mask
-        training[i] = replace(views[i], mask=counts & ~held)
-        if (counts & held).any():
-            validation.append(replace(views[i], mask=counts & held))
-    return training, validation
+    shown = [i for i, view in enumerate(views) if view.mask is None or view.mask.any()]
+    count = min(MOST_HELD, max(FEWEST_HELD, int(HELD_SHARE * len(views))), len(shown))
+    held = {shown[k * len(shown) // count] for k in range(count)}
+    return [view for i, view in enumerate(views) if i not in held], [views[i] for i in sorted(held)]
 
 
 def can_validate(views: list[View]) -> bool:
     """Whether there are enough photos to search the number of Gaussians."""
-    return len(views) >= FEWEST_PHOTOS and len(split(views)[1]) >= FEWEST_VALIDATING
+    return len(views) >= FEWEST_PHOTOS and len(split(views)[1]) >= FEWEST_HELD
 
 
-def validate(gaussians: Gaussians, views: list[View], renderer: Renderer, sh_degree: int) -> list[float]:
-    """PSNR of each view, dB and up to `PERFECT`, of renders rounded to 8 bits."""
+def validate(
+    gaussians: Gaussians, views: list[View], renderer: Renderer, sh_degree: int, *, fitted: bool = False
+) -> list[float]:
+    """Quality of each view, dB: the mean of its PSNR and of its SSIM in decibels.
+
+    PSNR alone values a blurred surface as much as a sharp one that is slightly off. SSIM in decibels is
+    -10 log10(1 - SSIM), so that both grow by the same amount when their errors are halved.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    views : list of View
+    renderer : Renderer
+    sh_degree : int
+        Highest degree of the spherical harmonics evaluated.
+    fitted : bool
+        Compare after the affine map of the render's colours that fits the photo best. Where exposures are learned,
+        that of a photo which does not train is unknown.
+
+    Returns
+    -------
+    list of float
+        Both parts are at most `PERFECT`.
+    """
     cameras, degree = [view.camera for view in views], min(sh_degree, gaussians.sh_degree)
     pairs = zip(renderings(renderer, gaussians, cameras, degree), views, strict=True)
-    return [min(PERFECT, psnr(to_uint8(rendering.rgb), view.image, view.mask)) for rendering, view in pairs]
+    return [_quality(to_uint8(rendering.rgb), view, renderer, fitted) for rendering, view in pairs]
+
+
+def _quality(image: NDArray[np.uint8], view: View, renderer: Renderer, fitted: bool) -> float:
+    counts = np.ones(image.shape[:2], bool) if view.mask is None else view.mask
+    if fitted:
+        image = to_uint8(colors_fitted(image / 255, view.image / 255, counts))
+    square = float(np.mean((image[counts] / 255 - view.image[counts] / 255) ** 2))
+    rgb, photo = renderer.upload("rgb", image / 255), renderer.upload("photo", view.image, np.uint8)
+    unlike, _ = renderer.stages.l1_ssim(rgb, photo, 1.0, renderer.upload("mask", counts, np.uint8))
+    return (decibels(square) + decibels(unlike / counts.mean())) / 2
+
+
+def decibels(error: float) -> float:
+    """An error in decibels, at most `PERFECT`."""
+    return min(PERFECT, -10 * log10(error)) if error > 0 else PERFECT
