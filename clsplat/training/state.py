@@ -109,7 +109,7 @@ def initial_state(scene: Scene, config: TrainConfig) -> State:
         seconds=0.0,
         extent=scene.extent,
         rows=Rows(gaussians, Moments.zeros(gaussians), strategy),
-        search=rule.Search(len(gaussians)) if searches else None,
+        search=rule.start(scene, len(gaussians), config) if searches else None,
         exposures=photo_exposures.start(names) if config.exposure else None,
         poses=photo_poses.start(names) if config.poses else None,
         filter=SmoothingFilter() if config.filter_3d else None,

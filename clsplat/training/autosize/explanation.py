@@ -18,8 +18,8 @@ def write_report(path: Path, search: Search, config: TrainConfig, held: list[str
     """
     chosen = max(search.degrees, key=lambda p: p.worth)
     content = {
-        "rule": f"growth that gains more than its price by {SURE:g} standard error; pruning that loses less than its "
-        "price by as much; then the degree with the largest worth = quality - price log2(bytes)",
+        "rule": f"growth that gains more than its price by the margin of {SURE:g} standard error; pruning that "
+        "loses less than its price by as much; then the degree with the largest worth = quality - price log2(bytes)",
         "quality": "mean of PSNR and of SSIM in decibels on the held-back photos",
         "held_back": held,
         "price": config.size_price,
@@ -32,7 +32,7 @@ def write_report(path: Path, search: Search, config: TrainConfig, held: list[str
                 "n": [trial.smaller.n, trial.larger.n],
                 "quality": [trial.smaller.quality, trial.larger.quality],
                 "gain": trial.gain,
-                "standard_error": trial.standard_error,
+                "margin": trial.margin,
                 "price": trial.price,
                 "taken": trial.smaller.n if trial.takes_smaller else trial.larger.n,
             }

@@ -10,23 +10,20 @@ bytes. After that all photos train.
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import ceil, log2, sqrt
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from clsplat.config import TrainConfig
-from clsplat.training.densify.schedule import TRIAL_GROWTH, TRIAL_LENGTH, growth_window
+from clsplat.scene import Scene
+from clsplat.training.densify.schedule import TRIAL_LENGTH
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.rows import Rows
 
 GROWTH_END = 0.5
 """Fraction of the iterations at which growth ends, as the paper's densification does."""
 
-PRUNING_START = 0.6
-"""Fraction of the iterations at which trials of pruning begin. At the high learning rates before, the gain of more
-Gaussians is underestimated (measured: docs/size.md)."""
-
-PRUNING_END = 0.75
+PRUNING_END = 0.65
 """Fraction of the iterations at which trials of pruning end; all photos train afterwards."""
 
 GROWTH_START = 500
@@ -40,15 +37,24 @@ pruning must stay below it."""
 PATIENCE = 2.0
 """Factor by which the number of Gaussians grows without paying before growth ends."""
 
-VALIDATIONS = 2
-"""Validations in a window, which are averaged: quality fluctuates while the learning rates are high (measured:
-docs/size.md)."""
+GROWTH_WINDOW = 0.1
+"""Fraction of the iterations in a window of growth. In its first part the number of Gaussians grows, in its second
+half the scene is validated: Gaussians that have just been split are worse before they are better."""
 
-FIRST_PRUNING = 1.0
-"""Halvings of the number of Gaussians in the first trial of pruning."""
+PACE = 4.0
+"""Multiple of the first Gaussians that growth reaches by its end, unless a photo has more pixels than that: then it is
+one Gaussian per pixel. Faster growth ends worse (measured: docs/size.md)."""
 
-LAST_PRUNING = 0.5
-"""Fewest halvings of the number of Gaussians that a trial is made for."""
+VALIDATIONS = 3
+"""Validations in the second half of a window, which are averaged: quality fluctuates while the learning rates are high
+(measured: docs/size.md)."""
+
+FEWEST_PRUNING = 4
+"""Fewest held-back photos that decide on pruning. By two of castle_p30's photos a scene was halved that then lost 1.7
+dB in others (measured: docs/size.md)."""
+
+HALVING = 0.5
+"""Fraction of the Gaussians that a trial of pruning leaves."""
 
 RANDOM_START = 10_000
 """Gaussians of a random start. Few are enough, since they only have to fill the scene before growth adds detail."""
@@ -88,10 +94,10 @@ class Trial(NamedTuple):
         return self.larger.quality - self.smaller.quality
 
     @property
-    def standard_error(self) -> float:
-        """Standard error of the gain, dB, from the differences of the photos."""
+    def margin(self) -> float:
+        """`SURE` standard errors of the gain, dB, from the differences of the photos."""
         gains = np.array(self.larger.views) - np.array(self.smaller.views)
-        return float(gains.std(ddof=1) / sqrt(len(gains)))
+        return float(SURE * gains.std(ddof=1) / sqrt(len(gains)))
 
     @property
     def price(self) -> float:
@@ -105,8 +111,7 @@ class Trial(NamedTuple):
         A change must be earned: growth has to gain more than its price beyond chance, and what pruning loses must be
         below the price beyond chance.
         """
-        margin = SURE * self.standard_error
-        return self.gain <= self.price + (margin if self.grows else -margin)
+        return self.gain <= self.price + (self.margin if self.grows else -self.margin)
 
 
 class SmallSide(NamedTuple):
@@ -121,13 +126,14 @@ class SmallSide(NamedTuple):
 class Search:
     """The state of the search.
 
-    most: largest number of Gaussians after an edit; grows: whether growth has not ended; trials: comparisons so far;
+    most: largest number of Gaussians after an edit; pace: factor of its growth from window to window; grows: whether growth has not ended; trials: comparisons so far;
     degrees: candidates for the degree of the spherical harmonics; settled: the iteration before which the search
     ended, 0 until then; validated: quality of the photos at each validation in the current window; small_side: what
     the end of the window is compared with.
     """
 
     most: int
+    pace: float = 1.0
     grows: bool = True
     trials: list[Trial] = field(default_factory=list)
     degrees: list[Candidate] = field(default_factory=list)
@@ -149,9 +155,25 @@ def window_bounds(config: TrainConfig) -> list[int]:
     """Iterations before which windows begin or end: of growth, and from `first_pruning` on trials of pruning."""
     first, length = first_pruning(config), max(1, round(TRIAL_LENGTH * config.iterations))
     pruning = range(first, max(first, round(PRUNING_END * config.iterations)) + 1, length)
-    earliest, window = config.shortened(GROWTH_START), growth_window(config)
-    growth = range(round(GROWTH_END * config.iterations), earliest - 1, -window)
-    return [*growth[::-1], *pruning]
+    return [*growth_bounds(config)[:-1], *pruning]
+
+
+def growth_bounds(config: TrainConfig) -> list[int]:
+    """Iterations before which windows of growth end."""
+    earliest, last = config.shortened(GROWTH_START), round(GROWTH_END * config.iterations)
+    return [*range(last, earliest - 1, -growth_window(config))][::-1]
+
+
+def growth_window(config: TrainConfig) -> int:
+    """Iterations in a window of growth."""
+    return max(1, round(GROWTH_WINDOW * config.iterations))
+
+
+def start(scene: Scene, n: int, config: TrainConfig) -> "Search":
+    """The search before the first iteration, with n Gaussians."""
+    pixels = max(view.image[:, :, 0].size for view in scene.train)
+    windows = max(1, len(growth_bounds(config)))
+    return Search(n, max(PACE, pixels / n) ** (1 / windows))
 
 
 def validation_times(config: TrainConfig) -> set[int]:
@@ -162,8 +184,8 @@ def validation_times(config: TrainConfig) -> set[int]:
 
 
 def first_pruning(config: TrainConfig) -> int:
-    """Iteration before which the first trial of pruning begins."""
-    return max(1, round(PRUNING_START * config.iterations))
+    """Iteration before which growth has ended and the first trial of pruning begins."""
+    return max(1, round(GROWTH_END * config.iterations))
 
 
 def candidate(iteration: int, n: int, sh_degree: int, validated: list[list[float]], config: TrainConfig) -> Candidate:
@@ -176,8 +198,7 @@ def candidate(iteration: int, n: int, sh_degree: int, validated: list[list[float
 def growth_ends(search: Search, n: int, iteration: int, config: TrainConfig) -> bool:
     """Whether growth to n Gaussians has not paid for too long, or its time is over."""
     paid = search.small_side.candidate.n if search.small_side else n
-    late = iteration >= round(GROWTH_END * config.iterations)
-    return late or n >= PATIENCE * paid or n >= most_allowed(config)
+    return iteration >= first_pruning(config) or n >= PATIENCE * paid or n >= most_allowed(config)
 
 
 def most_allowed(config: TrainConfig) -> int:
@@ -187,22 +208,13 @@ def most_allowed(config: TrainConfig) -> int:
 
 def most_grown(search: Search, config: TrainConfig) -> int:
     """Largest number of Gaussians that growth may reach in the next window."""
-    return min(ceil(TRIAL_GROWTH * search.most), most_allowed(config)) if search.grows else search.most
+    return min(ceil(search.pace * search.most), most_allowed(config)) if search.grows else search.most
 
 
-Decision = Literal["rest", "prune", "settle"]
-"""Next phase of a search whose growth has ended: no change, a trial of pruning, or the end."""
+def prunes(search: Search, iteration: int, held: int, config: TrainConfig) -> bool:
+    """Whether a trial of pruning begins at one of the `window_bounds`: until one is rejected or time is over.
 
-
-def next_phase(search: Search, iteration: int, config: TrainConfig) -> Decision:
-    """Decide what follows one of the `window_bounds` once growth has ended."""
-    if iteration < first_pruning(config):
-        return "rest"
-    late = iteration == window_bounds(config)[-1]
-    return "settle" if late or halvings(search.trials) < LAST_PRUNING else "prune"
-
-
-def halvings(trials: list[Trial]) -> float:
-    """Halvings of the number of Gaussians in the next trial of pruning: halved by each trial that was rejected."""
-    rejected = sum(not trial.grows and not trial.takes_smaller for trial in trials)
-    return FIRST_PRUNING / 2**rejected
+    With fewer than `FEWEST_PRUNING` held-back photos none does.
+    """
+    rejected = any(not trial.grows and not trial.takes_smaller for trial in search.trials)
+    return held >= FEWEST_PRUNING and not rejected and iteration < window_bounds(config)[-1]

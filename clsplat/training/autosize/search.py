@@ -8,6 +8,7 @@ import numpy as np
 from clsplat.renderer import fetch
 from clsplat.training.autosize.reduction import costliest_rows
 from clsplat.training.autosize.rule import (
+    HALVING,
     Candidate,
     Search,
     SmallSide,
@@ -15,9 +16,8 @@ from clsplat.training.autosize.rule import (
     candidate,
     first_pruning,
     growth_ends,
-    halvings,
     most_grown,
-    next_phase,
+    prunes,
     validation_times,
     window_bounds,
 )
@@ -50,23 +50,19 @@ def search_size(training: Training, after: After, after_fork: After) -> None:
             continue
         training.run_until(iteration - 1, after)
         if iteration in times and (search.grows or search.small_side):
-            search = replace(search, validated=[*search.validated, _validate(training)])
-        if iteration not in bounds:
-            training.state = replace(training.state, search=search)
-        elif iteration < first_pruning(training.config):
-            training.state = _grown(training, search, iteration)
-        else:
-            training.state = _pruned(training, search, iteration, after_fork)
+            validated = [*search.validated, _validate(training)]
+            training.state = replace(training.state, search=replace(search, validated=validated))
+        if iteration in bounds and search.grows:
+            training.state = _grown(training, iteration)
+        if iteration in bounds and iteration >= first_pruning(training.config):
+            training.state = _pruned(training, iteration, after_fork)
 
 
-def _grown(training: Training, search: Search, iteration: int) -> State:
+def _grown(training: Training, iteration: int) -> State:
     """End a window of growth: compare with the last candidate that paid, and return to it where growth ends."""
-    if not search.grows:
-        return training.state
     training.state.move(None)
     state = replace(training.state)
-    if search.validated:
-        search = _compared(training, search, iteration)
+    search = _compared(training, iteration)
     if growth_ends(search, len(state.gaussians), iteration, training.config):
         if search.small_side:
             state = _continued(state, search.small_side)
@@ -76,8 +72,12 @@ def _grown(training: Training, search: Search, iteration: int) -> State:
     return state
 
 
-def _compared(training: Training, search: Search, iteration: int) -> Search:
+def _compared(training: Training, iteration: int) -> Search:
     """The search after a comparison of the present Gaussians with the last candidate that paid."""
+    search = training.state.search
+    assert search
+    if not search.validated:  # the run is too short
+        return search
     present, paid = _candidate(training, iteration, search.validated), search.small_side
     trials = [*search.trials, Trial(True, paid.candidate, present)] if paid else search.trials
     if paid is None or not trials[-1].takes_smaller:
@@ -86,26 +86,29 @@ def _compared(training: Training, search: Search, iteration: int) -> Search:
     return replace(search, trials=trials)
 
 
-def _pruned(training: Training, search: Search, iteration: int, after_fork: After) -> State:
-    """End a trial of pruning, decide the next phase, train the pruned side of its trial. Returns the new state."""
+def _pruned(training: Training, iteration: int, after_fork: After) -> State:
+    """End a trial of pruning; begin another one, whose pruned side is trained first, or settle. Returns the new
+    state."""
     training.state.move(None)  # one side of a trial at a time is on the device
-    state, trials = replace(training.state), search.trials
+    state, search = replace(training.state), training.state.search
+    assert search
     if search.small_side:
-        trials = [*trials, Trial(False, search.small_side.candidate, _candidate(training, iteration, search.validated))]
-        if trials[-1].takes_smaller:
+        trial = Trial(False, search.small_side.candidate, _candidate(training, iteration, search.validated))
+        if trial.takes_smaller:
             state = _continued(state, search.small_side)
-    search = state.search = Search(len(state.gaussians), False, trials)
+        search = replace(search, trials=[*search.trials, trial], small_side=None, validated=[])
+    search = state.search = replace(search, most=len(state.gaussians))
     here = training.fork(state)  # an interruption of what follows leaves the training as it is
     here.refresh_filter()
-    phase = next_phase(search, iteration, training.config)
-    if phase == "settle":
-        search = replace(search, settled=iteration, degrees=_degrees(here, iteration))
-        best = max(search.degrees, key=lambda c: c.worth).sh_degree
-        if best < len(search.degrees) - 1:
-            here.state.rows = here.state.rows.with_degree(best)
-    elif phase == "prune":
-        search = replace(search, small_side=_train_pruned(here, iteration, after_fork))
-    here.state.search = search
+    held = split(training.scene.train)[1]
+    if prunes(search, iteration, len(held), training.config):
+        here.state.search = replace(search, small_side=_train_pruned(here, iteration, after_fork))
+        return here.state
+    degrees = _degrees(here, iteration)
+    best = max(degrees, key=lambda c: c.worth).sh_degree
+    if best < len(degrees) - 1:
+        here.state.rows = here.state.rows.with_degree(best)
+    here.state.search = replace(search, settled=iteration, degrees=degrees)
     return here.state
 
 
@@ -118,9 +121,8 @@ def _train_pruned(training: Training, iteration: int, after: After) -> SmallSide
     """Fork a training, prune the fork, and train it to the end of the trial. The rows of the training are on the
     host."""
     state, config = training.state, training.config
-    left = 2 ** -halvings(state.search.trials if state.search else [])
     gaussians, views = fetch(state.shown(training.renderer)), state.corrected(training.scene.train)
-    rows = costliest_rows(gaussians, left, views, training.renderer)
+    rows = costliest_rows(gaussians, HALVING, views, training.renderer)
     side = training.fork(state.fork(state.rows.take(rows)))
     validated = []
     end = next(bound for bound in window_bounds(config) if bound > iteration)
