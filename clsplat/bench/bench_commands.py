@@ -150,7 +150,7 @@ class Quality:
     """Datasets, as for `train`. Options for reading the photos follow a colon: lego:background=white,
     fern:downscale=2. So do options for a variant: thin=4 (every 4th training photo), arc=0.2 (the end of the path is
     held out), points=0.1 (a tenth of the sparse points)."""
-    methods: tuple[str, ...] = ("paper-7k", "fast")
+    methods: tuple[str, ...] = ("paper-7k", "auto")
     """Presets of `train`, or configuration files as for its --config."""
     budgets: tuple[str, ...] = ("own",)
     """Caps on the number of Gaussians: "own" for the method's cap, a factor of it such as x0.5, or a number such as
@@ -186,7 +186,7 @@ class Captures:
     data: tyro.conf.Positional[tuple[str, ...]]
     """Datasets, as for `train`; two or more for a choice by rotation. Options for reading the photos follow a colon:
     fern:downscale=4."""
-    methods: tuple[str, ...] = ("paper-7k", "fast")
+    methods: tuple[str, ...] = ("paper-7k", "auto")
     """Presets of `train`, or configuration files as for its --config."""
     iterations: tuple[int, ...] = ()
     """Numbers of iterations; default: that of each method."""

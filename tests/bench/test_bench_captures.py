@@ -259,7 +259,7 @@ class TestBench:
         sources = [
             c.source
             for c in make_cells(
-                [f"{data / 'one'}{o}" for o in ("", ":thin=2", ":test_every=3")], ["fast"], ["own"], []
+                [f"{data / 'one'}{o}" for o in ("", ":thin=2", ":test_every=3")], ["mcmc"], ["own"], []
             )
         ]
         reader = Reader()
@@ -273,7 +273,7 @@ class TestBench:
         points = np.random.default_rng(0).uniform(-0.6, 0.6, (400, 3))
         scene = replace(scene, points=points, colors=np.zeros((400, 3), np.uint8))
         monkeypatch.setattr("clsplat.bench.quality.load_scene", lambda *_: scene)
-        cells = make_cells([f"{data / 'one'}{o}" for o in ("", ":points=0.1", ":thin=3")], ["fast"], ["own"], [])
+        cells = make_cells([f"{data / 'one'}{o}" for o in ("", ":points=0.1", ":thin=3")], ["mcmc"], ["own"], [])
         whole, fewer, thin = (Reader().read(c.source) for c in cells)
         assert len(fewer[0].points) == 40
         assert all((a == b).all() for a, b in zip(whole[1], fewer[1], strict=True))

@@ -72,7 +72,7 @@ class TestCells:
             parse_source(text)
 
     def test_methods_are_presets_or_files(self, data):
-        assert parse_method("fast") == ("fast", load_preset("fast"))
+        assert parse_method("mcmc") == ("mcmc", load_preset("mcmc"))
         assert parse_method(str(data / "plain.json")) == ("plain", with_settings(TrainConfig(), SMALL, ""))
         with pytest.raises(InputError, match="expected one of"):
             parse_method("slow")
@@ -90,12 +90,12 @@ class TestCells:
             parse_budget(text, 5)
 
     def test_every_combination_once(self):
-        cells = make_cells(["a:downscale=2", "b"], ["paper-7k", "fast"], ["own", "x0.5", "1000"], [10, 20])
-        cap = load_preset("fast").max_gaussians
+        cells = make_cells(["a:downscale=2", "b"], ["paper-7k", "mcmc"], ["own", "x0.5", "1000"], [10, 20])
+        cap = load_preset("mcmc").max_gaussians
         assert cap is not None
         found = {(c.source.name, c.method, c.config.max_gaussians, c.config.iterations) for c in cells}
         # Half of no cap is no cap, so this training runs once.
-        caps = {"paper-7k": (None, 1000), "fast": (cap, cap // 2, 1000)}
+        caps = {"paper-7k": (None, 1000), "mcmc": (cap, cap // 2, 1000)}
         expected = {(s, m, n, i) for s in ("a:downscale=2", "b") for m in caps for n in caps[m] for i in (10, 20)}
         assert found == expected
         assert len(cells) == len(expected)
@@ -103,12 +103,12 @@ class TestCells:
         assert all(c.config.data.downscale == (2 if c.source.name != "b" else 1) for c in cells)
 
     def test_all_trainings_of_a_seed_come_first(self):
-        cells = make_cells(["a", "b"], ["fast", "paper-7k"], ["own"], [], seeds=[5, 3])
+        cells = make_cells(["a", "b"], ["mcmc", "paper-7k"], ["own"], [], seeds=[5, 3])
         assert [(c.config.seed, c.source.name, c.method) for c in cells] == [
-            (seed, scene, method) for seed in (5, 3) for scene in "ab" for method in ("fast", "paper-7k")
+            (seed, scene, method) for seed in (5, 3) for scene in "ab" for method in ("mcmc", "paper-7k")
         ]
         with pytest.raises(InputError, match="--seeds: expected 0 or more, found -1"):
-            make_cells(["a"], ["fast"], ["own"], [], seeds=[0, -1])
+            make_cells(["a"], ["mcmc"], ["own"], [], seeds=[0, -1])
 
     def test_a_methods_own_iterations(self):
         (cell,) = make_cells(["a"], ["paper-30k"], ["own"], [])
@@ -119,11 +119,11 @@ class TestCells:
             (tmp_path / folder).mkdir()
             (tmp_path / folder / "m.json").write_text("{}")
         with pytest.raises(InputError, match="data: expected different names, found scene 2 times"):
-            make_cells(["a/scene", "b/scene"], ["fast"], ["own"], [])
+            make_cells(["a/scene", "b/scene"], ["mcmc"], ["own"], [])
         with pytest.raises(InputError, match="--methods: expected different names, found m 2 times"):
             make_cells(["a"], [str(tmp_path / "a" / "m.json"), str(tmp_path / "b" / "m.json")], ["own"], [])
         with pytest.raises(InputError, match="--iterations: expected 1 or more, found 0"):
-            make_cells(["a"], ["fast"], ["own"], [0])
+            make_cells(["a"], ["mcmc"], ["own"], [0])
 
     def test_settings_are_those_that_differ_from_the_defaults(self):
         config = TrainConfig(seed=3, adc=AdcConfig(every=7), init=InitConfig(opacity=0.5))

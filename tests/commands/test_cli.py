@@ -186,9 +186,9 @@ def test_flags_count_more_than_a_preset(
     # 7000 is the default of TrainConfig: a flag counts even if it equals the default.
     seen: list[TrainConfig] = []
     monkeypatch.setattr("clsplat.commands.train.train_and_report", lambda scene, config, *_: seen.append(config))
-    run("train", dataset, "-o", tmp_path / "a", "--preset", "fast", "--iterations", 7000, "--few.below", 0)
-    assert seen == [replace(load_preset("fast"), iterations=7000, few=FewViewsConfig(below=0))]
-    assert load_preset("fast").iterations != 7000
+    run("train", dataset, "-o", tmp_path / "a", "--preset", "paper-30k", "--iterations", 7000, "--few.below", 0)
+    assert seen == [replace(load_preset("paper-30k"), iterations=7000, few=FewViewsConfig(below=0))]
+    assert load_preset("paper-30k").iterations != 7000
     assert "expected one of " in fails(capsys, "train", dataset, "-o", tmp_path / "b", "--preset", "nothing")
     both = ("--preset", "fast", "--config", "x.json")
     assert "expected one of them, found both" in fails(capsys, "train", dataset, "-o", tmp_path / "b", *both)

@@ -50,48 +50,48 @@ def search_size(training: Training, after: After, after_fork: After) -> None:
             continue
         training.run_until(iteration - 1, after)
         if iteration in times and (search.grows or search.small_side):
-            validated = [*search.validated, _validate(training)]
-            training.state = replace(training.state, search=replace(search, validated=validated))
-        if iteration in bounds and search.grows:
-            training.state = _grown(training, iteration)
-        if iteration in bounds and iteration >= first_pruning(training.config):
-            training.state = _pruned(training, iteration, after_fork)
+            search = replace(search, validated=[*search.validated, _validate(training)])
+        if iteration not in bounds:
+            training.state = replace(training.state, search=search)
+            continue
+        if search.grows:
+            training.state, search = _grown(training, search, iteration)
+        if iteration >= first_pruning(training.config):
+            training.state = _pruned(training, search, iteration, after_fork)
 
 
-def _grown(training: Training, iteration: int) -> State:
+def _grown(training: Training, search: Search, iteration: int) -> tuple[State, Search]:
     """End a window of growth: compare with the last candidate that paid, and return to it where growth ends."""
     training.state.move(None)
     state = replace(training.state)
-    search = _compared(training, iteration)
+    search = _compared(training, search, iteration)
     if growth_ends(search, len(state.gaussians), iteration, training.config):
         if search.small_side:
             state = _continued(state, search.small_side)
         search = replace(search, grows=False, small_side=None)
     search = replace(search, most=len(state.gaussians), validated=[])
     state.search = replace(search, most=most_grown(search, training.config))
-    return state
+    return state, state.search
 
 
-def _compared(training: Training, iteration: int) -> Search:
+def _compared(training: Training, search: Search, iteration: int) -> Search:
     """The search after a comparison of the present Gaussians with the last candidate that paid."""
-    search = training.state.search
-    assert search
     if not search.validated:  # the run is too short
         return search
     present, paid = _candidate(training, iteration, search.validated), search.small_side
-    trials = [*search.trials, Trial(True, paid.candidate, present)] if paid else search.trials
-    if paid is None or not trials[-1].takes_smaller:
-        rows = training.state.rows.take(np.arange(present.n))
-        return replace(search, trials=trials, small_side=SmallSide(rows, present))
-    return replace(search, trials=trials)
+    if paid and paid.candidate.n < present.n:
+        trial = Trial(True, paid.candidate, present)
+        search = replace(search, trials=[*search.trials, trial])
+        if trial.takes_smaller:
+            return search
+    return replace(search, small_side=SmallSide(training.state.rows.take(np.arange(present.n)), present))
 
 
-def _pruned(training: Training, iteration: int, after_fork: After) -> State:
+def _pruned(training: Training, search: Search, iteration: int, after_fork: After) -> State:
     """End a trial of pruning; begin another one, whose pruned side is trained first, or settle. Returns the new
     state."""
     training.state.move(None)  # one side of a trial at a time is on the device
-    state, search = replace(training.state), training.state.search
-    assert search
+    state = replace(training.state)
     if search.small_side:
         trial = Trial(False, search.small_side.candidate, _candidate(training, iteration, search.validated))
         if trial.takes_smaller:
@@ -134,7 +134,7 @@ def _train_pruned(training: Training, iteration: int, after: After) -> SmallSide
 
 def _degrees(training: Training, iteration: int) -> list[Candidate]:
     """Candidates for the degree of the spherical harmonics, of those that are trained."""
-    degrees = range(training.state.sh_degree(training.state.iteration, training.config) + 1)
+    degrees = range(_trained_degree(training) + 1)
     n, config = len(training.state.gaussians), training.config
     return [candidate(iteration, n, degree, [_validate(training, degree)], config) for degree in degrees]
 
@@ -143,12 +143,15 @@ def _validate(training: Training, sh_degree: int | None = None) -> list[float]:
     """Quality of each held-back photo, dB, with the trained degree of the spherical harmonics or another one."""
     state, renderer = training.state, training.renderer
     if sh_degree is None:
-        sh_degree = state.sh_degree(state.iteration, training.config)
+        sh_degree = _trained_degree(training)
     held = split(training.scene.train)[1]
     return validate(state.shown(renderer), held, renderer, sh_degree, fitted=state.exposures is not None)
 
 
+def _trained_degree(training: Training) -> int:
+    return training.state.sh_degree(max(1, training.state.iteration), training.config)
+
+
 def _candidate(training: Training, iteration: int, validated: list[list[float]]) -> Candidate:
-    state = training.state
-    degree = state.sh_degree(state.iteration, training.config)
-    return candidate(iteration, len(state.gaussians), degree, validated, training.config)
+    gaussians = training.state.gaussians
+    return candidate(iteration, len(gaussians), gaussians.sh_degree, validated, training.config)

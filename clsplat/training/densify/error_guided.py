@@ -58,6 +58,10 @@ class ErrorGuided(Strategy):
         self.config, self.schedule = config.error, Schedule(config, config.error)
         self.statistics = {"differences": np.zeros(n, np.float32)}
 
+    def penalties(self, n: int) -> tuple[float, float]:
+        """See `clsplat.training.densify.Strategy`."""
+        return self.config.opacity_penalty / n, 0.0
+
     def due(self, iteration: int) -> bool:
         """See `clsplat.training.densify.Strategy`."""
         return self.schedule.due(iteration)
