@@ -39,7 +39,7 @@ def measure(
     renderer : Renderer
     folder : Path
     rare : list of (H, W) bool, optional
-        Pixels of each view for `rare_psnr`, as from `clsplat.bench.coverage.rare_pixels`.
+        Pixels of each view for `rare_psnr`, as from `clsplat.dataset.coverage.rare_pixels`.
     """
     masks: Sequence[NDArray[np.bool_] | None] = rare or [None] * len(views)
 

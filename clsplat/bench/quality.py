@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from clsplat.bench.captures import captured
 from clsplat.bench.cells import Cell, Source, differences
-from clsplat.bench.coverage import rare_pixels
+from clsplat.dataset.coverage import rare_pixels
 from clsplat.bench.environment import describe
 from clsplat.bench.measures import Masks, frames_per_second, measure, rare_share, training_psnr
 from clsplat.bench.results import KEYS, Record, append_record, read_records, write_records

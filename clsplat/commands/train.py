@@ -220,14 +220,18 @@ def evaluate_held_out(
     gaussians: "Gaussians", scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path
 ) -> None:
     """Evaluate the held-out photos, twice where poses were refined: as posed, and with their cameras aligned."""
+    from clsplat.commands.generalisation import generalisation
     from clsplat.evaluate import evaluate
     from clsplat.training.photo_poses import aligned
 
-    say_scores(evaluate(gaussians, scene.test, out / "eval", renderer), out / "eval")
+    report = evaluate(gaussians, scene.test, out / "eval", renderer)
+    say_scores(report, out / "eval")
     if config.poses:
         say("aligning the held-out photos' cameras with the scene")
         posed = [aligned(gaussians, view, scene.extent, config.optim, renderer) for view in scene.test]
-        say_scores(evaluate(gaussians, posed, out / "eval_aligned", renderer), out / "eval_aligned")
+        report = evaluate(gaussians, posed, out / "eval_aligned", renderer)
+        say_scores(report, out / "eval_aligned")
+    say(f"generalisation: {generalisation(gaussians, scene, report, renderer)}")
 
 
 @dataclass(frozen=True)

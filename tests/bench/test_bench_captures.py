@@ -10,7 +10,7 @@ from test_cli import fails, run, write_dataset
 from clsplat.bench import measures
 from clsplat.bench.captures import STANDARD, Capture, arc, captured, thinned, with_fewer_points
 from clsplat.bench.cells import make_cells
-from clsplat.bench.coverage import rare_pixels
+from clsplat.dataset.coverage import rare_pixels
 from clsplat.bench.measures import measure, rare_share, training_psnr
 from clsplat.bench.quality import Reader, run_cells
 from clsplat.bench.results import read_records

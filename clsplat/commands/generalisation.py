@@ -1,0 +1,85 @@
+"""The sentences with which `clsplat train` ends: what was held out, how well the scene holds there, what would help."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.dataset.coverage import VIEWS_MIN, rare_pixels
+from clsplat.evaluate import mean_metrics
+from clsplat.metrics import psnr
+
+if TYPE_CHECKING:
+    from clsplat.gaussians import Gaussians
+    from clsplat.renderer import Renderer
+    from clsplat.scene import Scene
+
+COMPARED = 24
+"""Most training photos that are compared with the held-out ones."""
+
+RARE = 0.05
+"""Fraction of a photo's pixels that few training photos must show to be named as the reason of its errors."""
+
+EXPOSURE_GAIN = 1.0
+"""Gain of PSNR, dB, by a fit of the held-out photos' colours from which their exposures are said to differ."""
+
+
+def generalisation(gaussians: "Gaussians", scene: "Scene", report: dict[str, Any], renderer: "Renderer") -> str:
+    """Say how well a scene holds in its held-out photos.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    scene : Scene
+        With training and held-out photos.
+    report : dict
+        The result of `clsplat.evaluate.evaluate` on the held-out photos.
+    renderer : Renderer
+
+    Returns
+    -------
+    str
+        One paragraph.
+    """
+    trained = scene.train[:: -(-len(scene.train) // COMPARED)]
+    trained_psnr = mean_metrics(gaussians, trained, renderer, (psnr,))["psnr"]
+    held, fitted = report["mean"]["psnr"], report["mean"]["psnr_fitted"]
+    if held is None or trained_psnr is None or not np.isfinite(trained_psnr):
+        return f"{len(scene.test)} held-out photos, without errors in at least one"
+    text = (
+        f"{len(scene.test)} held-out photos have {held:.1f} dB, training photos {trained_psnr:.1f} dB: the smaller the "
+        f"difference of {trained_psnr - held:.1f} dB, the better the scene holds from new viewpoints. "
+    )
+    worst = min(report["views"], key=lambda view: np.inf if view["psnr"] is None else view["psnr"])
+    text += f"The weakest is {worst['name']}, {worst['psnr']:.1f} dB: {_reason(scene, worst['name'])}"
+    if fitted is not None and fitted - held > EXPOSURE_GAIN:
+        text += f". After a fit of colours it would be {fitted:.1f} dB: where exposures differ, try --exposure"
+    return text
+
+
+def _reason(scene: "Scene", name: str) -> str:
+    """What the photo shows that training photos do not."""
+    view = next(view for view in scene.test if view.name == name)
+    masks = rare_pixels(replace(scene, test=[view]), scene.points) if len(scene.points) else None
+    if masks is None:
+        return "more photos from there would help most"
+    share, side = float(masks[0].mean()), _side(masks[0])
+    if share < RARE:
+        return f"each part of it is in the frame of {VIEWS_MIN} or more training photos; photos between them would help"
+    return (
+        f"{share:.0%} of it, mostly {side}, is in the frame of fewer than {VIEWS_MIN} training photos; more photos of "
+        "this part would help most"
+    )
+
+
+def _side(mask: NDArray[np.bool_]) -> str:
+    """The half of a photo in which a mask is true most often."""
+    height, width = mask.shape
+    halves = {
+        "on the left": mask[:, : width // 2],
+        "on the right": mask[:, width // 2 :],
+        "at the top": mask[: height // 2],
+        "at the bottom": mask[height // 2 :],
+    }
+    return max(halves, key=lambda name: halves[name].mean())

@@ -1,0 +1,61 @@
+"""The closing sentences of a training name the weakest photo, its reason and the remedy."""
+
+import numpy as np
+import pytest
+
+from clsplat.camera import Camera
+from clsplat.commands.generalisation import generalisation
+from clsplat.metrics import psnr
+from clsplat.render import render
+from clsplat.renderer import Renderer
+from clsplat.scene import Scene, View
+from clsplat.testing import synthetic_scene
+
+
+@pytest.fixture(scope="module")
+def scene(device):
+    """Photos of a wall of points at depth 5; the held-out camera looks to the right of the training cameras."""
+    gaussians = synthetic_scene(50, 4)[0].astype(np.float32)
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-6, 6, (2000, 2)), np.full((2000, 1), 5.0)], axis=1)
+
+    def view(name, x):
+        pose = np.eye(4)
+        pose[0, 3] = -x
+        camera = Camera(pose, 40, 40, 32, 24, 64, 48)
+        return View(name, camera, (255 * np.clip(render(gaussians, camera, device=device).rgb, 0, 1)).astype(np.uint8))
+
+    train = [view(f"{i}", 0.1 * i) for i in range(4)]
+    return gaussians, Scene(train, [view("seen", 0.1), view("beyond", 3.0)], points, np.zeros((2000, 3), np.uint8))
+
+
+def report(seen, beyond, fitted=20.0):
+    views = [{"name": "seen", "psnr": seen}, {"name": "beyond", "psnr": beyond}]
+    return {"mean": {"psnr": (seen + beyond) / 2, "psnr_fitted": fitted}, "views": views}
+
+
+def test_the_reason_is_the_part_that_few_photos_show(scene, device):
+    gaussians, photos = scene
+    renderer = Renderer(device)
+    text = generalisation(gaussians, photos, report(25.0, 15.0), renderer)
+    assert text.startswith("2 held-out photos have 20.0 dB, training photos ")
+    assert "weakest is beyond, 15.0 dB" in text and "mostly on the right, is in the frame of fewer than 3" in text
+    assert "exposure" not in text
+    text = generalisation(gaussians, photos, report(15.0, 25.0), renderer)
+    assert "weakest is seen, 15.0 dB: each part of it is in the frame of 3 or more" in text
+
+
+def test_exposures_are_named_where_a_fit_of_colours_gains(scene, device):
+    text = generalisation(*scene, report(25.0, 15.0, fitted=21.5), Renderer(device))
+    assert "After a fit of colours it would be 21.5 dB" in text and "--exposure" in text
+
+
+def test_without_points_or_errors(scene, device):
+    gaussians, photos = scene
+    bare = Scene(photos.train, photos.test, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    assert "more photos from there would help most" in generalisation(
+        gaussians, bare, report(25.0, 15.0), Renderer(device)
+    )
+    perfect = {"mean": {"psnr": None, "psnr_fitted": None}, "views": []}
+    assert "without errors" in generalisation(gaussians, photos, perfect, Renderer(device))
+    assert psnr(photos.test[0].image, photos.train[1].image) > 40
