@@ -36,8 +36,9 @@ class RenderConfig:
     was measured. pixel sorts in each pixel by the points where its ray meets the Gaussians: nothing pops when the
     camera turns, but it is slower (StopThePop)."""
     near: float | None = None
-    """Depth up to which nothing is drawn, world units. Default: a tenth of the depth of the nearest points for a
-    dataset's cameras, 0.01 for others. Without it, Gaussians very close to a camera spread over its whole image."""
+    """Depth up to which nothing is drawn, world units. Default: three tenths of the depth of the nearest points in each
+    photo for a dataset's cameras, 0.01 for others. Without it, Gaussians very close to a camera spread over its
+    whole image."""
 
 
 @dataclass(frozen=True)

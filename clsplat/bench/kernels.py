@@ -13,7 +13,7 @@ from clsplat.bench.environment import describe
 from clsplat.bench.roof import measure_roof
 from clsplat.bench.timing import STILL, Clock, clock, quartiles, run_step, training_of
 from clsplat.bench.workloads import Workload
-from clsplat.config import RenderConfig, TrainConfig
+from clsplat.config import SHORT_RUN, RenderConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.renderer import Renderer
 from clsplat.stages import FUNCTIONS
@@ -115,7 +115,7 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
         cpu_ms, the CPU time divided by the number of cores.
     """
     gaussians, view = workload.gaussians, workload.view
-    config = TrainConfig(strategy="adc", size="fixed", render=render, optim=STILL)
+    config = TrainConfig(strategy="adc", size="fixed", iterations=SHORT_RUN, render=render, optim=STILL)
     renderer = Renderer(device, render)
     run = renderer.forward(gaussians, view.camera)
     pairs = renderer.stages.count_pairs(run.splats, run.bins)

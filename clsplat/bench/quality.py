@@ -14,12 +14,12 @@ from tqdm import tqdm
 
 from clsplat.bench.captures import captured
 from clsplat.bench.cells import Cell, Source, differences
-from clsplat.dataset.coverage import rare_pixels
 from clsplat.bench.environment import describe
 from clsplat.bench.measures import Masks, frames_per_second, measure, rare_share, training_psnr
 from clsplat.bench.results import KEYS, Record, append_record, read_records, write_records
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.dataset import load_scene
+from clsplat.dataset.coverage import rare_pixels
 from clsplat.device import Device
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import Gaussians

@@ -66,7 +66,9 @@ def _reason(scene: "Scene", name: str) -> str:
         return "more photos from there would help most"
     share, side = float(masks[0].mean()), _side(masks[0])
     if share < RARE:
-        return f"each part of it is in the frame of {VIEWS_MIN} or more training photos; photos between them would help"
+        return (
+            f"each part of it is in the frame of {VIEWS_MIN} or more training photos; photos between them would help"
+        )
     return (
         f"{share:.0%} of it, mostly {side}, is in the frame of fewer than {VIEWS_MIN} training photos; more photos of "
         "this part would help most"

@@ -5,7 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from clsplat.camera import Camera
 from clsplat.config import DataConfig, SfmConfig
 from clsplat.constants import NEAR
 from clsplat.dataset import colmap, transforms
@@ -22,9 +24,8 @@ OFFSET_EXTENTS = 1000
 moved to the cameras. At this distance float32 resolves 6e-5 extents; a coarser resolution would lose the small steps
 of training."""
 
-NEAR_SHARE = 0.1
-"""Depth of the near plane as a fraction of the depth of the nearest points. In the scenes of the original paper this
-is close to the 0.2 world units of its code. Effect: docs/stability.md."""
+NEAR_SHARE = 0.3
+"""Depth of a photo's near plane as a fraction of the depth of its nearest points. Effect: docs/stability.md."""
 
 NEAR_QUANTILE = 0.01
 """Quantile of the depths of the points in a photo that counts as the depth of the nearest points. The nearest point
@@ -55,7 +56,7 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
     -------
     Scene
         Undistorted photos, sorted by name. Every `config.test_every`-th photo is held out, unless the dataset defines
-        a split. Their cameras draw nothing before the depth `near_plane`.
+        a split. Their cameras draw nothing before the depth of their `near_plane`.
 
     Raises
     ------
@@ -194,34 +195,41 @@ def _near_origin(scene: Scene) -> Scene:
     return Scene(moved(scene.train), moved(scene.test), scene.points - centre, scene.colors, centre)
 
 
-def near_plane(scene: Scene) -> float:
-    """Compute a depth of the near plane at which the scene's points show that nothing is closer.
+def near_plane(camera: Camera, points: NDArray[np.float64]) -> float | None:
+    """Compute a depth of the near plane at which the points in a photo show that nothing is closer.
 
-    A Gaussian very close to a camera, for example of a wall next to the photographer, covers the camera's whole
-    image. A neighbouring photo may need this Gaussian. A held-out photo from such a camera would be covered by it.
+    Faint Gaussians close to a camera cover its whole image. Other photos may show them as parts of a wall next to the
+    photographer, or not at all: a camera that stands where no photo was taken is then in a haze.
+
+    Parameters
+    ----------
+    camera : Camera
+    points : (P, 3)
+        Sparse points of the scene, world units.
 
     Returns
     -------
-    float
-        Depth in world units: `NEAR_SHARE` times the depth of the nearest points in any training photo; `NEAR` if no
-        photo shows enough points.
+    float or None
+        Depth in world units: `NEAR_SHARE` times the depth of the nearest points in the photo. None if the photo shows
+        too few points.
     """
-    points = scene.points[:: max(1, len(scene.points) // NEAR_POINTS)]
-    nearest = np.inf
-    for camera in (view.camera for view in scene.train):
-        points_camera = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        x, y, depths = points_camera[points_camera[:, 2] > 0].T
-        u, v = camera.fx * x / depths + camera.cx, camera.fy * y / depths + camera.cy
-        seen = depths[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)]
-        if len(seen) * NEAR_QUANTILE >= 1:  # otherwise the quantile is the nearest point
-            nearest = min(nearest, float(np.quantile(seen, NEAR_QUANTILE)))
-    return NEAR_SHARE * nearest if np.isfinite(nearest) else NEAR
+    points_camera = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    x, y, depths = points_camera[points_camera[:, 2] > 0].T
+    u, v = camera.fx * x / depths + camera.cx, camera.fy * y / depths + camera.cy
+    seen = depths[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)]
+    if len(seen) * NEAR_QUANTILE < 1:  # the quantile would be the nearest point
+        return None
+    return NEAR_SHARE * float(np.quantile(seen, NEAR_QUANTILE))
 
 
 def _with_near_planes(scene: Scene) -> Scene:
-    near = near_plane(scene)
+    """The scene whose photos have near planes: photos with too few points have the nearest one of the others."""
+    points = scene.points[:: max(1, len(scene.points) // NEAR_POINTS)]
+    found = {view.name: near_plane(view.camera, points) for view in (*scene.train, *scene.test)}
+    fallback = min((near for near in found.values() if near is not None), default=NEAR)
 
     def with_near(part: list[View]) -> list[View]:
-        return [replace(view, camera=replace(view.camera, near=near)) for view in part]
+        nears = [found[view.name] or fallback for view in part]
+        return [replace(v, camera=replace(v.camera, near=n)) for v, n in zip(part, nears, strict=True)]
 
     return replace(scene, train=with_near(scene.train), test=with_near(scene.test))

@@ -48,7 +48,10 @@ def save_state(path: Path, state: State, config: TrainConfig) -> None:
         if learned:
             arrays |= {f"{part}.{name}": array for name, array in learned.arrays().items()}
     if search := state.search:
-        about = {name: getattr(search, name) for name in ("most", "pace", "grows", "trials", "degrees", "settled", "validated")}
+        about = {
+            name: getattr(search, name)
+            for name in ("most", "pace", "grows", "trials", "degrees", "settled", "validated")
+        }
         if search.small_side:
             about["small_side"] = search.small_side.candidate
             arrays |= _rows_arrays(search.small_side.rows, "small_side.")
@@ -116,7 +119,14 @@ def _to_state(arrays: Arrays, extent: float, config: TrainConfig) -> State:
         if "small_side" in saved:
             small_side = SmallSide(_to_rows(arrays, "small_side.", extent, config), Candidate(*saved["small_side"]))
         search = Search(
-            saved["most"], saved["pace"], saved["grows"], trials, degrees, saved["settled"], saved["validated"], small_side
+            saved["most"],
+            saved["pace"],
+            saved["grows"],
+            trials,
+            degrees,
+            saved["settled"],
+            saved["validated"],
+            small_side,
         )
     return State(
         iteration=int(arrays["iteration"]),

@@ -10,13 +10,13 @@ from test_cli import fails, run, write_dataset
 from clsplat.bench import measures
 from clsplat.bench.captures import STANDARD, Capture, arc, captured, thinned, with_fewer_points
 from clsplat.bench.cells import make_cells
-from clsplat.dataset.coverage import rare_pixels
 from clsplat.bench.measures import measure, rare_share, training_psnr
 from clsplat.bench.quality import Reader, run_cells
 from clsplat.bench.results import read_records
 from clsplat.camera import Camera
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene
+from clsplat.dataset.coverage import rare_pixels
 from clsplat.errors import InputError
 from clsplat.metrics import psnr, to_uint8
 from clsplat.render import render

@@ -23,7 +23,9 @@ def scene(device):
         pose = np.eye(4)
         pose[0, 3] = -x
         camera = Camera(pose, 40, 40, 32, 24, 64, 48)
-        return View(name, camera, (255 * np.clip(render(gaussians, camera, device=device).rgb, 0, 1)).astype(np.uint8))
+        return View(
+            name, camera, (255 * np.clip(render(gaussians, camera, device=device).rgb, 0, 1)).astype(np.uint8)
+        )
 
     train = [view(f"{i}", 0.1 * i) for i in range(4)]
     return gaussians, Scene(train, [view("seen", 0.1), view("beyond", 3.0)], points, np.zeros((2000, 3), np.uint8))

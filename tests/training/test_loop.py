@@ -22,6 +22,7 @@ from clsplat.render import render
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
+from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import load_state, save_state
 from clsplat.training.contributions import contributions
 from clsplat.training.densify import STRATEGIES, Contributions, Edit, Survey
@@ -280,16 +281,20 @@ def test_training_goes_from_small_photos_to_whole_ones(
 def test_small_photos_train_while_the_size_is_sought(
     scene: Scene, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without what validates in them, at every size."""
+    """Without those that are held back, at every size."""
+    held = {view.name for view in split(scene.train)[1]}
     seen: list[tuple[int, bool]] = []
 
     def recorded(training: Training, view: View) -> float:
-        seen.append((view.camera.width, view.mask is not None))
+        search = training.state.search
+        assert search
+        seen.append((view.camera.width, view.name in held))
+        assert view.name not in held or not search.holds_back(training.state.iteration + 1)
         return step(training, view)
 
     monkeypatch.setattr(sys.modules["clsplat.training.session"], "step", recorded)
     train(scene, replace(CONFIG, size="auto", coarse=CoarseConfig(factor=2)), tmp_path, device)
-    assert set(seen) == {(20, True), (40, True), (40, False)}
+    assert set(seen) == {(20, False), (40, True), (40, False)}
 
 
 def test_each_round_surveys_photos_of_its_own(

@@ -97,9 +97,9 @@ def test_the_search_for_the_size_sees_what_is_shown(needles, device, tmp_path):
     validated = []
     validate = search.validate
 
-    def spy(gaussians, *rest):
+    def spy(gaussians, *rest, **options):
         validated.append(thinnest(fetch(gaussians), cameras))
-        return validate(gaussians, *rest)
+        return validate(gaussians, *rest, **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "validate", spy)

@@ -1,6 +1,5 @@
 """Validation of a scene on photos that are held back from training."""
 
-from dataclasses import replace
 from math import log10
 
 import numpy as np
