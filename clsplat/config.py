@@ -36,8 +36,8 @@ class RenderConfig:
     was measured. pixel sorts in each pixel by the points where its ray meets the Gaussians: nothing pops when the
     camera turns, but it is slower (StopThePop)."""
     near: float | None = None
-    """Depth up to which nothing is drawn, world units. Default: three tenths of the depth of the nearest points in each
-    photo for a dataset's cameras, 0.01 for others. Without it, Gaussians very close to a camera spread over its
+    """Depth up to which nothing is drawn, world units. Default: three tenths of the depth of the nearest points in
+    each photo for a dataset's cameras, 0.01 for others. Without it, Gaussians very close to a camera spread over its
     whole image."""
 
 
@@ -230,8 +230,8 @@ class ErrorConfig:
     replaced_most: float = 0.05
     """Largest fraction that is replaced, if the removal of that many lowers the error."""
     opacity_penalty: float = 0.01
-    """Weight of the mean opacity in the loss. Faint Gaussians that no photo needs vanish; otherwise they cover cameras
-    that stand where no photo was taken."""
+    """Weight of the mean opacity in the loss. Faint Gaussians that no photo needs vanish; otherwise they cover
+    cameras that stand where no photo was taken."""
 
 
 @dataclass(frozen=True)

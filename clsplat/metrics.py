@@ -72,9 +72,9 @@ def psnr_fitted(image: Array, truth: Array, mask: NDArray[np.bool_] | None = Non
 
 
 def colors_fitted(image: Array, truth: Array, mask: NDArray[np.bool_]) -> Array:
-    """Map the colours of an image (H, W, 3) by the affine map that brings its pixels in the mask closest to the truth.
+    """Map the colours of an image (H, W, 3) by the affine map that brings its pixels closest to the truth.
 
-    Both are floats; the result is neither rounded nor clamped.
+    The mask names the pixels that count. Images are floats; the result is neither rounded nor clamped.
     """
     inputs, outputs = np.c_[image[mask], np.ones(mask.sum())], truth[mask]
     # Normal equations: 4 unknowns per channel, many pixels. The pseudo-inverse also handles flat images.

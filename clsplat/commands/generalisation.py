@@ -1,4 +1,4 @@
-"""The sentences with which `clsplat train` ends: what was held out, how well the scene holds there, what would help."""
+"""The sentences with which `clsplat train` ends: how well the scene holds in held-out photos, and what would help."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -48,8 +48,8 @@ def generalisation(gaussians: "Gaussians", scene: "Scene", report: dict[str, Any
     if held is None or trained_psnr is None or not np.isfinite(trained_psnr):
         return f"{len(scene.test)} held-out photos, without errors in at least one"
     text = (
-        f"{len(scene.test)} held-out photos have {held:.1f} dB, training photos {trained_psnr:.1f} dB: the smaller the "
-        f"difference of {trained_psnr - held:.1f} dB, the better the scene holds from new viewpoints. "
+        f"{len(scene.test)} held-out photos have {held:.1f} dB, training photos {trained_psnr:.1f} dB: the smaller "
+        f"the difference of {trained_psnr - held:.1f} dB, the better the scene holds from new viewpoints. "
     )
     worst = min(report["views"], key=lambda view: np.inf if view["psnr"] is None else view["psnr"])
     text += f"The weakest is {worst['name']}, {worst['psnr']:.1f} dB: {_reason(scene, worst['name'])}"
@@ -66,12 +66,10 @@ def _reason(scene: "Scene", name: str) -> str:
         return "more photos from there would help most"
     share, side = float(masks[0].mean()), _side(masks[0])
     if share < RARE:
-        return (
-            f"each part of it is in the frame of {VIEWS_MIN} or more training photos; photos between them would help"
-        )
+        return f"{VIEWS_MIN} or more training photos have each part of it in their frame; photos between would help"
     return (
-        f"{share:.0%} of it, mostly {side}, is in the frame of fewer than {VIEWS_MIN} training photos; more photos of "
-        "this part would help most"
+        f"{share:.0%} of it, mostly {side}, is in the frame of fewer than {VIEWS_MIN} training photos; more photos "
+        "of this part would help most"
     )
 
 

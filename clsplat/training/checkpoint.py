@@ -33,6 +33,9 @@ FREE = ("device", "checkpoint_every", "eval_every", "memory_limit")
 """Settings that may differ when a run resumes: they do not change the result, unless a limit of memory is reached,
 and then the user lowers it."""
 
+SEARCH = ("most", "pace", "grows", "trials", "degrees", "settled", "validated")
+"""Fields of a search that are saved as JSON."""
+
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -48,10 +51,7 @@ def save_state(path: Path, state: State, config: TrainConfig) -> None:
         if learned:
             arrays |= {f"{part}.{name}": array for name, array in learned.arrays().items()}
     if search := state.search:
-        about = {
-            name: getattr(search, name)
-            for name in ("most", "pace", "grows", "trials", "degrees", "settled", "validated")
-        }
+        about = {name: getattr(search, name) for name in SEARCH}
         if search.small_side:
             about["small_side"] = search.small_side.candidate
             arrays |= _rows_arrays(search.small_side.rows, "small_side.")
@@ -118,16 +118,8 @@ def _to_state(arrays: Arrays, extent: float, config: TrainConfig) -> State:
         degrees, small_side = [Candidate(*c) for c in saved["degrees"]], None
         if "small_side" in saved:
             small_side = SmallSide(_to_rows(arrays, "small_side.", extent, config), Candidate(*saved["small_side"]))
-        search = Search(
-            saved["most"],
-            saved["pace"],
-            saved["grows"],
-            trials,
-            degrees,
-            saved["settled"],
-            saved["validated"],
-            small_side,
-        )
+        known = {name: saved[name] for name in SEARCH} | {"trials": trials, "degrees": degrees}
+        search = Search(**known, small_side=small_side)
     return State(
         iteration=int(arrays["iteration"]),
         seconds=float(arrays["seconds"]),

@@ -87,10 +87,8 @@ class Training:
 
     def _choose_views(self, iteration: int) -> None:
         """Take the photos of an iteration: at their size then, without those that are held back."""
-        wanted = (
-            factor_at(iteration, self.config),
-            bool(self.state.search and self.state.search.holds_back(iteration)),
-        )
+        search = self.state.search
+        wanted = factor_at(iteration, self.config), bool(search and search.holds_back(iteration))
         if self._views_of != wanted:
             factor, holds_back = self._views_of = wanted
             views = split(self.scene.train)[0] if holds_back else self.scene.train

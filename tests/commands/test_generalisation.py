@@ -44,7 +44,7 @@ def test_the_reason_is_the_part_that_few_photos_show(scene, device):
     assert "weakest is beyond, 15.0 dB" in text and "mostly on the right, is in the frame of fewer than 3" in text
     assert "exposure" not in text
     text = generalisation(gaussians, photos, report(15.0, 25.0), renderer)
-    assert "weakest is seen, 15.0 dB: each part of it is in the frame of 3 or more" in text
+    assert "weakest is seen, 15.0 dB: 3 or more training photos have each part of it" in text
 
 
 def test_exposures_are_named_where_a_fit_of_colours_gains(scene, device):

@@ -54,8 +54,8 @@ def test_every_nth_photo_by_name_is_held_out(tmp_path, every, test):
 
 
 def test_nothing_is_drawn_long_before_the_nearest_points(tmp_path):
-    """By hand: 100 points at 3 to 3.99 in front of the first photos and one outlier at 0.5; other photos see none, and
-    have the near plane of the first ones. Held-out photos have near planes, too."""
+    """By hand: 100 points at 3 to 3.99 in front of the first photos and one outlier at 0.5; other photos see none,
+    and have the near plane of the first ones. Held-out photos have near planes, too."""
     write_colmap(tmp_path)
     rows = [f"{k} 0.3 0 {3 + k / 100} 0 0 0 0\n" for k in range(100)]
     (tmp_path / "sparse" / "0" / "points3D.txt").write_text("".join([*rows, "100 0.3 0 0.5 0 0 0 0\n"]))

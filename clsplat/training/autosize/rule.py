@@ -2,9 +2,9 @@
 
 Some training photos are held back. A candidate is a number of Gaussians with its quality on these photos and a price
 per doubling of the number. The scene grows until growth stops paying on the held-back photos, and returns to the last
-candidate that did. Then trials of pruning compare it with a copy without the Gaussians of the lowest price of removal,
-trained for the same iterations. The degree of the spherical harmonics is chosen by the same price per doubling of the
-bytes. After that all photos train.
+candidate that did. Then trials of pruning compare it with a copy without the Gaussians of the lowest price of
+removal, trained for the same iterations. The degree of the spherical harmonics is chosen by the same price per
+doubling of the bytes. After that all photos train.
 """
 
 from dataclasses import dataclass, field
@@ -31,8 +31,8 @@ GROWTH_START = 500
 
 SURE = 1.0
 """Standard errors by which the gain of the larger of two candidates must exceed its price (the one-standard-error
-rule of Breiman et al. 1984, "Classification and Regression Trees", section 3.4.3), and by which that of a scene before
-pruning must stay below it."""
+rule of Breiman et al. 1984, "Classification and Regression Trees", section 3.4.3), and by which the loss by
+pruning must be below its price."""
 
 PATIENCE = 2.0
 """Factor by which the number of Gaussians grows without paying before growth ends."""
@@ -42,12 +42,12 @@ GROWTH_WINDOW = 0.1
 half the scene is validated: Gaussians that have just been split are worse before they are better."""
 
 PACE = 4.0
-"""Multiple of the first Gaussians that growth reaches by its end, unless a photo has more pixels than that: then it is
-one Gaussian per pixel. Faster growth ends worse (measured: docs/size.md)."""
+"""Multiple of the first Gaussians that growth reaches by its end, unless a photo has more pixels than that: then it
+is one Gaussian per pixel. Faster growth ends worse (measured: docs/size.md)."""
 
 VALIDATIONS = 3
-"""Validations in the second half of a window, which are averaged: quality fluctuates while the learning rates are high
-(measured: docs/size.md)."""
+"""Validations in the second half of a window, which are averaged: quality fluctuates while the learning rates are
+high."""
 
 FEWEST_PRUNING = 4
 """Fewest held-back photos that decide on pruning. By two of castle_p30's photos a scene was halved that then lost 1.7
@@ -126,10 +126,10 @@ class SmallSide(NamedTuple):
 class Search:
     """The state of the search.
 
-    most: largest number of Gaussians after an edit; pace: factor of its growth from window to window; grows: whether growth has not ended; trials: comparisons so far;
-    degrees: candidates for the degree of the spherical harmonics; settled: the iteration before which the search
-    ended, 0 until then; validated: quality of the photos at each validation in the current window; small_side: what
-    the end of the window is compared with.
+    most: largest number of Gaussians after an edit; pace: factor of its growth from window to window; grows: whether
+    growth has not ended; trials: comparisons so far; degrees: candidates for the degree of the spherical harmonics;
+    settled: the iteration before which the search ended, 0 until then; validated: quality of the photos at each
+    validation in the current window; small_side: what the end of the window is compared with.
     """
 
     most: int

@@ -12,8 +12,8 @@ from clsplat.renderer import Renderer
 from clsplat.scene import View
 
 HELD_SHARE = 1 / 6
-"""Fraction of the training photos that is held back. With a smaller fraction decisions are less certain, with a larger
-one the others show less of the scene."""
+"""Fraction of the training photos that is held back. With a smaller fraction decisions are less certain, with a
+larger one the others show less of the scene."""
 
 MOST_HELD = 16
 """Most photos that are held back. More make a decision little more certain, and each validation longer."""
