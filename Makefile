@@ -43,7 +43,7 @@ bench:
 # Measure the charts of docs/benchmarks.md: make bench-quality DATA=folder of real scenes. This takes an hour and a half
 # on two cores. Finished trainings are not repeated (make bench-quality METHODS=paper-30k adds four hours).
 QUALITY_SCENES = fox_pinhole:downscale=4 lego:background=white:downscale=2 fern:downscale=4 castle_p30:downscale=4
-METHODS = fast paper-7k auto mcmc
+METHODS = paper-7k auto mcmc
 bench-quality:
 	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-quality DATA=..."; exit 2; }
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods $(METHODS) \
