@@ -6,17 +6,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.bench.measures import training_psnr
 from clsplat.dataset.coverage import VIEWS_MIN, rare_pixels
-from clsplat.evaluate import mean_metrics
-from clsplat.metrics import psnr
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.renderer import Renderer
     from clsplat.scene import Scene
-
-COMPARED = 24
-"""Most training photos that are compared with the held-out ones."""
 
 RARE = 0.05
 """Fraction of a photo's pixels that few training photos must show to be named as the reason of its errors."""
@@ -42,14 +38,13 @@ def generalisation(gaussians: "Gaussians", scene: "Scene", report: dict[str, Any
     str
         One paragraph.
     """
-    trained = scene.train[:: -(-len(scene.train) // COMPARED)]
-    trained_psnr = mean_metrics(gaussians, trained, renderer, (psnr,))["psnr"]
+    trained = training_psnr(gaussians, scene.train, renderer)["train_psnr"]
     held, fitted = report["mean"]["psnr"], report["mean"]["psnr_fitted"]
-    if held is None or trained_psnr is None or not np.isfinite(trained_psnr):
+    if held is None or trained is None:
         return f"{len(scene.test)} held-out photos, without errors in at least one"
     text = (
-        f"{len(scene.test)} held-out photos have {held:.1f} dB, training photos {trained_psnr:.1f} dB: the smaller "
-        f"the difference of {trained_psnr - held:.1f} dB, the better the scene holds from new viewpoints. "
+        f"{len(scene.test)} held-out photos have {held:.1f} dB, training photos {trained:.1f} dB: the smaller "
+        f"the difference of {trained - held:.1f} dB, the better the scene holds from new viewpoints. "
     )
     worst = min(report["views"], key=lambda view: np.inf if view["psnr"] is None else view["psnr"])
     text += f"The weakest is {worst['name']}, {worst['psnr']:.1f} dB: {_reason(scene, worst['name'])}"
@@ -59,7 +54,7 @@ def generalisation(gaussians: "Gaussians", scene: "Scene", report: dict[str, Any
 
 
 def _reason(scene: "Scene", name: str) -> str:
-    """What the photo shows that training photos do not."""
+    """Likely reason for a photo's errors, and the remedy."""
     view = next(view for view in scene.test if view.name == name)
     masks = rare_pixels(replace(scene, test=[view]), scene.points) if len(scene.points) else None
     if masks is None:

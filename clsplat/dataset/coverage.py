@@ -18,7 +18,6 @@ QUANTILE = 0.25
 """Quantile of the neighbours' depths that counts as the depth of the block. It is low because points behind a surface
 are projected between those on it, but not the lowest because of outliers."""
 
-
 VIEWS_MIN = 3
 """Number of training photos below which a pixel is rare. A point that only two photos show can lie at a wrong depth
 without an error in either of them, if its colour changes with the direction; a third photo contradicts it."""
@@ -54,7 +53,7 @@ def rare_pixels(scene: Scene, points: NDArray[np.float64]) -> list[NDArray[np.bo
         left = np.flatnonzero(np.isfinite(shown).all(axis=1))
         count = np.zeros(len(shown), dtype=int)
         for other in scene.train:
-            count[left] += _projected(other.camera, shown[left])[2]
+            count[left] += projected(other.camera, shown[left])[2]
             left = left[count[left] < VIEWS_MIN]
         blocks = np.zeros(u.shape, dtype=bool)
         blocks.flat[left] = True
@@ -73,7 +72,7 @@ def _unprojected(
     """Points in the world that pixels (N, 2) show; None if too few sparse points are in the image."""
     from scipy.spatial import cKDTree
 
-    places, depths, inside = _projected(camera, points)
+    places, depths, inside = projected(camera, points)
     if inside.sum() < NEIGHBOURS:
         return None
     _, nearest = cKDTree(places[inside]).query(pixels, NEIGHBOURS)
@@ -84,7 +83,7 @@ def _unprojected(
     return (along * depth[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
 
 
-def _projected(
+def projected(
     camera: Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Places in the image (N, 2), depths (N,), and whether the points (N, 3) of the world are in the image."""

@@ -11,6 +11,7 @@ from clsplat.camera import Camera
 from clsplat.config import DataConfig, SfmConfig
 from clsplat.constants import NEAR
 from clsplat.dataset import colmap, transforms
+from clsplat.dataset.coverage import projected
 from clsplat.dataset.decoding import Dataset, by_faces, load_view, load_views
 from clsplat.dataset.finding import PhotosMissing
 from clsplat.dataset.photos import list_photos
@@ -213,10 +214,8 @@ def near_plane(camera: Camera, points: NDArray[np.float64]) -> float | None:
         Depth in world units: `NEAR_SHARE` times the depth of the nearest points in the photo. None if the photo shows
         too few points.
     """
-    points_camera = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    x, y, depths = points_camera[points_camera[:, 2] > 0].T
-    u, v = camera.fx * x / depths + camera.cx, camera.fy * y / depths + camera.cy
-    seen = depths[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)]
+    _, depths, inside = projected(camera, points)
+    seen = depths[inside]
     if len(seen) * NEAR_QUANTILE < 1:  # the quantile would be the nearest point
         return None
     return NEAR_SHARE * float(np.quantile(seen, NEAR_QUANTILE))

@@ -21,8 +21,8 @@ Array = NDArray[Any]
 
 
 MARGIN = 2
-"""Factor of the measured cost of a merge. A part of the change of its pixels is ascribed to other merges, and those
-that got away with it are chosen (measured: docs/howto/compact.md)."""
+"""Factor of the measured cost of a merge. A part of the change of its pixels is ascribed to other merges, and the
+cheapest merges are those for which this part is large."""
 
 
 class Reduction(NamedTuple):

@@ -1,4 +1,4 @@
-"""Variants of scenes, the pixels that few training photos show, and the measures of overfitting."""
+"""Variants of scenes, and the measures of overfitting."""
 
 import json
 from dataclasses import replace
@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_cli import fails, run, write_dataset
+from walls import HEIGHT, WIDTH, scene_of, view
 
 from clsplat.bench import measures
 from clsplat.bench.captures import STANDARD, Capture, arc, captured, thinned, with_fewer_points
@@ -13,37 +14,14 @@ from clsplat.bench.cells import make_cells
 from clsplat.bench.measures import measure, rare_share, training_psnr
 from clsplat.bench.quality import Reader, run_cells
 from clsplat.bench.results import read_records
-from clsplat.camera import Camera
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene
-from clsplat.dataset.coverage import rare_pixels
 from clsplat.errors import InputError
 from clsplat.metrics import psnr, to_uint8
 from clsplat.render import render
 from clsplat.renderer import Renderer
-from clsplat.scene import Scene, View
+from clsplat.scene import View
 from clsplat.testing import synthetic_scene
-
-WIDTH, HEIGHT = 70, 40
-WALL = 4.0
-
-
-def view(name, x=0.0, z=0.0, **camera):
-    """A photo from (x, 0, z), looking along z at a wall in the plane z = WALL."""
-    viewmat = np.eye(4)
-    viewmat[[0, 2], 3] = -x, -z
-    made = Camera(viewmat, 50, 50, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, **camera)
-    return View(name, made, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-
-
-def wall(spacing=0.1):
-    x, y = np.meshgrid(np.arange(-8, 8, spacing), np.arange(-4, 4, spacing))
-    return np.stack([x.ravel(), y.ravel(), np.full(x.size, WALL)], axis=1)
-
-
-def scene_of(train, test, points=None):
-    points = wall() if points is None else points
-    return Scene(train, test, points, np.arange(3 * len(points)).reshape(-1, 3).astype(np.uint8))
 
 
 def names(views):
@@ -107,59 +85,6 @@ class TestVariants:
         kinds = [capture.kind for capture in STANDARD]
         assert kinds == ["full", "thinned", "thinned", "thinned", "arc", "fewer points"]
         assert Capture(thin=2, points=0.5).kind == "thinned and fewer points"
-
-
-class TestRarePixels:
-    def test_pixels_that_two_photos_show_are_rare(self):
-        # At the wall a photo is 5.6 wide; each of these shows the part of the held-out one right of its left border.
-        train = [view(str(i), x=x) for i, x in enumerate((0.0, 0.8, 1.6, 3.2))]
-        (mask,) = rare_pixels(scene_of(train, [view("t")]), wall())
-        assert mask.shape == (HEIGHT, WIDTH)
-        border = 1.6 * 50 / WALL
-        assert mask[:, : int(border)].all() and not mask[:, int(border) + 1 :].any()
-        scene = scene_of(train[:2], [view("t")])
-        assert rare_pixels(scene, wall())[0].all(), "two photos are fewer than three"
-
-    def test_points_behind_the_wall_do_not_count(self):
-        behind = 3 * wall()
-        train = [view(str(i), x=x) for i, x in enumerate((0.0, 0.8, 1.6))]
-        scene = scene_of(train, [view("t")])
-        expected = rare_pixels(scene, wall())[0]
-        assert (rare_pixels(scene, np.concatenate([wall(), behind]))[0] == expected).all()
-        assert (rare_pixels(scene, behind)[0] != expected).any()
-
-    def test_a_photo_that_looks_away_does_not_count(self):
-        away = view("a")
-        away.camera.viewmat[:3, :3] = np.diag([-1, 1, -1])
-        near = [view("0"), view("1")]
-        assert rare_pixels(scene_of([*near, away], [view("t")]), wall())[0].all()
-        assert not rare_pixels(scene_of([*near, view("2")], [view("t")]), wall())[0].any()
-
-    def test_large_photos_are_compared_by_blocks(self):
-        sizes = {"width": 200, "height": 101}
-        train = [replace(v, camera=v.camera.resized(**sizes)) for v in (view("0", x=1.0), view("1", x=1.0))]
-        test = replace(view("t"), camera=view("t").camera.resized(**sizes))
-        scene = scene_of([*train, test], [test])
-        (mask,) = rare_pixels(scene, wall())
-        assert mask.shape == (101, 200)
-        border = 1.0 * test.camera.fx / WALL
-        assert abs(mask.sum(axis=1) - border).max() <= 1.5, "a block has 3 pixels"
-
-    def test_a_fisheye_has_no_rare_pixels_outside_its_circle(self):
-        fisheye = replace(view("f"), camera=replace(view("f").camera, model="fisheye", fx=18.0, fy=18.0))
-        shell = np.random.default_rng(0).normal(size=(4000, 3))
-        shell *= 3 / np.linalg.norm(shell, axis=1, keepdims=True)
-        scene = scene_of([replace(fisheye, name=n) for n in "abc"], [fisheye])
-        assert not rare_pixels(scene, shell)[0].any()
-        turned = replace(fisheye, camera=replace(fisheye.camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0])))
-        (mask,) = rare_pixels(scene_of([turned] * 3, [fisheye]), shell)
-        assert mask[HEIGHT // 2, WIDTH // 2], "only what lies ahead"
-        assert np.isfinite(fisheye.camera.rays(0.5, 0.5)).all() or not mask[0, 0]
-
-    def test_unknown_without_points(self):
-        scene = scene_of([view("0")], [view("t"), view("u", z=100.0)])
-        assert rare_pixels(scene, np.zeros((0, 3))) is None
-        assert rare_pixels(scene, wall()) is None, "the second photo shows none"
 
 
 @pytest.fixture(scope="module")

@@ -7,24 +7,20 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import tyro
+from opened_scene import Arguments, opened
 
-from clsplat.commands.compact import Compact
-from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
-from clsplat.dataset import load_scene
-from clsplat.device import Device
 from clsplat.evaluate import mean_metrics
 from clsplat.formats import load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.compaction import choices_of
 from clsplat.pruning.prices import removal_order
 from clsplat.pruning.reductions import reduce
-from clsplat.renderer import Renderer
 
 SMALLEST = 0.4
 """Fraction of the Gaussians at which the rounds end."""
@@ -34,28 +30,19 @@ STEP = 1.05
 
 
 @dataclass(frozen=True)
-class Arguments:
+class BytesArguments(Arguments):
     """Find the smallest files within a loss of SSIM on the evaluation views."""
 
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
-    photos: Path | None = None
-    """Dataset, as for `train`; without it the scene's own renders from automatic viewpoints are the photos."""
     formats: tuple[str, ...] = (".sog", ".spz")
     loss: float = 0.001
     """Largest loss of SSIM, rounding by the format included."""
-    data: tyro.conf.OmitArgPrefixes[DataConfig] = field(default_factory=DataConfig)
 
 
 def main() -> None:
-    arguments = tyro.cli(Arguments, description=Arguments.__doc__)
+    arguments = tyro.cli(BytesArguments, description=BytesArguments.__doc__)
     warnings.simplefilter("ignore")
-    gaussians, mode, _ = load_gaussians(arguments.scene)
+    gaussians, pricing, evaluation, renderer = opened(arguments)
     n = len(gaussians)
-    renderer = Renderer(Device(), RenderConfig(mode=mode), BACKGROUNDS[arguments.data.background])
-    scene = None if arguments.photos is None else load_scene(arguments.photos, arguments.data)
-    command = Compact(arguments.scene, Path("-"), photos=arguments.photos, data_config=arguments.data)
-    pricing, evaluation = command._views(gaussians, scene, renderer)
 
     def enough(left: Gaussians) -> bool:
         return len(left) < SMALLEST * n
@@ -83,7 +70,7 @@ def main() -> None:
     for suffix in arguments.formats:
         for name, (versions, rows) in ways.items():
             found = [
-                smallest(version, rows, n, partial(stored, suffix=suffix, mode=mode), quality, least)
+                smallest(version, rows, n, partial(stored, suffix=suffix, mode=renderer.config.mode), quality, least)
                 for version in versions
             ]
             reached = [row for row in found if row[0]] or [max(found, key=lambda row: row[3])]

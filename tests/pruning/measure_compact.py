@@ -4,43 +4,21 @@
 """
 
 import time
-from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import tyro
+from opened_scene import Arguments, opened
 
-from clsplat.commands.compact import Compact
-from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
-from clsplat.dataset import load_scene
-from clsplat.device import Device
-from clsplat.formats import load_gaussians
 from clsplat.pruning.compaction import LossMeter
 from clsplat.pruning.prices import price, removal_order
-from clsplat.renderer import Renderer
 
 LOSSES = (0.1, 0.5, 1.0)
 
 
-@dataclass(frozen=True)
-class Arguments:
-    """Prune a scene in several orders, each to several losses."""
-
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
-    photos: Path | None = None
-    """Dataset, as given to `train`; without it automatic viewpoints."""
-    data: tyro.conf.OmitArgPrefixes[DataConfig] = field(default_factory=DataConfig)
-
-
 def main() -> None:
-    arguments = tyro.cli(Arguments, description=Arguments.__doc__)
-    gaussians, mode, _ = load_gaussians(arguments.scene)
+    arguments = tyro.cli(Arguments, description="Prune a scene in several orders, each to several losses.")
+    gaussians, pricing, evaluation, renderer = opened(arguments)
     n = len(gaussians)
-    renderer = Renderer(Device(), RenderConfig(mode=mode), BACKGROUNDS[arguments.data.background])
-    scene = None if arguments.photos is None else load_scene(arguments.photos, arguments.data)
-    command = Compact(arguments.scene, Path("-"), photos=arguments.photos, data_config=arguments.data)
-    pricing, evaluation = command._views(gaussians, scene, renderer)
     measured = LossMeter(gaussians, evaluation, arguments.photos is not None, renderer)
 
     def fewest(order: np.ndarray, loss: float) -> int:

@@ -4,44 +4,22 @@
 """
 
 import time
-from dataclasses import dataclass, field
-from pathlib import Path
 
 import tyro
+from opened_scene import Arguments, opened
 
-from clsplat.commands.compact import Compact
-from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
-from clsplat.dataset import load_scene
-from clsplat.device import Device
 from clsplat.evaluate import mean_metrics
-from clsplat.formats import load_gaussians
 from clsplat.pruning import harmonics
 from clsplat.pruning.compaction import PALETTE_PARTS
 from clsplat.pruning.harmonics import curvatures, fitted_degree, with_shared_bands
 from clsplat.pruning.prices import with_degree
-from clsplat.renderer import Renderer
 
 SPREADS = (0.005, 0.02, 0.2)
 
 
-@dataclass(frozen=True)
-class Arguments:
-    """Cut, fit and share the harmonics of a scene."""
-
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
-    photos: Path
-    """Dataset, as given to `train`."""
-    data: tyro.conf.OmitArgPrefixes[DataConfig] = field(default_factory=DataConfig)
-
-
 def main() -> None:
-    arguments = tyro.cli(Arguments, description=Arguments.__doc__)
-    gaussians, mode, _ = load_gaussians(arguments.scene)
-    renderer = Renderer(Device(), RenderConfig(mode=mode), BACKGROUNDS[arguments.data.background])
-    scene = load_scene(arguments.photos, arguments.data)
-    command = Compact(arguments.scene, Path("-"), photos=arguments.photos, data_config=arguments.data)
-    pricing, evaluation = command._views(gaussians, scene, renderer)
+    arguments = tyro.cli(Arguments, description="Cut, fit and share the harmonics of a scene.")
+    gaussians, pricing, evaluation, renderer = opened(arguments)
 
     def lost(version) -> str:
         found = mean_metrics(version, evaluation, renderer)

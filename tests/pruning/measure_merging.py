@@ -4,45 +4,23 @@
 """
 
 import time
-from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import tyro
+from opened_scene import Arguments, opened
 
-from clsplat.commands.compact import Compact
-from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
-from clsplat.dataset import load_scene
-from clsplat.device import Device
 from clsplat.evaluate import mean_metrics
-from clsplat.formats import load_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import removal_order
 from clsplat.pruning.reductions import reduce
-from clsplat.renderer import Renderer
 
 FRACTIONS = (0.8, 0.5, 0.3, 0.2, 0.1, 0.05)
 
 
-@dataclass(frozen=True)
-class Arguments:
-    """Reduce a scene to fractions of its Gaussians in two ways."""
-
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
-    photos: Path | None = None
-    """Dataset, as given to `train`; without it automatic viewpoints."""
-    data: tyro.conf.OmitArgPrefixes[DataConfig] = field(default_factory=DataConfig)
-
-
 def main() -> None:
-    arguments = tyro.cli(Arguments, description=Arguments.__doc__)
-    gaussians, mode, _ = load_gaussians(arguments.scene)
+    arguments = tyro.cli(Arguments, description="Reduce a scene to fractions of its Gaussians in two ways.")
+    gaussians, pricing, evaluation, renderer = opened(arguments)
     n = len(gaussians)
-    renderer = Renderer(Device(), RenderConfig(mode=mode), BACKGROUNDS[arguments.data.background])
-    scene = None if arguments.photos is None else load_scene(arguments.photos, arguments.data)
-    command = Compact(arguments.scene, Path("-"), photos=arguments.photos, data_config=arguments.data)
-    pricing, evaluation = command._views(gaussians, scene, renderer)
 
     def enough(left: Gaussians) -> bool:
         return len(left) <= FRACTIONS[-1] * n

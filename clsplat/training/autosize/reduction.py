@@ -52,7 +52,7 @@ def without_useless_bands(gaussians: Gaussians, views: list[View], renderer: Ren
     """Zero, per Gaussian, bands of the spherical harmonics whose removal makes the renders no worse.
 
     Each band is priced alone. Of those that seem useless the cheapest fraction is removed, and the fraction is halved
-    until the mean PSNR of the photos does not fall.
+    until the mean quality of the photos does not fall.
     """
     priced = some(views)
     bands, degree = price(gaussians, priced, renderer).bands, gaussians.sh_degree

@@ -16,12 +16,14 @@ import numpy as np
 
 from clsplat.config import TrainConfig
 from clsplat.scene import Scene
-from clsplat.training.densify.schedule import TRIAL_LENGTH
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.rows import Rows
 
 GROWTH_END = 0.5
 """Fraction of the iterations at which growth ends, as the paper's densification does."""
+
+TRIAL_LENGTH = 0.05
+"""Fraction of the iterations in a trial of pruning."""
 
 PRUNING_END = 0.65
 """Fraction of the iterations at which trials of pruning end; all photos train afterwards."""
@@ -50,8 +52,8 @@ VALIDATIONS = 3
 high."""
 
 FEWEST_PRUNING = 4
-"""Fewest held-back photos that decide on pruning. By two of castle_p30's photos a scene was halved that then lost 1.7
-dB in others (measured: docs/size.md)."""
+"""Fewest held-back photos that decide on pruning: by fewer a scene is halved that then loses in other photos
+(measured: docs/size.md)."""
 
 HALVING = 0.5
 """Fraction of the Gaussians that a trial of pruning leaves."""
