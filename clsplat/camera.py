@@ -8,10 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat import display
-from clsplat.constants import FISHEYE_ANGLE_MAX, FRUSTUM_MARGIN, NEAR
+from clsplat.constants import FISHEYE_ANGLE_MAX, FRUSTUM_MARGIN, NEAR, NEAR_EXTENTS
 from clsplat.errors import InputError
 
 CameraModel = Literal["pinhole", "orthographic", "fisheye", "equirectangular"]
+
+NEAR_MEANS = 10_000
+"""Approximate number of Gaussians from which `default_near` is computed; the others are skipped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +44,9 @@ class Camera:
         Projection.
     distortion : tuple of 4 floats
         k1 to k4 of a fisheye; 0 for other models.
-    near : float
-        Depth (for a fisheye, distance) in world units up to which nothing is drawn; positive.
+    near : float, optional
+        Depth (for a fisheye, distance) in world units up to which nothing is drawn; positive. Default: by the
+        scene's points where it is trained, by the Gaussians' `default_near` where they are rendered.
 
     Raises
     ------
@@ -61,7 +65,7 @@ class Camera:
     height: int
     model: CameraModel = "pinhole"
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    near: float = NEAR
+    near: float | None = None
 
     def __post_init__(self) -> None:
         if self.model not in get_args(CameraModel):
@@ -85,8 +89,8 @@ class Camera:
             raise InputError(f"camera: expected positive focal lengths, found fx={self.fx}, fy={self.fy}")
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: expected a size of at least 1x1, found {self.width}x{self.height}")
-        if not 0 < self.near <= np.finfo(np.float32).max:
-            raise InputError(f"near: expected a positive depth, found {self.near}")
+        if self.near is not None and not np.finfo(np.float32).tiny <= self.near <= np.finfo(np.float32).max:
+            raise InputError(f"near: expected a positive depth, as float32, found {self.near}")
         rotation = viewmat[:3, :3]
         # 1e-3 accepts poses printed with four digits. A scaled or sheared matrix would silently render a wrong scene.
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
@@ -99,6 +103,11 @@ class Camera:
     def K(self) -> NDArray[np.float64]:
         """Intrinsic matrix, (3, 3), in pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def near_depth(self) -> float:
+        """Depth of the near plane, world units: `near`, or NEAR where it is not given."""
+        return NEAR if self.near is None else self.near
 
     @property
     def position(self) -> NDArray[np.float64]:
@@ -268,3 +277,21 @@ def focus_point(cameras: list[Camera]) -> NDArray[np.float64]:
             return focus
     spread = float(np.linalg.norm(positions - centre, axis=1).max())
     return centre + directions.mean(axis=0) * (spread if spread > 0 else 1.0)
+
+
+def default_near(means: NDArray[np.floating]) -> float:
+    """Compute a depth of the near plane by the size of a scene, for cameras without one.
+
+    Parameters
+    ----------
+    means : (N, 3)
+        Of at least one Gaussian, world units.
+
+    Returns
+    -------
+    float
+        `NEAR_EXTENTS` times the median distance of the means from their median, in world units; `NEAR` if that is 0.
+    """
+    some = means[:: max(1, len(means) // NEAR_MEANS)].astype(np.float64)
+    spread = float(np.median(np.linalg.norm(some - np.median(some, axis=0), axis=1)))
+    return max(NEAR_EXTENTS * spread, float(np.finfo(np.float32).tiny)) if spread > 0 else NEAR

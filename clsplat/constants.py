@@ -38,8 +38,12 @@ FILTER_VARIANCE = 0.2
 most finely (Mip-Splatting)."""
 
 NEAR = 0.01
-"""Default depth of the near plane, in front of which Gaussians are culled, world units (gsplat; original: 0.2).
-Datasets with points set their own."""
+"""Depth of the near plane, in front of which Gaussians are culled, world units, where nothing is known of the scene
+(gsplat; original: 0.2)."""
+
+NEAR_EXTENTS = 0.0025
+"""Depth of the near plane in extents of the scene, where its points do not tell it. For NeRF-synthetic scenes it is
+`NEAR` within a tenth."""
 
 FRUSTUM_MARGIN = 0.3
 """Margin around the image to which the slopes x/z and y/z of the Jacobian are clamped, as a fraction of half the

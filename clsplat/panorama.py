@@ -40,7 +40,10 @@ def faces(camera: Camera) -> list[Camera]:
     """Make the pinhole cameras that together cover the view of an equirectangular camera, in the order of FACES."""
     size = face_size(camera) + 2 * BORDER
     focal, centre = face_size(camera) / 2, size / 2
-    return [Camera(rotated(camera.viewmat, face), focal, focal, centre, centre, size, size) for face in FACES]
+    return [
+        Camera(rotated(camera.viewmat, face), focal, focal, centre, centre, size, size, near=camera.near)
+        for face in FACES
+    ]
 
 
 def assemble(camera: Camera, images: list[NDArray[np.floating]]) -> NDArray[np.floating]:

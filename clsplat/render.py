@@ -1,13 +1,14 @@
 """Rendered images that know their gradients: `render`, `render_views` and the `Rendering` they return."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat import display, panorama
-from clsplat.camera import Camera
+from clsplat.camera import Camera, default_near
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
@@ -218,7 +219,11 @@ def _renderings(
 ) -> Iterator[Rendering]:
     """A generator, apart from `renderings` so that this one's errors come before the first image is asked for."""
     placed = renderer.place(gaussians) if len(gaussians) else gaussians
+    near: float | None = None
     for camera in cameras:
+        if camera.near is None and len(gaussians):
+            near = near or default_near(np.asarray(download(gaussians.means)))
+            camera = replace(camera, near=near)
         run, image, alpha = _rendered(renderer, placed, camera, degree, depth, gradients)
         yield Rendering(renderer, run if gradients else None, gaussians, image, alpha)
 

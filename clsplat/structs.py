@@ -33,7 +33,7 @@ def camera_struct(camera: Camera, real: Any) -> np.ndarray:
     struct["intrinsics"] = camera.fx, camera.fy, camera.cx, camera.cy
     if camera.model == "fisheye":
         struct["distortion"], struct["cos_max"] = camera.distortion, np.cos(camera.angle_max)
-    struct["near"] = camera.near
+    struct["near"] = camera.near_depth
     struct["size"] = camera.width, camera.height
     return struct
 

@@ -147,11 +147,15 @@ def train_and_report(
     from clsplat.formats import save_gaussians
     from clsplat.renderer import Renderer
     from clsplat.show.training_curve import training_curve
+    from clsplat.training.outcome import failure
 
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     gaussians = train_with_progress(scene, config, renderer, out, resume, viewer)
     save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
     say(f"{out / 'scene.ply'}: {len(gaussians)} Gaussians")
+    failed = failure(gaussians, scene.train, renderer)
+    if failed:
+        warn(failed)
     training_curve(out / "log.jsonl", out / "training_curve.png")
     if config.size == "auto":
         say_size(scene, out)

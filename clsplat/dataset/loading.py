@@ -1,19 +1,16 @@
-"""Load a folder as a `Scene`: detect the kind of dataset, hold out photos, choose the origin and the near plane."""
+"""Load a folder as a `Scene`: detect the kind of dataset, hold out photos and choose the origin."""
 
 import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from clsplat.camera import Camera
 from clsplat.config import DataConfig, SfmConfig
-from clsplat.constants import NEAR
 from clsplat.dataset import colmap, transforms
-from clsplat.dataset.coverage import projected
 from clsplat.dataset.decoding import Dataset, by_faces, load_view, load_views
 from clsplat.dataset.finding import PhotosMissing
+from clsplat.dataset.near_planes import with_near_planes
 from clsplat.dataset.photos import list_photos
 from clsplat.dataset.sfm import reconstruction as sfm
 from clsplat.dataset.sfm.triangulation import filled, triangulate
@@ -24,16 +21,6 @@ OFFSET_EXTENTS = 1000
 """Largest distance of the cameras from the origin, in scene extents, at which the origin is kept. Farther out, it is
 moved to the cameras. At this distance float32 resolves 6e-5 extents; a coarser resolution would lose the small steps
 of training."""
-
-NEAR_SHARE = 0.3
-"""Depth of a photo's near plane as a fraction of the depth of its nearest points. Effect: docs/stability.md."""
-
-NEAR_QUANTILE = 0.01
-"""Quantile of the depths of the points in a photo that counts as the depth of the nearest points. The nearest point
-itself may be an outlier."""
-
-NEAR_POINTS = 10_000
-"""Approximate number of points from which the near plane is computed; the others are skipped."""
 
 
 def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> Scene:
@@ -87,7 +74,7 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
         raise InputError(
             f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
         )
-    return _with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
+    return with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
 
 
 def _split(views: list[View], dataset: Dataset, test_every: int) -> tuple[list[View], list[View]]:
@@ -194,41 +181,3 @@ def _near_origin(scene: Scene) -> Scene:
         return [replace(view, camera=view.camera.translated(centre)) for view in part]
 
     return Scene(moved(scene.train), moved(scene.test), scene.points - centre, scene.colors, centre)
-
-
-def near_plane(camera: Camera, points: NDArray[np.float64]) -> float | None:
-    """Compute a depth of the near plane at which the points in a photo show that nothing is closer.
-
-    Faint Gaussians close to a camera cover its whole image. Other photos may show them as parts of a wall next to the
-    photographer, or not at all: a camera that stands where no photo was taken is then in a haze.
-
-    Parameters
-    ----------
-    camera : Camera
-    points : (P, 3)
-        Sparse points of the scene, world units.
-
-    Returns
-    -------
-    float or None
-        Depth in world units: `NEAR_SHARE` times the depth of the nearest points in the photo. None if the photo shows
-        too few points.
-    """
-    _, depths, inside = projected(camera, points)
-    seen = depths[inside]
-    if len(seen) * NEAR_QUANTILE < 1:  # the quantile would be the nearest point
-        return None
-    return NEAR_SHARE * float(np.quantile(seen, NEAR_QUANTILE))
-
-
-def _with_near_planes(scene: Scene) -> Scene:
-    """The scene whose photos have near planes: photos with too few points have the nearest one of the others."""
-    points = scene.points[:: max(1, len(scene.points) // NEAR_POINTS)]
-    found = {view.name: near_plane(view.camera, points) for view in (*scene.train, *scene.test)}
-    fallback = min((near for near in found.values() if near is not None), default=NEAR)
-
-    def with_near(part: list[View]) -> list[View]:
-        nears = [found[view.name] or fallback for view in part]
-        return [replace(v, camera=replace(v.camera, near=n)) for v, n in zip(part, nears, strict=True)]
-
-    return replace(scene, train=with_near(scene.train), test=with_near(scene.test))

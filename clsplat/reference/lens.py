@@ -33,14 +33,14 @@ def lens(camera: Camera, points: Array) -> dict[str, Any]:
     x, y, z = points.T
     hessian, means2d_by, jacobian_by = np.zeros((n, 2, 3, 3)), np.zeros((n, 2, 4)), np.zeros((n, 2, 3, 4))
     means2d_by[:, [0, 1], [2, 3]] = 1
-    depths, onward, seen = z, np.broadcast_to([0.0, 0.0, 1.0], (n, 3)), z > camera.near
+    depths, onward, seen = z, np.broadcast_to([0.0, 0.0, 1.0], (n, 3)), z > camera.near_depth
     if camera.model == "orthographic":
         slopes, slope_jacobian = points[:, :2], np.tile(np.eye(2, 3), (n, 1, 1))
     elif camera.model == "fisheye":
         depths = np.linalg.norm(points, axis=1)
         onward, seen = (
             points / depths[:, None],
-            (depths > camera.near) & (np.arctan2(np.hypot(x, y), z) < camera.angle_max),
+            (depths > camera.near_depth) & (np.arctan2(np.hypot(x, y), z) < camera.angle_max),
         )
         s, gradient, second = _radial(camera, points)
         # (x s)_jk = e_j s_k + e_k s_j + x s_jk, and the same for y

@@ -22,8 +22,9 @@ OPACITY = 0.1
 RANDOM_POINTS = 100_000
 """Default number of Gaussians of a random start (original)."""
 
-VARIANCE_MIN = 1e-7
-"""Smallest first variance, squared world units; without it, duplicate points would have scale 0 (original)."""
+VARIANCE_SHARE = 1e-4
+"""Smallest first variance, as a fraction of their median; without it, duplicate points would have scale 0. The
+original's is 1e-7 squared world units, about the same for scenes of a few units."""
 
 
 def initialize(scene: Scene, config: InitConfig, seed: int, cap: int | None = None) -> Gaussians:
@@ -148,7 +149,9 @@ def _variances(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.ones(1)
     # The nearest point is the point itself, or a duplicate of it at the same distance 0.
     distances, _ = cKDTree(points).query(points, k=neighbours + 1, workers=-1)
-    return np.maximum(np.mean(distances[:, 1:] ** 2, axis=1), VARIANCE_MIN)
+    variances = np.mean(distances[:, 1:] ** 2, axis=1)
+    median = np.median(variances[variances > 0]) if variances.any() else 1.0
+    return np.maximum(variances, VARIANCE_SHARE * median)
 
 
 def _gaussians(

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsplat.config import TrainConfig
+from clsplat.dataset.near_planes import with_near_planes
 from clsplat.errors import DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import without_invisible
@@ -81,6 +82,7 @@ def train(
         If the Gaussians stop growing because more would not fit the device's memory.
     """
     check(scene, config)
+    scene = with_near_planes(scene)
     out, device = Path(out), device or open_device(config)
     state = load_state(out / CHECKPOINT, scene.extent, config) if resume else initial_state(scene, config)
     training = Training(scene, config, device, state)

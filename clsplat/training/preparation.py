@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from clsplat.config import TrainConfig
 from clsplat.dataset import load_scene, with_points
 from clsplat.dataset.finding import mask_folder
+from clsplat.dataset.near_planes import with_near_planes
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
 from clsplat.training.few_views import adapted
@@ -67,6 +68,7 @@ def prepare(
         config = replace(config, data=replace(config.data, masks=masks))
     if scene is None:
         scene = load_scene(path, config.data, verbose)
+    scene = with_near_planes(scene)
     tell(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
     few_photos = len(scene.train) < config.few.below  # their points limit the number of Gaussians
     if config.init.triangulate and not len(scene.points) and (few_photos or not resume):

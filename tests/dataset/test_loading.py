@@ -9,9 +9,7 @@ from PIL import Image
 
 from clsplat.camera import Camera
 from clsplat.config import DataConfig, SfmConfig
-from clsplat.constants import NEAR
 from clsplat.dataset import load_scene
-from clsplat.dataset.loading import NEAR_SHARE, near_plane
 from clsplat.dataset.sfm import reconstruction as sfm
 from clsplat.errors import InputError
 
@@ -51,25 +49,6 @@ def test_every_nth_photo_by_name_is_held_out(tmp_path, every, test):
     for view in scene.train + scene.test:
         assert view.image[0, 0, 0] == int(view.name[:2])
         np.testing.assert_allclose(view.camera.position, [int(view.name[:2]), 0, 0], atol=1e-12)
-
-
-def test_nothing_is_drawn_long_before_the_nearest_points(tmp_path):
-    """By hand: 100 points at 3 to 3.99 in front of the first photos and one outlier at 0.5; other photos see none,
-    and have the near plane of the first ones. Held-out photos have near planes, too."""
-    write_colmap(tmp_path)
-    rows = [f"{k} 0.3 0 {3 + k / 100} 0 0 0 0\n" for k in range(100)]
-    (tmp_path / "sparse" / "0" / "points3D.txt").write_text("".join([*rows, "100 0.3 0 0.5 0 0 0 0\n"]))
-    scene = load_scene(tmp_path, DataConfig())
-    views = sorted(scene.train + scene.test, key=lambda view: view.name)
-    found = [near_plane(view.camera, scene.points) for view in views]
-    assert None in found and found[0] == pytest.approx(NEAR_SHARE * 3.0, abs=0.01), found
-    nearest = min(near for near in found if near is not None)
-    assert [view.camera.near for view in views] == [near or nearest for near in found]
-    assert near_plane(views[0].camera, scene.points[:99]) is None, "too few to recognise an outlier"
-    assert near_plane(views[0].camera, scene.points[:0]) is None
-    (tmp_path / "sparse" / "0" / "points3D.txt").write_text("")
-    bare = load_scene(tmp_path, DataConfig())
-    assert {view.camera.near for view in bare.train} == {NEAR}
 
 
 def test_nothing_left_to_train_on_is_an_error(tmp_path):

@@ -1,14 +1,17 @@
-"""Geo-referenced scenes: float32 has steps of 0.06 at 1e6, and of 0.5 at 5e6."""
+"""Coordinates of the world. Geo-referenced scenes: float32 has steps of 0.06 at 1e6, and of 0.5 at 5e6. Units: a
+scene in kilometres or in micrometres."""
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from test_loading import write_colmap
 
 from clsplat.bench.stability.small import CONFIG, small_scene
 from clsplat.config import DataConfig, InitConfig
 from clsplat.dataset import load_scene
 from clsplat.dataset.loading import _near_origin
+from clsplat.dataset.near_planes import with_near_planes
 from clsplat.evaluate import mean_metrics
 from clsplat.render import render
 from clsplat.renderer import Renderer
@@ -46,3 +49,27 @@ def test_training_is_the_same_a_million_units_away(device, tmp_path):
         mean_metrics(train(s, config, tmp_path, device), s.test, Renderer(device))["psnr"] for s in (scene, there)
     ]
     assert abs(psnrs[0] - psnrs[1]) < 0.01
+
+
+@pytest.mark.parametrize("points", [True, False], ids=["points", "random"])
+def test_training_is_the_same_in_any_unit(device, tmp_path, points):
+    """Near planes, scales, learning rates and thresholds follow the scene."""
+    scene, config = small_scene(device), replace(CONFIG, iterations=100)
+    if not points:
+        scene = replace(scene, points=scene.points[:0], colors=scene.colors[:0])
+        config = replace(config, init=replace(config.init, random_points=200, triangulate=False))
+    psnrs = {}
+    for unit in (1.0, 1e-6, 1e-3, 1e3, 1e6):
+
+        def scaled(views, unit=unit):
+            viewmats = [view.camera.viewmat.copy() for view in views]
+            for viewmat in viewmats:
+                viewmat[:3, 3] *= unit
+            pairs = zip(views, viewmats, strict=True)
+            return [replace(view, camera=replace(view.camera, viewmat=viewmat)) for view, viewmat in pairs]
+
+        there = replace(scene, train=scaled(scene.train), test=scaled(scene.test), points=unit * scene.points)
+        gaussians = train(there, config, tmp_path / f"{unit:g}", device)
+        views = with_near_planes(there).test
+        psnrs[unit] = mean_metrics(gaussians, views, Renderer(device))["psnr"]
+    assert max(psnrs.values()) - min(psnrs.values()) < 0.1, psnrs

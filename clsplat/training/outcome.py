@@ -1,0 +1,54 @@
+"""Check of a scene that has been trained: whether it shows anything of its photos."""
+
+import numpy as np
+
+from clsplat.gaussians import Gaussians
+from clsplat.render import renderings
+from clsplat.renderer import Renderer
+from clsplat.scene import View
+
+FEWEST_GAUSSIANS = 16
+"""Number of Gaussians below which a training has failed. The strategies leave at least this number while they prune,
+and no photo is described by fewer."""
+
+CHECKED = 8
+"""Number of training photos, evenly spaced, that are compared with a constant colour."""
+
+LEVEL = 1 / 255
+"""Root mean square of a photo's differences from its mean colour up to which it shows nothing."""
+
+
+def failure(gaussians: Gaussians, views: list[View], renderer: Renderer) -> str | None:
+    """Say why a scene is a failure, if it has almost no Gaussians, or a constant colour is closer to its photos.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        The trained scene.
+    views : list of View
+        The training photos.
+    renderer : Renderer
+
+    Returns
+    -------
+    str or None
+        A sentence with what to look at; None if the scene shows something of its photos.
+    """
+    advice = "look at the photos, their poses and masks, and train for more --iterations"
+    if len(gaussians) < FEWEST_GAUSSIANS:
+        return f"training failed: only {len(gaussians)} Gaussians are left; {advice}"
+    chosen = [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), CHECKED)).round().astype(int)]
+    errors, variances = [], []
+    for view, rendering in zip(chosen, renderings(renderer, gaussians, [v.camera for v in chosen]), strict=True):
+        counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+        photo = view.image[counts] / 255
+        if len(photo) and photo.var(axis=0).mean() > LEVEL**2:
+            errors.append(np.mean((np.clip(rendering.rgb[counts], 0, 1) - photo) ** 2))
+            variances.append(photo.var(axis=0).mean())
+    if not errors or np.mean(errors) < np.mean(variances):
+        return None
+    found, constant = (-10 * np.log10(np.mean(values)) for values in (errors, variances))
+    return (
+        f"training failed: its photos have {found:.1f} dB, where a constant colour for each has {constant:.1f} dB; "
+        f"{advice}"
+    )

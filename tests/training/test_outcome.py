@@ -1,0 +1,45 @@
+"""A scene that shows nothing of its photos is called a failure."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.bench.stability.small import CONFIG, small_scene
+from clsplat.config import InitConfig
+from clsplat.renderer import Renderer
+from clsplat.training.initialize import initialize
+from clsplat.training.loop import train
+from clsplat.training.outcome import FEWEST_GAUSSIANS, failure
+
+
+@pytest.fixture
+def scene(device):
+    return small_scene(device)
+
+
+def test_a_short_training_is_no_failure_but_black_is(scene, device, tmp_path):
+    gaussians = train(scene, replace(CONFIG, iterations=60), tmp_path, device)
+    assert failure(gaussians, scene.train, Renderer(device)) is None
+    gaussians.sh[:] = -10
+    assert "a constant colour" in failure(gaussians, scene.train, Renderer(device))
+
+
+def test_almost_no_gaussians_are_a_failure(scene, device):
+    gaussians = initialize(scene, InitConfig(opacity=0.9), seed=0)
+    few = gaussians.take(np.arange(FEWEST_GAUSSIANS - 1))
+    assert f"{FEWEST_GAUSSIANS - 1} Gaussians" in failure(few, scene.train, Renderer(device))
+
+
+def test_photos_that_show_nothing_ask_for_nothing(scene, device):
+    """Black photos are matched by black Gaussians, and none of their errors is said to be a failure."""
+    black = [replace(view, image=np.zeros_like(view.image)) for view in scene.train]
+    gaussians = initialize(scene, InitConfig(opacity=0.9), seed=0)
+    assert failure(gaussians, black, Renderer(device)) is None
+
+
+def test_only_the_pixels_of_the_mask_count(scene, device):
+    gaussians = initialize(scene, InitConfig(opacity=0.9), seed=0)
+    masked = [replace(view, mask=np.zeros(view.image.shape[:2], bool)) for view in scene.train]
+    gaussians.sh[:] = -10
+    assert failure(gaussians, masked, Renderer(device)) is None
