@@ -252,9 +252,10 @@ class FewViewsConfig:
 class TrainConfig:
     """Settings of a training; saved as ``config.json``, from which it can be repeated."""
 
-    iterations: int = 3000
-    """Optimisation steps. In runs shorter than 7000, the paper's shorter setting, the first densification and the
-    bands of spherical harmonics come earlier in proportion."""
+    iterations: int = 0
+    """Optimisation steps. 0: 30 for each training photo, but at least 3000 and at most 30 000. In runs shorter than
+    7000, the paper's shorter setting, the first densification and the bands of spherical harmonics come earlier in
+    proportion."""
     seed: int = 0
     """Seed of the random start, of the order of the photos and of the strategy's random numbers."""
     optimizer: Literal["device", "numpy"] = "device"

@@ -13,6 +13,7 @@ from clsplat.bench.results import Record
 from clsplat.config import DataConfig, TrainConfig
 from clsplat.errors import InputError
 from clsplat.training.presets import YAML, load_config, load_preset, with_settings
+from clsplat.training.run_length import MOST_ITERATIONS
 
 AUTO = "auto"
 """Name of the method with default settings, which choose the number of Gaussians."""
@@ -59,7 +60,8 @@ class Cell:
         cap = self.config.max_gaussians
         limit = "" if cap is None else f", at most {cap:,} Gaussians"
         seed = f", seed {self.config.seed}" if self.config.seed else ""
-        return f"{self.source.name}, {self.method}{limit}, {self.config.iterations:,} iterations{seed}"
+        number = f", {self.config.iterations:,} iterations" if self.config.iterations else ""
+        return f"{self.source.name}, {self.method}{limit}{number}{seed}"
 
 
 def parse_source(text: str) -> Source:
@@ -183,7 +185,7 @@ def make_cells(
                 seed=base.seed if seed is None else seed,
                 data=source.data,
                 # Checkpoints cost time: write one only at the end, which is not timed.
-                checkpoint_every=number,
+                checkpoint_every=number or MOST_ITERATIONS,
                 device=None,
                 memory_limit=memory_limit,
             )

@@ -79,9 +79,9 @@ class Run:
 
     @property
     def setting(self) -> str:
-        """Method, cap and number of iterations."""
+        """Method, cap, and number of iterations if it is not chosen by the photos."""
         cap = "" if self.max_gaussians is None else f" · ≤{short(self.max_gaussians)}"
-        return f"{self.method}{cap} · {short(self.iterations)} it"
+        return f"{self.method}{cap} · {short(self.iterations)} it" if self.iterations else self.method + cap
 
     @property
     def last(self) -> Record:

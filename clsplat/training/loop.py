@@ -19,6 +19,7 @@ from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.preparation import open_device
 from clsplat.training.recorder import LOG, Recorder, log_file
+from clsplat.training.run_length import with_iterations
 from clsplat.training.session import Training
 from clsplat.training.state import initial_state
 
@@ -82,7 +83,7 @@ def train(
         If the Gaussians stop growing because more would not fit the device's memory.
     """
     check(scene, config)
-    scene = with_near_planes(scene)
+    scene, config = with_near_planes(scene), with_iterations(config, scene)
     out, device = Path(out), device or open_device(config)
     state = load_state(out / CHECKPOINT, scene.extent, config) if resume else initial_state(scene, config)
     training = Training(scene, config, device, state)

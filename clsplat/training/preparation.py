@@ -15,6 +15,7 @@ from clsplat.scene import Scene
 from clsplat.training.few_views import adapted
 from clsplat.training.initialize import start_count
 from clsplat.training.memory import Footprint, parse_bytes
+from clsplat.training.run_length import with_iterations
 from clsplat.training.state import start_config
 
 if TYPE_CHECKING:
@@ -34,7 +35,8 @@ def prepare(
     """Load a dataset and adapt the configuration to it.
 
     Where the dataset has poses but no points, points are triangulated from its photos (`config.init.triangulate`).
-    With few photos the configuration is adapted to them (`config.few`). `clsplat.training.loop.train` on the result
+    The number of iterations follows that of the photos, unless it is given. With few photos the configuration is
+    adapted to them (`config.few`). `clsplat.training.loop.train` on the result
     does what ``clsplat train`` does.
 
     Parameters
@@ -75,6 +77,7 @@ def prepare(
         scene = with_points(scene, path, config.data, verbose)
         found = f"{len(scene.points)} points, from photos and poses" if len(scene.points) else "random"
         tell(f"start: {found} (--init.no-triangulate: random)")
+    config = with_iterations(config, scene)
     few = adapted(config, scene)
     if few != config:
         tell(
