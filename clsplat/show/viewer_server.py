@@ -20,6 +20,7 @@ from typing import Any, Literal
 from urllib.parse import urlsplit
 
 import msgspec
+import numpy as np
 import websockets.asyncio.server
 from websockets import Headers
 from websockets.asyncio.server import ServerConnection, serve
@@ -56,6 +57,9 @@ class _CameraMessage(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_f
 
     def __post_init__(self) -> None:
         client_camera(self.wxyz, self.position, self.fov, self.image_width, self.image_height)
+        axes = np.array([self.look_at, self.up_direction])
+        if not np.isfinite(axes).all() or not axes[1].any() or self.look_at == self.position:
+            raise InputError(f"camera: expected a target and an up direction, found {axes.tolist()}")
 
 
 class _InputMessage(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True):

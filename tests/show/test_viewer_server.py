@@ -236,6 +236,14 @@ class TestMessages:
         assert not acceptable("text") and not acceptable(b"") and not acceptable(b"\xa1\xff")
         assert not acceptable(b"\x91" * 50_000), "nested too deeply"
 
+    @pytest.mark.parametrize(
+        "changes",
+        [{"look_at": [NAN] * 3}, {"look_at": [0, 0, -3.5]}, {"up_direction": [0] * 3}, {"up_direction": [INF, 0, 0]}],
+        ids=str,
+    )
+    def test_nor_cameras_that_viser_cannot_move(self, changes):
+        assert not acceptable(camera_message(**changes))
+
     def test_nonsense_leaves_the_connection_open(self, viewer):
         with connect(**own(viewer.address)) as socket_:
             socket_.send(camera_message())

@@ -57,11 +57,15 @@ class Swarm:
 
         return self.run(all_of_them())
 
-    def send(self, clients: list[Any], message: bytes) -> None:
-        """Send a message by each connection."""
+    def send(self, clients: list[Any], *messages: bytes | str) -> None:
+        """Send messages by each connection, in their order."""
+
+        async def each(client: Any) -> None:
+            for message in messages:
+                await client.send(message)
 
         async def all_of_them() -> None:
-            await asyncio.gather(*(client.send(message) for client in clients))
+            await asyncio.gather(*map(each, clients))
 
         self.run(all_of_them())
 
