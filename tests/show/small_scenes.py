@@ -38,5 +38,6 @@ def small_training(device, out, progress=lambda record: None, **options):
     photos = [View(f"{i}.png", c, to_uint8(render(gaussians, c, device=device).rgb)) for i, c in enumerate(cams)]
     points = gaussians.means[:100].astype(np.float64)
     scene = Scene(photos, [], points, np.full((100, 3), 128, np.uint8))
-    config = TrainConfig(strategy="adc", size="fixed", iterations=12, max_gaussians=150, eval_every=0, **options)
+    fixed = {"strategy": "adc", "size": "fixed", "iterations": 12, "max_gaussians": 150, "eval_every": 0}
+    config = TrainConfig(**fixed | options)
     return train(scene, config, out, device, progress=progress)

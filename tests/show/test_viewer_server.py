@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from browser import wait_for
+from browser import PATIENCE, wait_for
 from small_scenes import cameras, views_of
 
 viser = pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
@@ -264,7 +264,7 @@ class TestMessages:
             socket_.send(bytes(LARGEST_MESSAGE + 1))
             with pytest.raises(ConnectionClosed, match="1009"):
                 while True:
-                    socket_.recv()
+                    socket_.recv(PATIENCE)
             other.send(camera_message())
             wait_for(lambda: viewer._clients, "the other client")
 
