@@ -30,14 +30,14 @@ from clsplat.show.camera_paths import first_photo
 from clsplat.show.viewer import Viewer
 
 GROWTH_MAX = 64.0
-"""Largest growth of the process after the first quarter of the time, MiB. In three hours some hundred thousand clients
+"""Largest growth of the process after the first quarter of the time, MiB. In three hours, a hundred thousand clients
 come and go: a leak of 1 kB each exceeds it, and what the allocator keeps of frames of many sizes does not."""
 
 WINDOWS = ((64, 48), (320, 240), (1280, 960))
 """Sizes of the clients' windows, px. They are few, so that the device has kept its buffers for all of them early."""
 
 ITERATIONS = 400
-"""Iterations of a training. Trainings repeat until the time is over; each is compared with the one without a viewer."""
+"""Iterations of a training. Trainings repeat until the time is over; each is compared with that without a viewer."""
 
 
 async def visit(address: str, rng: random.Random) -> None:
