@@ -1,6 +1,6 @@
 PYTHON = python
 
-.PHONY: test test-slow stability fuzz lint docs check-races bench bench-knobs bench-quality bench-captures bench-stability \
+.PHONY: test test-slow stability fuzz soak lint docs check-races bench bench-knobs bench-quality bench-captures bench-stability \
   formats
 
 # Run the default tests: a few minutes on two cores.
@@ -19,6 +19,12 @@ stability:
 CASES = 4000
 fuzz:
 	CLSPLAT_FUZZ=$(CASES) $(PYTHON) -m pytest --hypothesis-profile=fuzz $(shell ls tests/stability/test_fuzz_*.py)
+
+# Train for MINUTES under a viewer whose clients come and go, and check that the memory does not grow and that the bits
+# stay: build/soak/soak.png and soak.json. Linux only.
+MINUTES = 180
+soak:
+	$(PYTHON) tests/show/measure_soak.py --minutes $(MINUTES) -o build/soak
 
 # Check style, types, and the format of the kernels.
 lint:

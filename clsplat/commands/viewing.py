@@ -20,7 +20,7 @@ class View:
     data: Path | None = None
     """Dataset, as for `train`: its cameras are shown, and a click on one moves the view there."""
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 admits other machines."""
+    """Address to listen on; 0.0.0.0 admits other machines, with the token in the printed address."""
     port: int = 8080
     """Port to listen on; if it is in use, the next free one."""
     device: str | None = None

@@ -7,11 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.errors import InputError
 from clsplat.reference.project import rotations
+
+LARGEST_EDGE = 16384
+"""Largest edge of a window, px: the limit of most graphics cards for the canvas that shows the scene."""
+
+LARGEST_FRAME = 3840 * 2160
+"""Largest number of pixels of a frame: a whole 4K screen. In a larger window, the browser enlarges the frame. This
+bounds the memory of a frame, which is proportional to its pixels."""
 
 
 def client_camera(wxyz: Any, position: Any, fov: float, width: int, height: int) -> Camera:
-    """Camera of a browser window.
+    """Camera of a browser window, with `LARGEST_FRAME` pixels at most.
 
     Parameters
     ----------
@@ -21,13 +29,31 @@ def client_camera(wxyz: Any, position: Any, fov: float, width: int, height: int)
         Vertical field of view, radians.
     width, height : int
         Size of the window, px.
+
+    Raises
+    ------
+    InputError
+        If a value is not finite as float32, the quaternion is zero, the field of view is not between 0 and pi, or an
+        edge is not between 1 and `LARGEST_EDGE`.
     """
+    values = np.array([*wxyz, *position, fov], dtype=np.float64)
+    if not (np.abs(values) <= np.finfo(np.float32).max).all():
+        raise InputError(f"camera: expected a finite pose and field of view, as float32, found {values.tolist()}")
+    quat, position, norm = values[:4], values[4:7], np.linalg.norm(values[:4])
+    if norm == 0 or not 0 < fov / 2 < math.pi / 2:
+        raise InputError(
+            f"camera: expected a rotation and a field of view between 0 and pi, found the quaternion {quat.tolist()} "
+            f"and {fov}"
+        )
+    if not (1 <= width <= LARGEST_EDGE and 1 <= height <= LARGEST_EDGE):
+        raise InputError(f"window: expected edges between 1 and {LARGEST_EDGE} px, found {width}x{height}")
     viewmat = np.eye(4)
-    quat = np.asarray(wxyz, dtype=np.float64)
-    viewmat[:3, :3] = rotations(quat / np.linalg.norm(quat)).T
-    viewmat[:3, 3] = -viewmat[:3, :3] @ np.asarray(position, dtype=np.float64)
+    viewmat[:3, :3] = rotations(quat / norm).T
+    viewmat[:3, 3] = -viewmat[:3, :3] @ position
     f = height / 2 / math.tan(fov / 2)
-    return Camera(viewmat, f, f, width / 2, height / 2, width, height)
+    camera = Camera(viewmat, f, f, width / 2, height / 2, width, height)
+    scale = math.sqrt(LARGEST_FRAME / (width * height))
+    return camera if scale >= 1 else camera.resized(*(max(1, int(scale * edge)) for edge in (width, height)))
 
 
 def wxyz_of(camera: Camera) -> NDArray[np.float64]:

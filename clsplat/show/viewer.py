@@ -9,7 +9,9 @@ on the viewer.
 import math
 import threading
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.errors import DeviceError, InputError
+from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
 from clsplat.show.browser_cameras import client_camera, whole_view, wxyz_of
@@ -49,6 +51,10 @@ size do not hide the scene."""
 
 TEXT_EVERY = 0.25
 """Time between two updates of the panel's text, s."""
+
+
+def _reason(error: Exception) -> str:
+    return str(error) if isinstance(error, ClsplatError) else f"{type(error).__name__}: {error}"
 
 
 class _Shown(NamedTuple):
@@ -89,14 +95,20 @@ class Viewer:
     views : list of View
         Photos whose cameras are shown as frusta. A click on a frustum moves the view to that camera.
     host : str
-        Address that the server listens on.
+        Address that the server listens on. If other machines can reach it, only the whole `address`, with its random
+        token, opens the viewer.
     port : int
         First port to try. If it is taken, the next free one is used.
+
+    Attributes
+    ----------
+    address : str
+        What to open in the browser.
 
     Raises
     ------
     InputError
-        If the package viser is not installed.
+        If the package viser is not installed, or the machine cannot listen on `host`.
     """
 
     def __init__(
@@ -109,7 +121,9 @@ class Viewer:
         port: int = 8080,
     ):
         try:
-            import viser
+            from clsplat.show.viewer_server import start_server
+
+            self._server, self.address = start_server(host, port)
         except ImportError as error:
             raise InputError(
                 "cannot start the viewer: the package viser is missing; install it with pip install 'clsplat[viewer]'"
@@ -120,9 +134,8 @@ class Viewer:
         self._asked = threading.Event()
         self._mode, self._version, self._paused = MODES[0], 0, False
         self._pause: Any = None
+        self._failed = False
         self._facts, self._drawn, self._written = "", "", 0.0
-        self._server = viser.ViserServer(host=host, port=port, label="clsplat", verbose=False)
-        self.address = f"http://{host}:{self._server.get_port()}"
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False)
         show = gui.add_dropdown("Show", MODES)
@@ -132,8 +145,9 @@ class Viewer:
 
         @show.on_update
         def _(_: Any) -> None:
-            self._mode = show.value
-            self._asked.set()
+            if show.value in MODES:  # a page can send any text
+                self._mode = show.value
+                self._asked.set()
 
         self._server.scene.set_up_direction(tuple(start.up))
         first, initial = start.camera, self._server.initial_camera
@@ -193,12 +207,11 @@ class Viewer:
         client = self._clients[handle.client_id] = _Client(handle)
 
         async def update(camera: Any) -> None:
-            if min(camera.image_width, camera.image_height) > 0:
-                client.camera = client_camera(
-                    camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
-                )
-                client.moved = time.perf_counter()
-                self._asked.set()
+            client.camera = client_camera(
+                camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
+            )
+            client.moved = time.perf_counter()
+            self._asked.set()
 
         handle.camera.on_update(update)
         await update(handle.camera)
@@ -221,12 +234,22 @@ class Viewer:
         """
         due = [(c, self._share_due(c, time.perf_counter())) for c in list(self._clients.values())]
         due = [(client, share) for client, share in due if share]
-        if due:
-            gaussians = self._renderer.place(gaussians)
-        for client, share in due:
-            self._frame(client, share, gaussians)
-        self._write()
+        with self._harmless():
+            gaussians = self._renderer.place(gaussians) if due else gaussians
+            for client, share in due:
+                self._frame(client, share, gaussians)
+            self._write()
         return bool(due)
+
+    @contextmanager
+    def _harmless(self) -> Iterator[None]:
+        """Turn the first error in the block into a warning, and ignore the others: none may end a training."""
+        try:
+            yield
+        except Exception as error:
+            if not self._failed:
+                self._failed = True
+                warnings.warn(f"the viewer failed: {_reason(error)}; its frames may be missing or old", stacklevel=3)
 
     def _share_due(self, client: _Client, now: float) -> float:
         """Resolution of the next frame, as a fraction of the window's edges; 0 if no frame is due."""
@@ -248,11 +271,12 @@ class Viewer:
         small = camera.resized(*(max(1, round(share * edge)) for edge in (camera.width, camera.height)))
         try:
             frame, legend = picture(self._renderer, gaussians, small, mode)
-        except DeviceError as error:  # must not end a training
-            frame, legend = np.zeros((1, 1, 3), np.uint8), str(error)
-        if not any(c is client for c in self._clients.values()):
+        except Exception as error:  # of any type: it must not end a training
+            frame, legend = np.zeros((1, 1, 3), np.uint8), _reason(error)
+        if not any(c is client for c in list(self._clients.values())):
             return  # the browser was closed in the meantime
-        client.handle.scene.set_background_image(frame, format="jpeg", jpeg_quality=JPEG_QUALITY)
+        with self._harmless():
+            client.handle.scene.set_background_image(frame, format="jpeg", jpeg_quality=JPEG_QUALITY)
         now = time.perf_counter()
         if share == client.share:
             change = math.sqrt(FRAME_TIME / (now - started))
@@ -285,12 +309,13 @@ class Viewer:
     def tell(self, facts: dict[str, str]) -> None:
         """Set the facts about the scene that the panel shows below the modes, by name."""
         self._facts = "  \n".join(f"**{name}** {value}" for name, value in facts.items())
-        self._write()
+        with self._harmless():
+            self._write()
 
     def follow(self, gaussians: Gaussians, interrupted: Callable[[], bool]) -> None:
         """Draw the frames that browsers request, and wait while the training is paused.
 
-        A training calls this between two iterations.
+        A training calls this between two iterations. An error of the viewer becomes a warning, whatever its type.
 
         Parameters
         ----------
@@ -299,13 +324,14 @@ class Viewer:
         interrupted : callable
             Returns True when the user has interrupted the training, which also ends a pause.
         """
-        if self._pause is None:
-            self._pause = self._server.gui.add_button("Pause training")
-            self._pause.on_click(self._toggle)
-        self._version += 1
-        self.draw(gaussians)
-        if self._paused:
-            self.hold(gaussians, lambda: interrupted() or not self._paused)
+        with self._harmless():
+            if self._pause is None:
+                self._pause = self._server.gui.add_button("Pause training")
+                self._pause.on_click(self._toggle)
+            self._version += 1
+            self.draw(gaussians)
+            if self._paused:
+                self.hold(gaussians, lambda: interrupted() or not self._paused)
 
     def _toggle(self, _: Any) -> None:
         self._paused = not self._paused

@@ -1,6 +1,5 @@
 """The viewer: conversion of cameras, frames, trainings with a viewer, and a browser that shows the frames."""
 
-import math
 import sys
 import threading
 import time
@@ -11,41 +10,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from browser import browser, wait_for
+from small_scenes import SIZE, cameras, small_training
 
-from clsplat.camera import Camera
-from clsplat.config import TrainConfig
 from clsplat.errors import DeviceError, InputError
 from clsplat.metrics import psnr, to_uint8
 from clsplat.ops import count_pairs
 from clsplat.render import render
 from clsplat.renderer import Renderer
-from clsplat.scene import Scene, View
 from clsplat.show.browser_cameras import client_camera, whole_view, wxyz_of
 from clsplat.show.camera_paths import first_photo
 from clsplat.show.frames import MODES, picture
 from clsplat.show.viewer import FRAME_TIME, STILL_AFTER, Viewer
-from clsplat.testing import synthetic_scene
-from clsplat.training.loop import train
-
-SIZE = (320, 240)
-
-
-def cameras(count=5, tilt=0.2):
-    """Gaussians of `synthetic_scene`, and cameras around them, tilted to alternating sides."""
-    gaussians, camera = synthetic_scene(300, seed=5)
-    centre = gaussians.means.mean(axis=0)
-    distance = np.linalg.norm(camera.position - centre)
-    result = []
-    for i in range(count):
-        angle = 2 * math.pi * i / count
-        eye = centre + distance * np.array([math.sin(angle), 0.3 * math.sin(2 * i), -math.cos(angle)])
-        up = (tilt * (-1) ** i, -1, 0.1 * i)
-        result.append(Camera.look_at(eye, centre, up, 300 + 10 * i, *SIZE))
-    return gaussians, result
-
-
-def views_of(cams):
-    return [View(f"{i}.png", c, np.zeros((c.height, c.width, 3), np.uint8)) for i, c in enumerate(cams)]
 
 
 def test_a_camera_is_the_same_after_the_conversion_to_the_browser_and_back():
@@ -108,16 +83,6 @@ def test_without_viser_the_message_names_the_extra(device, monkeypatch):
     cams = cameras()[1]
     with pytest.raises(InputError, match=r"pip install 'clsplat\[viewer\]'"):
         Viewer(Renderer(device), first_photo(cams), [])
-
-
-@pytest.fixture
-def viewer(device):
-    """A viewer of five cameras. A test adds its clients."""
-    pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
-    cams = cameras()[1]
-    result = Viewer(Renderer(device), first_photo(cams), views_of(cams), port=18080)
-    yield result
-    result.close()
 
 
 class Clock:
@@ -204,15 +169,6 @@ class TestResolution:
         assert viewer.draw(gaussians)
         assert client.frames[0].shape == (1, 1, 3)
         assert "needs a buffer" in viewer._drawn
-
-
-def small_training(device, out, progress=lambda record: None, **options):
-    gaussians, cams = cameras()
-    photos = [View(f"{i}.png", c, to_uint8(render(gaussians, c, device=device).rgb)) for i, c in enumerate(cams)]
-    points = gaussians.means[:100].astype(np.float64)
-    scene = Scene(photos, [], points, np.full((100, 3), 128, np.uint8))
-    config = TrainConfig(strategy="adc", size="fixed", iterations=12, max_gaussians=150, eval_every=0, **options)
-    return train(scene, config, out, device, progress=progress)
 
 
 @pytest.mark.parametrize("optimizer", ["device", "numpy"])

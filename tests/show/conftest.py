@@ -1,0 +1,18 @@
+"""Fixtures of the viewer's tests."""
+
+import pytest
+from small_scenes import cameras, views_of
+
+from clsplat.renderer import Renderer
+from clsplat.show.camera_paths import first_photo
+from clsplat.show.viewer import Viewer
+
+
+@pytest.fixture
+def viewer(device):
+    """A viewer of five cameras. A test adds its clients."""
+    pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
+    cams = cameras()[1]
+    result = Viewer(Renderer(device), first_photo(cams), views_of(cams), port=18080)
+    yield result
+    result.close()
