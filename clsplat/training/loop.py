@@ -73,7 +73,7 @@ def train(
     DeviceError
         If the device's memory, or its limit, is exceeded.
     ClsplatError
-        If the loss stops being finite.
+        If the loss stops being finite, or a parameter is not when a checkpoint is due.
 
     Warns
     -----

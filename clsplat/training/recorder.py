@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from clsplat.atomic import replacing
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.training.checkpoint import CHECKPOINT, save_state
+from clsplat.training.divergence import check_loss, check_state
 from clsplat.training.session import Training
 
 LOG = "log.jsonl"
@@ -59,11 +60,7 @@ class Recorder:
     def after(self, training: Training, loss: float) -> None:
         """Record an iteration of the training itself."""
         state, config = training.state, training.config
-        if not np.isfinite(loss):
-            raise ClsplatError(
-                f"training diverged: the loss of iteration {state.iteration} is {loss}; lower the learning rates "
-                f"(--optim.*); the last checkpoint in {self._out} is intact"
-            )
+        check_loss(loss, state.iteration, self._out)
         self._losses.append(loss)
         state.seconds = time.perf_counter() - self._started
         record: dict[str, Any] = {}
@@ -77,7 +74,7 @@ class Recorder:
             at = {"iteration": state.iteration, "num_gaussians": len(state.gaussians), "seconds": state.seconds}
             self._log(at | record)
         if state.iteration % config.checkpoint_every == 0 or state.iteration == config.iterations:
-            save_state(self._out / CHECKPOINT, state, config)
+            self._save()
         left = time.perf_counter()
         self._tell(training, loss)
         self._started += time.perf_counter() - left
@@ -93,8 +90,13 @@ class Recorder:
         try:
             self._progress(about | {"gaussians": gaussians})
         except KeyboardInterrupt:
-            save_state(self._out / CHECKPOINT, state, self._training.config)
+            self._save()
             raise
+
+    def _save(self) -> None:
+        training = self._training
+        check_state(training.state, training.renderer.stages, self._out)
+        save_state(self._out / CHECKPOINT, training.state, training.config)
 
 
 @contextmanager
