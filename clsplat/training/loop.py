@@ -1,6 +1,7 @@
 """Training on a scene's photos, from the first Gaussians or a checkpoint to the scene that is saved."""
 
 from collections.abc import Callable, Container
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from clsplat.training.autosize.search import search_size
 from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
 from clsplat.training.densify import STRATEGIES
+from clsplat.training.inputs import Inputs
 from clsplat.training.preparation import open_device
 from clsplat.training.recorder import LOG, Recorder, log_file
 from clsplat.training.session import Training
@@ -68,8 +70,8 @@ def train(
     Raises
     ------
     InputError
-        If the scene has no photos to train on, the strategy is unknown, the price is negative, or the checkpoint is
-        of another configuration.
+        If the scene has no photos to train on, the strategy is unknown, the price is negative, or `resume` finds no
+        checkpoint, or one of other photos, masks, cameras or points, or of another configuration.
     DeviceError
         If the device's memory, or its limit, is exceeded.
     ClsplatError
@@ -78,11 +80,16 @@ def train(
     Warns
     -----
     UserWarning
-        If the Gaussians stop growing because more would not fit the device's memory.
+        If the Gaussians stop growing because more would not fit the device's memory, or if a run resumes on another
+        device or driver, where its bits differ.
     """
     check(scene, config)
     out, device = Path(out), device or open_device(config)
-    state = load_state(out / CHECKPOINT, scene.extent, config) if resume else initial_state(scene, config)
+    inputs = Inputs.of(scene, device)
+    if resume:
+        state = load_state(out / CHECKPOINT, scene.extent, config, inputs)
+    else:
+        state = replace(initial_state(scene, config), inputs=inputs)
     training = Training(scene, config, device, state)
     with log_file(out / LOG, state.iteration) as log:
         recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)

@@ -54,19 +54,18 @@ class Recorder:
             every = config.eval_every
             evaluate_after = range(every, config.iterations + 1, every) if every else ()
         self._evaluate, self._evaluate_after = evaluate, evaluate_after
-        self._losses: list[float] = []
         self._started = time.perf_counter() - training.state.seconds
 
     def after(self, training: Training, loss: float) -> None:
         """Record an iteration of the training itself."""
         state, config = training.state, training.config
         check_loss(loss, state.iteration, self._out)
-        self._losses.append(loss)
+        state.losses.append(loss)
         state.seconds = time.perf_counter() - self._started
         record: dict[str, Any] = {}
         if state.iteration % LOG_EVERY == 0 or state.iteration == config.iterations:
-            record = {"loss": float(np.mean(self._losses))}
-            self._losses.clear()
+            record = {"loss": float(np.mean(state.losses))}
+            state.losses.clear()
         if self._evaluate and state.iteration in self._evaluate_after:
             record |= self._evaluate(state.shown(training.renderer))
             self._started = time.perf_counter() - state.seconds
