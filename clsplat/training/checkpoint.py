@@ -208,12 +208,17 @@ def _load_arrays(path: Path) -> Arrays:
                 raise ValueError("compressed arrays")  # NumPy's savez leaves them as they are
             return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}
     except FileNotFoundError as error:
-        raise InputError(
-            f"{path.parent}: expected a checkpoint to resume from, found none; start the run without --resume, or "
-            "name its folder with -o"
-        ) from error
+        raise no_checkpoint(path.parent) from error
     except (EOFError, NotImplementedError, OSError, RuntimeError, ValueError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: expected a checkpoint of clsplat, found a damaged file: {error}") from error
+
+
+def no_checkpoint(out: Path) -> InputError:
+    """The error of a folder that no run can resume in."""
+    return InputError(
+        f"{out}: expected a checkpoint to resume from, found none; start the run without --resume, or name its "
+        "folder with -o"
+    )
 
 
 def _array(content: bytes) -> NDArray[Any]:

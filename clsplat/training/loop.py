@@ -20,6 +20,7 @@ from clsplat.training.densify import STRATEGIES
 from clsplat.training.inputs import Inputs
 from clsplat.training.preparation import open_device
 from clsplat.training.recorder import LOG, Recorder, log_file
+from clsplat.training.run_folder import held
 from clsplat.training.session import Training
 from clsplat.training.state import initial_state
 
@@ -71,7 +72,8 @@ def train(
     ------
     InputError
         If the scene has no photos to train on, the strategy is unknown, the price is negative, or `resume` finds no
-        checkpoint, or one of other photos, masks, cameras or points, or of another configuration.
+        checkpoint, or one of other photos, masks, cameras or points, or of another configuration, or another process
+        or thread trains into the folder.
     DeviceError
         If the device's memory, or its limit, is exceeded.
     ClsplatError
@@ -85,25 +87,26 @@ def train(
     """
     check(scene, config)
     out, device = Path(out), device or open_device(config)
-    inputs = Inputs.of(scene, device)
-    if resume:
-        state = load_state(out / CHECKPOINT, scene.extent, config, inputs)
-    else:
-        state = replace(initial_state(scene, config), inputs=inputs)
-    training = Training(scene, config, device, state)
-    with log_file(out / LOG, state.iteration) as log:
-        recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
-        try:
-            with driver_errors():
-                if state.search:
-                    search_size(training, recorder.after, recorder.after_fork)
-                training.run_until(config.iterations, recorder.after)
-        except DeviceError as error:
-            raise DeviceError(
-                f"iteration {training.state.iteration + 1}: {error}; the last checkpoint in {out}, if there is one, "
-                "is intact: --resume continues from it, and a lower --memory-limit stops growth earlier"
-            ) from error
-    return finish(training, out)
+    with held(out):
+        inputs = Inputs.of(scene, device)
+        if resume:
+            state = load_state(out / CHECKPOINT, scene.extent, config, inputs)
+        else:
+            state = replace(initial_state(scene, config), inputs=inputs)
+        training = Training(scene, config, device, state)
+        with log_file(out / LOG, state.iteration) as log:
+            recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
+            try:
+                with driver_errors():
+                    if state.search:
+                        search_size(training, recorder.after, recorder.after_fork)
+                    training.run_until(config.iterations, recorder.after)
+            except DeviceError as error:
+                raise DeviceError(
+                    f"iteration {training.state.iteration + 1}: {error}; the last checkpoint in {out}, if there is "
+                    "one, is intact: --resume continues from it, and a lower --memory-limit stops growth earlier"
+                ) from error
+        return finish(training, out)
 
 
 def check(scene: Scene, config: TrainConfig) -> None:

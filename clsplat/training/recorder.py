@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from clsplat.atomic import replacing
-from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.training.checkpoint import CHECKPOINT, save_state
 from clsplat.training.divergence import check_loss, check_state
@@ -108,7 +107,7 @@ def log_file(path: Path, iteration: int) -> Iterator[Append]:
     Raises
     ------
     InputError
-        If the folder cannot be created or the file cannot be written.
+        If the file cannot be written.
     """
     kept = []
     if iteration and path.exists():
@@ -118,10 +117,6 @@ def log_file(path: Path, iteration: int) -> Iterator[Append]:
                     kept.append(line)
             except (json.JSONDecodeError, KeyError):  # a line cut off when the run was killed
                 continue
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot create {path.parent}: {error.strerror}") from error
     with replacing(path) as file:
         file.writelines(f"{line}\n".encode() for line in kept)
     events = event_writer(path.parent / "tensorboard", iteration)
