@@ -221,7 +221,8 @@ def test_a_resumed_run_leaves_what_a_whole_one_does(dataset: Path, killed: Path,
 def test_resume_where_there_is_no_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     expected = f"{out}: expected a checkpoint to resume from, found none; start the run without --resume, or name its"
-    assert expected in fails(capsys, "train", dataset, "-o", out, *QUICK, "--resume")
+    for data in (dataset, tmp_path / "missing"):  # the cheapest check comes first
+        assert expected in fails(capsys, "train", data, "-o", out, *QUICK, "--resume")
     assert not out.exists()
     out.mkdir()
     (out / "config.json").write_text("{}")
