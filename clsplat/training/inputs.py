@@ -95,7 +95,7 @@ class Inputs:
             )
         if now.device != self.device:
             warnings.warn(
-                f"the checkpoint was made on {self.device}; the run goes on on {now.device}: its bits will differ "
+                f"the checkpoint was made on {self.device}; the run continues on {now.device}: its bits will differ "
                 "from those of an uninterrupted run",
                 stacklevel=2,
             )

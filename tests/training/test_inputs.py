@@ -142,7 +142,7 @@ def test_another_device_or_driver_warns_and_goes_on(
             train(scene, SHORT, tmp_path, device, progress=interrupt)
     driver = device.cl_device.driver_version.strip()
     message = re.escape(
-        f"the checkpoint was made on Another platform: another device, driver {driver}; the run goes on on "
+        f"the checkpoint was made on Another platform: another device, driver {driver}; the run continues on "
         f"{device.label}, driver {driver}: its bits will differ"
     )
     with pytest.warns(UserWarning, match=message), pytest.raises(KeyboardInterrupt):
