@@ -65,11 +65,27 @@ class Train:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.formats import save_gaussians, suffix_of
-        from clsplat.training.checkpoint import CHECKPOINT
+        from clsplat.formats import suffix_of
+        from clsplat.training.checkpoint import CHECKPOINT, no_checkpoint
+        from clsplat.training.run_folder import held
 
         suffix = "" if self.out.is_dir() else suffix_of(self.out)
         out = self.out.with_name(self.out.name[: -len(suffix)]) if suffix else self.out
+        if self.resume and not (out / CHECKPOINT).exists():
+            raise no_checkpoint(out)
+        with held(out):
+            gaussians, viewer = self.trained(out, suffix)
+        if viewer:
+            say(f"viewer: {viewer.address} stays open; Ctrl-C ends it")
+            with suppress(KeyboardInterrupt):
+                viewer.hold(gaussians)
+            viewer.close()
+
+    def trained(self, out: Path, suffix: str) -> "tuple[Gaussians, Viewer | None]":
+        """Train in a folder that is held, and write the file of Gaussians that a suffix asks for."""
+        from clsplat.formats import save_gaussians
+        from clsplat.training.checkpoint import CHECKPOINT
+
         if not self.resume and (out / CHECKPOINT).exists():
             raise InputError(
                 f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
@@ -87,16 +103,16 @@ class Train:
         if suffix:
             save_gaussians(self.out, gaussians, config.render.mode, scene.offset)
             say(f"{self.out}: {self.out.stat().st_size / 1e6:.3g} MB")
-        if viewer:
-            say(f"viewer: {viewer.address} stays open; Ctrl-C ends it")
-            with suppress(KeyboardInterrupt):
-                viewer.hold(gaussians)
-            viewer.close()
+        return gaussians, viewer
 
     def prepared(self, out: Path, device: "Device") -> "tuple[Scene, TrainConfig]":
-        """Prepare scene and configuration, check that they fit the device, and write the configuration to `out`."""
+        """Prepare scene and configuration, and check that they fit the device.
+
+        The configuration is written to `out`, and the cameras are drawn there, unless a run resumes: it keeps those
+        that it was started with, and `train` compares them.
+        """
         from clsplat.dataset.video import extract_frames, is_video
-        from clsplat.training.checkpoint import CHECKPOINT
+        from clsplat.training.loop import check
         from clsplat.training.preparation import prepare
 
         data = self.data
@@ -107,13 +123,14 @@ class Train:
             data,
             self.settings,
             device,
-            resume=(out / CHECKPOINT).exists(),
+            resume=self.resume,
             verbose=console.loudness == "verbose",
             tell=say,
         )
-        new_folder(out)
-        write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
-        say_cameras(data, out / "cameras.png")
+        check(scene, config)
+        if not self.resume:
+            write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
+            say_cameras(data, out / "cameras.png")
         return scene, config
 
 

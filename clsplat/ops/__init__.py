@@ -14,6 +14,7 @@ from clsplat.ops.count import count_pairs
 from clsplat.ops.dropout import dropout_bwd, dropout_fwd
 from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.filter import filter_bwd, filter_fwd, pixel_sizes
+from clsplat.ops.finite import count_not_finite
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
@@ -44,6 +45,7 @@ class Launches:
         self.observe = partial(observe, device)
         self.adam_step = partial(adam_step, device)
         self.add_noise = partial(add_noise, device)
+        self.count_not_finite = partial(count_not_finite, device)
         self.pixel_sizes = partial(pixel_sizes, device)
         self.filter_fwd = partial(filter_fwd, device)
         self.filter_bwd = partial(filter_bwd, device)

@@ -4,6 +4,8 @@ import io
 import json
 import math
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from clsplat.renderer import download, fetch
 from clsplat.scene import Scene
 from clsplat.training.autosize.rule import Candidate, Search, SmallSide, Trial
 from clsplat.training.densify import STRATEGIES
+from clsplat.training.inputs import Inputs
 from clsplat.training.optimizer import Moments
 from clsplat.training.photo_parameters import PerPhoto
 from clsplat.training.photo_poses import refined
@@ -33,6 +36,9 @@ FREE = ("device", "checkpoint_every", "eval_every", "memory_limit")
 """Settings that may differ when a run resumes: they do not change the result, unless a limit of memory is reached,
 and then the user lowers it."""
 
+FORMAT = 2
+"""Version of the arrays in a checkpoint. The first had no number; the second adds the inputs and the losses."""
+
 SEARCH = ("most", "pace", "grows", "trials", "degrees", "settled", "validated")
 """Fields of a search that are saved as JSON."""
 
@@ -41,8 +47,10 @@ Arrays = dict[str, NDArray[Any]]
 
 def save_state(path: Path, state: State, config: TrainConfig) -> None:
     """Write the state to an .npz file, whole or not at all."""
-    arrays: dict[str, Any] = {"iteration": state.iteration, "seconds": state.seconds}
+    arrays: dict[str, Any] = {"format": FORMAT, "iteration": state.iteration, "seconds": state.seconds}
     arrays["intersections"] = state.intersections
+    arrays["losses"] = np.array(state.losses, np.float64)
+    arrays["inputs"] = json.dumps(asdict(state.inputs))
     arrays["config"] = json.dumps(asdict(config), sort_keys=True)
     arrays |= _rows_arrays(state.rows, "")
     if state.filter and state.filter.pixels is not None:
@@ -88,26 +96,59 @@ def write_photos(path: Path, state: State, scene: Scene) -> None:
         file.write((json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
 
 
-def load_state(path: Path, extent: float, config: TrainConfig) -> State:
-    """Read the state that `save_state` wrote, of a scene of the given extent in world units.
+def load_state(path: Path, extent: float, config: TrainConfig, inputs: Inputs | None = None) -> State:
+    """Read the state that `save_state` wrote.
+
+    Parameters
+    ----------
+    path : Path
+    extent : float
+        Scale of the scene, world units.
+    config : TrainConfig
+    inputs : Inputs, optional
+        Those of the run that goes on from the state; None if none does.
 
     Raises
     ------
     InputError
-        If the file is missing or damaged, or it was made with another configuration.
+        If the file is missing or damaged, or it was made from other inputs, with another configuration or by another
+        version of clsplat.
+
+    Warns
+    -----
+    UserWarning
+        If the device or its driver differs.
     """
     arrays = _load_arrays(path)
-    try:
+    with _damage_named(path):
+        version = int(arrays.get("format", 1))
+    if version != FORMAT:
+        raise InputError(
+            f"{path}: expected a checkpoint of format {FORMAT}, found format {version} of another version; "
+            "continue it with that version, or start a new run in another folder"
+        )
+    with _damage_named(path):
+        made_from = Inputs.restored(json.loads(str(arrays["inputs"])))
+    if inputs is not None:
+        made_from = made_from.continued(inputs, path)
+    with _damage_named(path):
         saved, asked = json.loads(str(arrays["config"])), json.loads(json.dumps(asdict(config)))
         for free in FREE:
             saved.pop(free, None), asked.pop(free, None)
         changed = sorted(k for k in asked if asked[k] != saved.get(k))
         state = None if saved != asked else _to_state(arrays, extent, config)
-    except (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: expected a checkpoint of clsplat, found a damaged file: {error!r}") from error
     if state is None:
         raise InputError(f"{path}: expected the configuration it was made with, found other {', '.join(changed)}")
+    state.inputs = made_from
     return state
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected a checkpoint of clsplat, found a damaged file: {error!r}") from error
 
 
 def _to_state(arrays: Arrays, extent: float, config: TrainConfig) -> State:
@@ -126,6 +167,7 @@ def _to_state(arrays: Arrays, extent: float, config: TrainConfig) -> State:
         extent=extent,
         rows=_to_rows(arrays, "", extent, config),
         intersections=float(arrays["intersections"]),
+        losses=[float(loss) for loss in arrays["losses"]],
         search=search,
         exposures=_to_photo_parameters(arrays, "exposures."),
         poses=_to_photo_parameters(arrays, "poses."),
@@ -166,11 +208,17 @@ def _load_arrays(path: Path) -> Arrays:
                 raise ValueError("compressed arrays")  # NumPy's savez leaves them as they are
             return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}
     except FileNotFoundError as error:
-        raise InputError(
-            f"{path}: expected a checkpoint to resume from, found none; start without --resume"
-        ) from error
+        raise no_checkpoint(path.parent) from error
     except (EOFError, NotImplementedError, OSError, RuntimeError, ValueError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: expected a checkpoint of clsplat, found a damaged file: {error}") from error
+
+
+def no_checkpoint(out: Path) -> InputError:
+    """The error of a folder that no run can resume in."""
+    return InputError(
+        f"{out}: expected a checkpoint to resume from, found none; start the run without --resume, or name its "
+        "folder with -o"
+    )
 
 
 def _array(content: bytes) -> NDArray[Any]:

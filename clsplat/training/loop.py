@@ -1,6 +1,7 @@
 """Training on a scene's photos, from the first Gaussians or a checkpoint to the scene that is saved."""
 
 from collections.abc import Callable, Container
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +18,10 @@ from clsplat.training.autosize.search import search_size
 from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
 from clsplat.training.densify import STRATEGIES
+from clsplat.training.inputs import Inputs
 from clsplat.training.preparation import open_device
 from clsplat.training.recorder import LOG, Recorder, log_file
+from clsplat.training.run_folder import held
 from clsplat.training.run_length import with_iterations
 from clsplat.training.session import Training
 from clsplat.training.state import initial_state
@@ -70,36 +73,43 @@ def train(
     Raises
     ------
     InputError
-        If the scene has no photos to train on, the strategy is unknown, the price is negative, or the checkpoint is
-        of another configuration.
+        If the scene has no photos to train on, the strategy is unknown, the price is negative, or `resume` finds no
+        checkpoint, or one of other photos, masks, cameras or points, or of another configuration, or another process
+        or thread trains into the folder.
     DeviceError
         If the device's memory, or its limit, is exceeded.
     ClsplatError
-        If the loss stops being finite.
+        If the loss stops being finite, or a parameter is not when a checkpoint is due.
 
     Warns
     -----
     UserWarning
-        If the Gaussians stop growing because more would not fit the device's memory.
+        If the Gaussians stop growing because more would not fit the device's memory, or if a run resumes on another
+        device or driver, where its bits differ.
     """
     check(scene, config)
     scene, config = with_near_planes(scene), with_iterations(config, scene)
     out, device = Path(out), device or open_device(config)
-    state = load_state(out / CHECKPOINT, scene.extent, config) if resume else initial_state(scene, config)
-    training = Training(scene, config, device, state)
-    with log_file(out / LOG, state.iteration) as log:
-        recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
-        try:
-            with driver_errors():
-                if state.search:
-                    search_size(training, recorder.after, recorder.after_fork)
-                training.run_until(config.iterations, recorder.after)
-        except DeviceError as error:
-            raise DeviceError(
-                f"iteration {training.state.iteration + 1}: {error}; the last checkpoint in {out}, if there is one, "
-                "is intact: --resume continues from it, and a lower --memory-limit stops growth earlier"
-            ) from error
-    return finish(training, out)
+    with held(out):
+        inputs = Inputs.of(scene, device)
+        if resume:
+            state = load_state(out / CHECKPOINT, scene.extent, config, inputs)
+        else:
+            state = replace(initial_state(scene, config), inputs=inputs)
+        training = Training(scene, config, device, state)
+        with log_file(out / LOG, state.iteration) as log:
+            recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
+            try:
+                with driver_errors():
+                    if state.search:
+                        search_size(training, recorder.after, recorder.after_fork)
+                    training.run_until(config.iterations, recorder.after)
+            except DeviceError as error:
+                raise DeviceError(
+                    f"iteration {training.state.iteration + 1}: {error}; the last checkpoint in {out}, if there is "
+                    "one, is intact: --resume continues from it, and a lower --memory-limit stops growth earlier"
+                ) from error
+        return finish(training, out)
 
 
 def check(scene: Scene, config: TrainConfig) -> None:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from clsplat.atomic import replacing
-from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.training.checkpoint import CHECKPOINT, save_state
+from clsplat.training.divergence import check_loss, check_state
 from clsplat.training.session import Training
 
 LOG = "log.jsonl"
@@ -53,23 +53,18 @@ class Recorder:
             every = config.eval_every
             evaluate_after = range(every, config.iterations + 1, every) if every else ()
         self._evaluate, self._evaluate_after = evaluate, evaluate_after
-        self._losses: list[float] = []
         self._started = time.perf_counter() - training.state.seconds
 
     def after(self, training: Training, loss: float) -> None:
         """Record an iteration of the training itself."""
         state, config = training.state, training.config
-        if not np.isfinite(loss):
-            raise ClsplatError(
-                f"training diverged: the loss of iteration {state.iteration} is {loss}; lower the learning rates "
-                f"(--optim.*); the last checkpoint in {self._out} is intact"
-            )
-        self._losses.append(loss)
+        check_loss(loss, state.iteration, self._out)
+        state.losses.append(loss)
         state.seconds = time.perf_counter() - self._started
         record: dict[str, Any] = {}
         if state.iteration % LOG_EVERY == 0 or state.iteration == config.iterations:
-            record = {"loss": float(np.mean(self._losses))}
-            self._losses.clear()
+            record = {"loss": float(np.mean(state.losses))}
+            state.losses.clear()
         if self._evaluate and state.iteration in self._evaluate_after:
             record |= self._evaluate(state.shown(training.renderer))
             self._started = time.perf_counter() - state.seconds
@@ -77,7 +72,7 @@ class Recorder:
             at = {"iteration": state.iteration, "num_gaussians": len(state.gaussians), "seconds": state.seconds}
             self._log(at | record)
         if state.iteration % config.checkpoint_every == 0 or state.iteration == config.iterations:
-            save_state(self._out / CHECKPOINT, state, config)
+            self._save()
         left = time.perf_counter()
         self._tell(training, loss)
         self._started += time.perf_counter() - left
@@ -93,8 +88,13 @@ class Recorder:
         try:
             self._progress(about | {"gaussians": gaussians})
         except KeyboardInterrupt:
-            save_state(self._out / CHECKPOINT, state, self._training.config)
+            self._save()
             raise
+
+    def _save(self) -> None:
+        training = self._training
+        check_state(training.state, training.renderer.stages, self._out)
+        save_state(self._out / CHECKPOINT, training.state, training.config)
 
 
 @contextmanager
@@ -107,7 +107,7 @@ def log_file(path: Path, iteration: int) -> Iterator[Append]:
     Raises
     ------
     InputError
-        If the folder cannot be created or the file cannot be written.
+        If the file cannot be written.
     """
     kept = []
     if iteration and path.exists():
@@ -117,10 +117,6 @@ def log_file(path: Path, iteration: int) -> Iterator[Append]:
                     kept.append(line)
             except (json.JSONDecodeError, KeyError):  # a line cut off when the run was killed
                 continue
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot create {path.parent}: {error.strerror}") from error
     with replacing(path) as file:
         file.writelines(f"{line}\n".encode() for line in kept)
     events = event_writer(path.parent / "tensorboard", iteration)

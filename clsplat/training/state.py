@@ -1,7 +1,7 @@
 """The state of a training: everything that its iterations change."""
 
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from clsplat.config import InitConfig, TrainConfig
@@ -13,6 +13,7 @@ from clsplat.training.autosize import rule
 from clsplat.training.autosize.validation import can_validate
 from clsplat.training.densify import STRATEGIES, Strategy
 from clsplat.training.initialize import initialize
+from clsplat.training.inputs import Inputs
 from clsplat.training.optimizer import Moments, sh_degree_at
 from clsplat.training.photo_parameters import PerPhoto
 from clsplat.training.rows import Rows
@@ -28,8 +29,9 @@ class State:
 
     iteration: the last one done, counted from 1; seconds: training time. rows: on the device or on the host, as
     `move` placed them. intersections: the largest mean number of tiles per Gaussian that a view has had; it bounds
-    the growth where memory does. search: for the number of Gaussians; None where that is fixed. exposures, poses:
-    parameters of the photos; None where they are not learned. filter: the 3D filter, if there is one.
+    the growth where memory does. losses: those of the iterations since the last line of the log. search: for the
+    number of Gaussians; None where that is fixed. exposures, poses: parameters of the photos; None where they are not
+    learned. filter: the 3D filter, if there is one. inputs: what the run trains on; iterations do not change it.
     """
 
     iteration: int
@@ -37,10 +39,12 @@ class State:
     extent: float
     rows: Rows
     intersections: float = 0.0
+    losses: list[float] = field(default_factory=list)
     search: rule.Search | None = None
     exposures: PerPhoto | None = None
     poses: PerPhoto | None = None
     filter: SmoothingFilter | None = None
+    inputs: Inputs = field(default_factory=Inputs)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -72,6 +76,7 @@ class State:
         return replace(
             self,
             rows=rows,
+            losses=[*self.losses],
             search=self.search and replace(self.search, most=len(rows.gaussians)),
             exposures=deepcopy(self.exposures),
             poses=deepcopy(self.poses),

@@ -1,6 +1,7 @@
 """The size of a scene: the rules in numbers, the search on known Gaussians, the same bits after a resume."""
 
 import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -236,6 +237,9 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     for name, array in whole.arrays().items():
         assert resumed.arrays()[name].tobytes() == array.tobytes(), name
     assert (tmp_path / "parts" / "size.json").read_text() == (tmp_path / "whole" / "size.json").read_text()
+    logs = [(tmp_path / name / "log.jsonl").read_text() for name in ("parts", "whole")]
+    logs = [re.sub(r'"seconds": [0-9.e-]+', "", log) for log in logs]
+    assert logs[0] == logs[1] and logs[0].count("loss") == 20
 
 
 def test_a_step_leaves_what_the_photos_would_miss(device: Device) -> None:

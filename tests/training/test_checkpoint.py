@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from test_loop import CONFIG, same, scene  # noqa: F401  (a fixture)
 
+from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.scene import Scene
 from clsplat.training.checkpoint import load_state, save_state
 from clsplat.training.densify import Edit
+from clsplat.training.loop import train
 from clsplat.training.recorder import log_file
 from clsplat.training.state import State, initial_state
 
@@ -77,11 +79,10 @@ def test_a_failed_write_leaves_the_last_checkpoint(
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.npz"]
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_named(scene: Scene, device: Device, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"cannot create .*file/out: Not a directory"):
-        with log_file(tmp_path / "file" / "out" / "log.jsonl", 0):
-            pass
+        train(scene, CONFIG, tmp_path / "file" / "out", device)
 
 
 def test_the_log_is_also_written_for_tensorboard(tmp_path: Path) -> None:

@@ -39,9 +39,12 @@ def test_eight_photos(tmp_path: Path) -> None:
 
 def test_poses_without_points(posed: list[View], tmp_path: Path) -> None:
     path = write_transforms(tmp_path, posed)
-    run("train", path, "-o", tmp_path / "command", "--iterations", 5, "--test-every", 0, "--max-gaussians", 500)
+    options = ("--iterations", 5, "--test-every", 0, "--max-gaussians", 500)
+    run("train", path, "-o", tmp_path / "command", *options)
     config = TrainConfig(iterations=5, max_gaussians=500, data=DataConfig(test_every=0))
     assert from_python(path, config, tmp_path / "python") == (tmp_path / "command" / "scene.ply").read_bytes()
+    # The points of few photos are triangulated again when a run resumes, and must be the same.
+    run("train", path, "-o", tmp_path / "command", *options, "--resume")
     told: list[str] = []
     scene, _ = prepare(path, config, tell=told.append)
     assert len(scene.points) == POINTS_TARGET and f"start: {POINTS_TARGET} points, from photos and poses" in told[1]

@@ -1,0 +1,141 @@
+"""The inputs of a run: photos, cameras, points and device, by which a checkpoint recognises them."""
+
+import warnings
+from dataclasses import dataclass, field, replace
+from hashlib import blake2b
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import CameraModel
+from clsplat.errors import InputError
+from clsplat.scene import Scene, View
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+DIGEST_BYTES = 16
+"""Length of a digest: among 10^12 photos, the chance that two of them share one is 10^-15."""
+
+CAMERA_TOLERANCE = 1e-9
+"""Difference of a camera's numbers, relative and absolute, up to which it counts as the same. Poses come from linear
+algebra in float64, whose rounding depends on the processor; a run may move to another machine."""
+
+NAMED = 3
+"""Number of photos that a message names."""
+
+
+class Photo(NamedTuple):
+    """A photo of a run: digests of its pixels and of its mask (empty without one), and the numbers of its camera."""
+
+    pixels: str
+    mask: str
+    camera: list[float]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a run trains on.
+
+    train, test: photos by name; points: digest of points and colours, empty without points; device: its platform,
+    name and driver version.
+    """
+
+    train: dict[str, Photo] = field(default_factory=dict)
+    test: dict[str, Photo] = field(default_factory=dict)
+    points: str = ""
+    device: str = ""
+
+    @classmethod
+    def of(cls, scene: Scene, device: "Device") -> "Inputs":
+        """The inputs of a training of a scene on a device."""
+        train, test = ({view.name: _photo(view, scene) for view in part} for part in (scene.train, scene.test))
+        points = _digest(scene.points, scene.colors) if len(scene.points) else ""
+        return cls(train, test, points, f"{device.label}, driver {device.cl_device.driver_version.strip()}")
+
+    @classmethod
+    def restored(cls, saved: dict[str, Any]) -> "Inputs":
+        """Inputs from their fields, as JSON gives them; any other value raises TypeError, ValueError or KeyError."""
+        train, test = (
+            {
+                name: Photo(str(pixels), str(mask), [float(x) for x in camera])
+                for name, (pixels, mask, camera) in saved.pop(part).items()
+            }
+            for part in ("train", "test")
+        )
+        return cls(train, test, **{name: str(value) for name, value in saved.items()})
+
+    def continued(self, now: "Inputs", path: Path) -> "Inputs":
+        """The inputs of a run that goes on from these.
+
+        Parameters
+        ----------
+        now : Inputs
+            Those that are there now. A scene without points does not differ in them: only the start needed them, and
+            a run that goes on does not triangulate them again.
+        path : Path
+            The checkpoint, for the message.
+
+        Raises
+        ------
+        InputError
+            If anything but the device differs; the message says what.
+
+        Warns
+        -----
+        UserWarning
+            If the device differs.
+        """
+        if found := self._differences(now):
+            raise InputError(
+                f"{path}: expected the dataset it was made with, found {', and '.join(found)}; name that dataset, or "
+                "start a new run in another folder"
+            )
+        if now.device != self.device:
+            warnings.warn(
+                f"the checkpoint was made on {self.device}; the run continues on {now.device}: its bits will differ "
+                "from those of an uninterrupted run",
+                stacklevel=2,
+            )
+        return replace(now, points=now.points or self.points)
+
+    def _differences(self, now: "Inputs") -> list[str]:
+        old, new = self.train | self.test, now.train | now.test
+        both = sorted(old.keys() & new.keys())
+        differing = {
+            "fewer photos": sorted(old.keys() - new.keys()),
+            "more photos": sorted(new.keys() - old.keys()),
+            "another choice of held-out photos": [name for name in both if (name in self.test) != (name in now.test)],
+            "other pixels": [name for name in both if old[name].pixels != new[name].pixels],
+            "other masks": [name for name in both if old[name].mask != new[name].mask],
+            "other cameras": [name for name in both if not _same_camera(old[name].camera, new[name].camera)],
+        }
+        found = [f"{what} ({_some(names)})" for what, names in differing.items() if names]
+        return found + ["other points"] * bool(now.points and now.points != self.points)
+
+
+def _photo(view: View, scene: Scene) -> Photo:
+    c = view.camera
+    numbers = [get_args(CameraModel).index(c.model), c.fx, c.fy, c.cx, c.cy, c.width, c.height, *c.distortion, c.near]
+    pixels = _digest(view.image) if view.clear is None else _digest(view.image, view.clear)
+    mask = "" if view.mask is None else _digest(view.mask)
+    return Photo(pixels, mask, [float(x) for x in (*numbers, *c.viewmat[:3].flat, *scene.offset)])
+
+
+def _digest(*arrays: NDArray[Any]) -> str:
+    result = blake2b(digest_size=DIGEST_BYTES)
+    for array in arrays:
+        result.update(f"{array.dtype.str}{array.shape}".encode())
+        result.update(np.ascontiguousarray(array).data)
+    return result.hexdigest()
+
+
+def _same_camera(a: list[float], b: list[float]) -> bool:
+    return len(a) == len(b) and np.allclose(a, b, rtol=CAMERA_TOLERANCE, atol=CAMERA_TOLERANCE)
+
+
+def _some(names: list[str]) -> str:
+    left_out = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {left_out} more" if left_out > 0 else "")
