@@ -19,6 +19,7 @@ from clsplat.commands.rendering import Eval, Render
 from clsplat.commands.train import Demo, Train
 from clsplat.commands.viewing import View
 from clsplat.errors import ClsplatError, InputError, driver_errors
+from clsplat.ranges import check
 
 BENCHMARKS = (
     Annotated[Kernels, tyro.conf.subcommand("kernels")]
@@ -91,5 +92,6 @@ def run(arguments: list[str]) -> None:
         # Parsed again, with the settings of the preset or file as the defaults, which flags then override.
         start = replace(command, settings=base)
         command = tyro.cli(Train, prog="clsplat train", args=arguments[1:], default=start)
+    check(command)
     with driver_errors():
         command.run()

@@ -4,6 +4,7 @@ from collections.abc import Callable, Container
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clsplat import ranges
 from clsplat.config import TrainConfig
 from clsplat.errors import DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians
@@ -15,7 +16,6 @@ from clsplat.training.autosize.reduction import without_useless_bands
 from clsplat.training.autosize.search import search_size
 from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
-from clsplat.training.densify import STRATEGIES
 from clsplat.training.preparation import open_device
 from clsplat.training.recorder import LOG, Recorder, log_file
 from clsplat.training.session import Training
@@ -68,8 +68,8 @@ def train(
     Raises
     ------
     InputError
-        If the scene has no photos to train on, the strategy is unknown, the price is negative, or the checkpoint is
-        of another configuration.
+        If a setting is out of range, the scene has no photos to train on, or the checkpoint is of another
+        configuration.
     DeviceError
         If the device's memory, or its limit, is exceeded.
     ClsplatError
@@ -101,10 +101,9 @@ def train(
 
 def check(scene: Scene, config: TrainConfig) -> None:
     """Raise an InputError if the configuration cannot train the scene."""
-    if config.strategy not in STRATEGIES:
-        raise InputError(f"--strategy: expected one of {', '.join(STRATEGIES)}, found {config.strategy!r}")
-    if not config.size_price >= 0:
-        raise InputError(f"--size-price: expected 0 or more, found {config.size_price}")
+    ranges.check(config)
+    if config.iterations < 1:
+        raise InputError(f"--iterations: expected 1 or more to train, found {config.iterations}")
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
 

@@ -235,9 +235,9 @@ def test_of_two_models_the_larger_is_taken(photos, tmp_path):
     ("options", "message"),
     [
         ({"matching": "random"}, "matching"),
-        ({"camera_model": "PINBALL"}, "camera_model.*SIMPLE_RADIAL"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model"),
-        ({"max_image_size": 0}, "max_image_size"),
+        ({"camera_model": "PINBALL"}, "--sfm.camera-model.*SIMPLE_RADIAL"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "--sfm.camera-model"),
+        ({"max_image_size": 0}, "--sfm.max-image-size"),
     ],
 )
 def test_bad_options_are_refused(solved, options, message):

@@ -218,11 +218,6 @@ def test_the_cap_holds_in_every_iteration(
     assert 0 < len(initial_state(scene, config).gaussians) <= min(cap, 40)
 
 
-def test_a_cap_of_none_is_refused(scene: Scene, device: Device, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--max-gaussians: expected at least 1, found 0"):
-        train(scene, replace(CONFIG, max_gaussians=0), tmp_path, device)
-
-
 @pytest.mark.parametrize("optimizer", ["device", "numpy"])
 def test_noise_and_penalties_are_part_of_a_step(
     scene: Scene, device: Device, tmp_path: Path, optimizer: Literal["device", "numpy"]
@@ -325,17 +320,6 @@ def test_each_round_surveys_photos_of_its_own(
     assert shares == [5 / len(scene.train)] * 4
     assert len({tuple(sorted(names)) for names in rounds}) > 1
     assert set().union(*rounds) <= {view.name for view in scene.train}
-
-
-def test_an_unknown_strategy_is_refused(scene: Scene, device: Device, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"--strategy: expected one of {', '.join(STRATEGIES)}, found 'best'"):
-        train(scene, replace(CONFIG, strategy="best"), tmp_path, device)
-
-
-@pytest.mark.parametrize("price", [-1.0, float("nan")])
-def test_a_price_that_is_none_is_refused(price: float, scene: Scene, device: Device, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"--size-price: expected 0 or more, found {price}"):
-        train(scene, replace(CONFIG, size_price=price), tmp_path, device)
 
 
 def test_a_search_starts_from_few_random_gaussians() -> None:

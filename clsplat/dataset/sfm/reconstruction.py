@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from clsplat.config import SfmConfig
-from clsplat.dataset.lenses import camera_models
 
 # This also imports Pillow before pycolmap. Loaded after pycolmap 4.2.1, Pillow uses parts of the zlib inside pycolmap
 # and crashes when it writes a PNG.
@@ -34,6 +33,7 @@ from clsplat.dataset.photos import (
 )
 from clsplat.dataset.sfm.matching import SEED, extract, is_sliver, match, quiet
 from clsplat.errors import InputError
+from clsplat.ranges import check
 
 RECORD = "clsplat_sfm.json"
 """Name of the file next to the model's folder ``0`` that records the photos and options from which the model was
@@ -60,7 +60,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         return None
     try:
         record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        SfmConfig(**record["options"])
+        check(SfmConfig(**record["options"]))
         if not isinstance(record["hashes"], dict) or not isinstance(record["registered"], int):
             raise TypeError("hashes or registered of another type")
         return {**record, "photos": str(record["photos"])}
@@ -95,17 +95,17 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
     Raises
     ------
     InputError
-        If there are too few photos, one is damaged, too few can be registered, or the output folder cannot be written
-        or holds a model from elsewhere.
+        If an option is out of range, there are too few photos, one is damaged, too few can be registered, or the
+        output folder cannot be written or holds a model from elsewhere.
     """
+    check(config, "sfm.")
     photos = Path(photos)
     output = photos if output is None else Path(output)
     if not photos.is_dir():
         raise InputError(f"{photos}: expected a folder of photos, found {'a file' if photos.exists() else 'nothing'}")
     folder, names = photo_folder(photos), list_photos(photos)
-    if len(names) < max(config.min_registered, 2):
-        raise InputError(f"{folder}: expected at least {max(config.min_registered, 2)} photos, found {len(names)}")
-    _check_options(config)
+    if len(names) < config.min_registered:
+        raise InputError(f"{folder}: expected at least {config.min_registered} photos, found {len(names)}")
     hashes = {name: hashlib.blake2b((folder / name).read_bytes(), digest_size=16).hexdigest() for name in names}
     model = output / "sparse" / "0"
     registered = _registered_before(output, hashes, config)
@@ -151,15 +151,6 @@ def _registered_before(output: Path, hashes: dict[str, str], config: SfmConfig) 
     return int(record["registered"]) if made_with == config else None
 
 
-def _check_options(config: SfmConfig) -> None:
-    if config.matching not in ("auto", "exhaustive", "sequential"):
-        raise InputError(f"matching: expected auto, exhaustive or sequential, found {config.matching!r}")
-    if config.camera_model not in camera_models():
-        raise InputError(f"camera_model: expected one of {', '.join(camera_models())}, found {config.camera_model!r}")
-    if config.max_image_size < 1:
-        raise InputError(f"max_image_size: expected a number of pixels, found {config.max_image_size}")
-
-
 def _matched(config: SfmConfig, folder: Path) -> SfmConfig:
     """Resolve `matching` "auto" for the photos in `folder`."""
     if config.matching != "auto":
@@ -168,10 +159,10 @@ def _matched(config: SfmConfig, folder: Path) -> SfmConfig:
 
 
 def _check_registered(registered: int, count: int, photos: Path, config: SfmConfig) -> None:
-    if registered < max(config.min_registered, 2):
+    if registered < config.min_registered:
         raise InputError(
             f"cannot recover the cameras of {photos}: found the poses of {registered} of {count} photos, expected at "
-            f"least {max(config.min_registered, 2)}; take more photos: sharp, overlapping by two thirds, from "
+            f"least {config.min_registered}; take more photos: sharp, overlapping by two thirds, from "
             "different positions, of a scene with texture"
         )
 
@@ -248,7 +239,7 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
     match(database, pairs, verbose)
 
     options = pycolmap.IncrementalPipelineOptions(
-        min_model_size=max(config.min_registered, 2), random_seed=SEED, num_threads=1
+        min_model_size=config.min_registered, random_seed=SEED, num_threads=1
     )
     (work / "models").mkdir()
     with tqdm(total=len(names), desc="poses", unit="photo", dynamic_ncols=True) as bar:
