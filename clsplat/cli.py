@@ -1,7 +1,9 @@
 """The command line: choose a command of `clsplat.commands`, run it, print errors as one sentence."""
 
 import os
+import signal
 import sys
+import threading
 import traceback
 import warnings
 from dataclasses import dataclass, replace
@@ -69,6 +71,8 @@ def main(arguments: list[str] | None = None) -> None:
     warnings.showwarning = lambda message, *_, **__: warn(f"warning: {message}")
     if os.environ.get("NO_COLOR"):  # no-color.org
         tyro._experimental_options["ansi_codes"] = False
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, terminate)
     try:
         run(sys.argv[1:] if arguments is None else arguments)
     except (ClsplatError, OSError) as error:
@@ -82,6 +86,12 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         warn("clsplat: interrupted")
         sys.exit(130)
+
+
+def terminate(*_: object) -> None:
+    """End the program after its clean-up, as Ctrl-C does; its status is that of a process that SIGTERM ended."""
+    warn("clsplat: terminated")
+    sys.exit(128 + signal.SIGTERM)
 
 
 def run(arguments: list[str]) -> None:

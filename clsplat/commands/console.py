@@ -7,12 +7,11 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, unwritable
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -65,15 +64,12 @@ def try_folder(out: Path) -> None:
     """Raise an InputError if a folder cannot be created or no file can be written in it; nothing new remains."""
     missing = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     new_folder(out)
-    try:
-        with TemporaryFile(dir=out) as file:
-            file.write(b"clsplat")
-    except OSError as error:
-        raise InputError(f"cannot write to {out}: {error.strerror or error}") from error
-    finally:
-        for folder in missing:
-            with suppress(OSError):
-                folder.rmdir()
+    problem = unwritable(out)
+    for folder in missing:
+        with suppress(OSError):
+            folder.rmdir()
+    if problem:
+        raise InputError(f"cannot write to {out}: {problem}")
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -174,7 +174,7 @@ def _read_dataset(path: Path, config: DataConfig, verbose: bool) -> Dataset:
         )
     photos, options = path, config.sfm
     if record is not None:
-        photos = path / record["photos"]
+        photos = sfm.recorded_photos(path, record)
         # Cameras that were recovered with other options are kept, unless options are given now.
         options = options if options != SfmConfig() else SfmConfig(**record["options"])
     model = sfm.reconstruct(photos, options, path, verbose)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat import ranges
 from clsplat.config import TrainConfig
-from clsplat.errors import DeviceError, InputError, driver_errors
+from clsplat.errors import BuildError, DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import without_invisible
 from clsplat.renderer import fetch
@@ -51,10 +51,10 @@ def train(
     resume : bool
         Continue from the checkpoint in `out`, to the same bits as a run that was never interrupted.
     evaluate : callable, optional
-        Called every `config.eval_every` iterations with the Gaussians, on the device; what it returns is logged. Its
-        time does not count.
+        Called every `config.eval_every` iterations with the Gaussians, on the device, and at the end with those that
+        are returned; what it returns is logged. Its time does not count.
     evaluate_after : container of int, optional
-        Iterations after which `evaluate` is called instead.
+        Iterations after which `evaluate` is called instead; not at the end.
     progress : callable
         Called after every iteration with iteration, loss, num_gaussians and gaussians, which are the ones that train
         and must not be changed. Its time does not count. If it raises KeyboardInterrupt, a checkpoint is written
@@ -84,6 +84,9 @@ def train(
     out, device = Path(out), device or open_device(config)
     state = load_state(out / CHECKPOINT, scene.extent, config) if resume else initial_state(scene, config)
     training = Training(scene, config, device, state)
+    evaluates_end = evaluate is not None and evaluate_after is None and state.iteration < config.iterations
+    if evaluate_after is None and config.eval_every:
+        evaluate_after = range(config.eval_every, config.iterations, config.eval_every)
     with log_file(out / LOG, state.iteration) as log:
         recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
         try:
@@ -92,11 +95,20 @@ def train(
                     search_size(training, recorder.after, recorder.after_fork)
                 training.run_until(config.iterations, recorder.after)
         except DeviceError as error:
+            less = "" if isinstance(error, BuildError) else ", and a lower --memory-limit stops growth earlier"
             raise DeviceError(
                 f"iteration {training.state.iteration + 1}: {error}; the last checkpoint in {out}, if there is one, "
-                "is intact: --resume continues from it, and a lower --memory-limit stops growth earlier"
+                f"is intact: --resume continues from it{less}"
             ) from error
-    return finish(training, out)
+        gaussians = finish(training, out)
+        if evaluate and evaluates_end:
+            ended = {
+                "iteration": config.iterations,
+                "num_gaussians": len(gaussians),
+                "seconds": training.state.seconds,
+            }
+            log(ended | evaluate(gaussians))
+    return gaussians
 
 
 def check(scene: Scene, config: TrainConfig) -> None:

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -321,6 +322,20 @@ def test_bad_scenes(trained: Path, dataset: Path, tmp_path: Path, capsys: pytest
     assert "bad.ply" in fails(capsys, "export", bad, "-o", tmp_path / "out.ply")
     assert "suffix" in fails(capsys, "export", trained / "scene.ply", "-o", tmp_path / "out.obj")
     assert not (tmp_path / "out.ply").exists()
+
+
+def test_a_folder_is_no_scene(
+    trained: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = "expected a file of Gaussians, such as scene.ply, found a folder"
+    message = fails(capsys, "eval", trained, dataset, "-o", tmp_path / "eval")
+    assert message == f"clsplat: {trained}: {expected}; the scene in it is {trained / 'scene.ply'}"
+    original = tmp_path / "run" / "point_cloud" / "iteration_7000"
+    original.mkdir(parents=True)
+    shutil.copyfile(trained / "scene.ply", original / "point_cloud.ply")
+    message = fails(capsys, "eval", tmp_path / "run", dataset, "-o", tmp_path / "eval")
+    assert message.endswith(f"the scene in it is {original / 'point_cloud.ply'}")
+    assert fails(capsys, "eval", dataset, dataset, "-o", tmp_path / "eval").endswith(expected)
 
 
 def test_unknown_device_lists_the_known(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

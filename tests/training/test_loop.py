@@ -165,7 +165,8 @@ def test_it_is_evaluated_when_asked(
         return {"psnr": float(len(seen))}
 
     config = replace(CONFIG, eval_every=20)
-    train(scene, config, tmp_path, device, evaluate=evaluate, evaluate_after=after)
+    result = train(scene, config, tmp_path, device, evaluate=evaluate, evaluate_after=after)
+    assert after is not None or seen[-1] is result  # as saved, not as it was before the last step of the training
     log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [record["iteration"] for record in log if "psnr" in record] == expected
     assert len(seen) == len(expected)
