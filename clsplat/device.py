@@ -147,7 +147,7 @@ class Device:
         memory_limit: int | None = None,
         model: Mapping[str, float] = {},
     ):
-        if not isinstance(cl_device, cl.Device | None):
+        if cl_device is not None and not hasattr(cl_device, "extensions"):
             raise InputError(f"cl_device: expected a device, such as select_device(name), found {cl_device!r:.60}")
         unknown = sorted(set(model) - set(MODEL_CONSTANTS))
         if unknown:
