@@ -1,7 +1,9 @@
 """The command line: choose a command of `clsplat.commands`, run it, print errors as one sentence."""
 
 import os
+import signal
 import sys
+import threading
 import traceback
 import warnings
 from dataclasses import dataclass, replace
@@ -19,6 +21,7 @@ from clsplat.commands.rendering import Eval, Render
 from clsplat.commands.train import Demo, Train
 from clsplat.commands.viewing import View
 from clsplat.errors import ClsplatError, InputError, driver_errors
+from clsplat.ranges import check
 
 BENCHMARKS = (
     Annotated[Kernels, tyro.conf.subcommand("kernels")]
@@ -68,6 +71,8 @@ def main(arguments: list[str] | None = None) -> None:
     warnings.showwarning = lambda message, *_, **__: warn(f"warning: {message}")
     if os.environ.get("NO_COLOR"):  # no-color.org
         tyro._experimental_options["ansi_codes"] = False
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, terminate)
     try:
         run(sys.argv[1:] if arguments is None else arguments)
     except (ClsplatError, OSError) as error:
@@ -83,6 +88,12 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
 
 
+def terminate(*_: object) -> None:
+    """End the program after its clean-up, as Ctrl-C does; its status is that of a process that SIGTERM ended."""
+    warn("clsplat: terminated")
+    sys.exit(128 + signal.SIGTERM)
+
+
 def run(arguments: list[str]) -> None:
     """Parse the arguments and run the command."""
     arguments = set_loudness(arguments)
@@ -91,5 +102,6 @@ def run(arguments: list[str]) -> None:
         # Parsed again, with the settings of the preset or file as the defaults, which flags then override.
         start = replace(command, settings=base)
         command = tyro.cli(Train, prog="clsplat train", args=arguments[1:], default=start)
+    check(command)
     with driver_errors():
         command.run()

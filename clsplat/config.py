@@ -6,9 +6,20 @@ from typing import Annotated, Literal
 import tyro
 
 from clsplat.constants import TILE
+from clsplat.ranges import byte_size, name_in, within
 
 Mode = Literal["classic", "antialiased"]
 Background = Literal["black", "white"]
+
+# The ranges of most fields. `clsplat.ranges.check` checks them.
+Count = Annotated[int, within(least=1)]
+Fraction = Annotated[float, within(least=0, most=1)]
+PartialFraction = Annotated[float, within(least=0, below=1)]
+Positive = Annotated[float, within(above=0)]
+NonNegative = Annotated[float, within(least=0)]
+
+INT32_MAX, UINT32_MAX, UINT64_MAX = 2**31 - 1, 2**32 - 1, 2**64 - 1
+"""Largest integers of COLMAP's options, of indices and counters on the device, and of the keys of random numbers."""
 
 SHORT_RUN = 7000
 """Iterations of the paper's shorter setting (table 1, "7K"). In shorter runs its intervals are shortened in
@@ -35,7 +46,7 @@ class RenderConfig:
     within each tile afterwards (per_tile). Both give the same image; auto takes global, which was faster wherever it
     was measured. pixel sorts in each pixel by the points where its ray meets the Gaussians: nothing pops when the
     camera turns, but it is slower (StopThePop)."""
-    near: float | None = None
+    near: Annotated[float | None, within(above=0)] = None
     """Depth up to which nothing is drawn, world units. Default: three tenths of the depth of the nearest points in
     each photo for a dataset's cameras, 0.01 for others. Without it, Gaussians very close to a camera spread over its
     whole image."""
@@ -48,13 +59,13 @@ class SfmConfig:
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Pairs of photos that are matched. exhaustive: all. sequential: neighbours by file name. auto: sequential for
     frames that clsplat extracted from a video, exhaustive otherwise."""
-    camera_model: str = "OPENCV"
+    camera_model: Annotated[str, name_in("clsplat.dataset.lenses:camera_models")] = "OPENCV"
     """COLMAP camera model to fit; photos are undistorted when they are loaded."""
     single_camera: bool = True
     """All photos were taken by one camera with one focal length; otherwise each photo has its own intrinsics."""
-    max_image_size: int = 1600
+    max_image_size: Annotated[int, within(least=1, most=INT32_MAX)] = 1600
     """Longer edge of the photos in which features are detected, px."""
-    min_registered: int = 3
+    min_registered: Annotated[int, within(least=2, most=INT32_MAX)] = 3
     """Fewest registered photos; fewer are an error."""
 
 
@@ -65,7 +76,7 @@ class DataConfig:
     downscale: Literal[1, 2, 4, 8] = 1
     """Factor by which the photos' edges are divided: the folder images_2, images_4 or images_8 is read if it exists,
     otherwise the photos are resampled."""
-    test_every: int = 8
+    test_every: Annotated[int, within(least=0)] = 8
     """Every n-th photo by name is held out (0: none). Ignored where the dataset has a split of its own."""
     background: Background = "black"
     """Colour behind the scene and behind transparent photos."""
@@ -86,13 +97,13 @@ class InitConfig:
 
     triangulate: bool = True
     """Triangulate points from the photos where the dataset has poses but no points; otherwise the start is random."""
-    random_points: int | None = None
+    random_points: Annotated[int | None, within(least=1, most=UINT32_MAX)] = None
     """Number of Gaussians of a random start, where there are no points. Default: 100 000 (original), or 10 000 with
     --size auto, which adds more where they are needed."""
-    random_extent: float = 1 / 3
+    random_extent: Positive = 1 / 3
     """Half edge of the box of a random start, as a fraction of the cameras' mean distance from the point they look
     at. For NeRF-synthetic scenes (distance 4) the box is that of the original within 3 %."""
-    opacity: float | None = None
+    opacity: Annotated[float | None, within(above=0, below=1)] = None
     """Opacity of the first Gaussians. Default: the strategy's, which is 0.1 for adc, 0.5 for mcmc and error."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """Highest degree of the spherical harmonics."""
@@ -103,39 +114,39 @@ class OptimConfig:
     """Adam and its learning rates. Those of the Gaussians, but for the opacities, are twice the original's, for runs
     of fewer iterations; the presets named after papers have the original's."""
 
-    means_lr: float = 3.2e-4
+    means_lr: Positive = 3.2e-4
     """Learning rate of the means at the start, in extents of the scene."""
-    means_lr_final: float = 3.2e-6
+    means_lr_final: Positive = 3.2e-6
     """Learning rate of the means at the last iteration; it changes exponentially in between."""
-    log_scales_lr: float = 1e-2
+    log_scales_lr: NonNegative = 1e-2
     """Learning rate of the logarithms of the scales."""
-    quats_lr: float = 2e-3
+    quats_lr: NonNegative = 2e-3
     """Learning rate of the quaternions."""
-    logit_opacities_lr: float = 5e-2
+    logit_opacities_lr: NonNegative = 5e-2
     """Learning rate of the logits of the opacities."""
-    sh0_lr: float = 5e-3
+    sh0_lr: NonNegative = 5e-3
     """Learning rate of the spherical harmonics of degree 0."""
-    sh_rest_lr: float = 5e-3 / 20
+    sh_rest_lr: NonNegative = 5e-3 / 20
     """Learning rate of the spherical harmonics of degree 1 and above."""
-    beta1: float = 0.9
+    beta1: PartialFraction = 0.9
     """Decay rate of Adam's mean of the gradients."""
-    beta2: float = 0.999
+    beta2: PartialFraction = 0.999
     """Decay rate of Adam's mean of the squared gradients."""
-    eps: float = 1e-15
+    eps: Positive = 1e-15
     """Term that Adam adds to the root of the mean square."""
-    ssim_weight: float = 0.2
+    ssim_weight: Fraction = 0.2
     """Weight lambda in the loss (1 - lambda) L1 + lambda (1 - SSIM) (paper, equation 7)."""
-    sh_degree_every: int = 1000
+    sh_degree_every: Count = 1000
     """Iterations after which the degree of the trained spherical harmonics rises by one; fewer in short runs."""
-    erank_penalty: float = 0.0
+    erank_penalty: NonNegative = 0.0
     """Weight in the loss of the penalty of needles: the mean over Gaussians of max(-ln(effective rank - 1), 0)."""
-    exposure_lr: float = 1e-2
+    exposure_lr: Positive = 1e-2
     """Learning rate of the photos' exposures at the start (original code)."""
-    exposure_lr_final: float = 1e-3
+    exposure_lr_final: Positive = 1e-3
     """Learning rate of the exposures at the last iteration; it changes exponentially in between."""
-    poses_lr: float = 1e-3
+    poses_lr: Positive = 1e-3
     """Learning rate of the photos' poses at the start: radians, and extents of the scene."""
-    poses_lr_final: float = 1e-5
+    poses_lr_final: Positive = 1e-5
     """Learning rate of the poses at the last iteration; it changes exponentially in between."""
 
 
@@ -146,7 +157,7 @@ class CoarseConfig:
 
     factor: Literal[1, 2, 4, 8] = 1
     """Divisor of the photos' edges at the start; it is halved at equal intervals. 1: no smaller photos."""
-    until: float = 0.5
+    until: Fraction = 0.5
     """Fraction of the iterations after which photos have their full size."""
 
 
@@ -154,27 +165,27 @@ class CoarseConfig:
 class AdcConfig:
     """Adaptive density control (paper, section 5.2; the original's values)."""
 
-    start: int = 500
+    start: Annotated[int, within(least=0)] = 500
     """First iteration after which Gaussians are added or removed; earlier in short runs."""
-    stop_fraction: float = 0.5
+    stop_fraction: Fraction = 0.5
     """Fraction of the iterations after which the number of Gaussians is fixed."""
-    every: int = 100
+    every: Count = 100
     """Iterations between two rounds."""
-    grad_threshold: float = 2e-4
+    grad_threshold: NonNegative = 2e-4
     """Mean norm of the positional gradient, in normalised device coordinates, from which a Gaussian is densified."""
-    scale_threshold: float = 0.01
+    scale_threshold: NonNegative = 0.01
     """Largest scale of a Gaussian, in extents of the scene, up to which it is cloned and above which it is split."""
-    opacity_min: float = 0.005
+    opacity_min: PartialFraction = 0.005
     """Opacity below which Gaussians are removed."""
-    scale_max: float = 0.1
+    scale_max: NonNegative = 0.1
     """Scale, in extents of the scene, above which Gaussians are removed once opacities have been reset."""
-    reset_every: int = 3000
+    reset_every: Count = 3000
     """Iterations between two resets of the opacities."""
-    reset_opacity: float = 0.01
+    reset_opacity: Annotated[float, within(above=0, below=1)] = 0.01
     """Largest opacity after a reset; above ALPHA_MIN, so that gradients do not vanish."""
-    opacity_decay: float = 0.0
+    opacity_decay: PartialFraction = 0.0
     """Fraction by which each round lowers the opacities. Above 0 it replaces the resets, which disturb the image."""
-    min_gaussians: int = 16
+    min_gaussians: Count = 16
     """Fewest Gaussians that pruning leaves."""
 
 
@@ -182,25 +193,25 @@ class AdcConfig:
 class McmcConfig:
     """3D Gaussian Splatting as Markov chain Monte Carlo (Kheradmand et al. 2024; the original's values)."""
 
-    start: int = 500
+    start: Annotated[int, within(least=0)] = 500
     """First iteration after which Gaussians are relocated or added; earlier in short runs."""
-    stop_fraction: float = 0.83
+    stop_fraction: Fraction = 0.83
     """Fraction of the iterations after which Gaussians are no longer relocated or added (gsplat: 25 000 of 30
     000)."""
-    every: int = 100
+    every: Count = 100
     """Iterations between two rounds."""
-    growth: float = 0.05
+    growth: NonNegative = 0.05
     """Gaussians added per round, as a fraction of all; more if the cap would otherwise be reached too late."""
-    full_fraction: float = 0.25
+    full_fraction: Fraction = 0.25
     """Fraction of the iterations by which the cap is reached (original: 5200 of 30 000, for 1 million)."""
-    opacity_min: float = 0.005
+    opacity_min: PartialFraction = 0.005
     """Opacity up to which a Gaussian is dead and is relocated to a live one."""
-    noise_lr: float = 1e7
+    noise_lr: NonNegative = 1e7
     """Strength of the noise on the means, in units of their learning rate and per squared extent of the scene
     (original: 5e5 in world units, at an extent of 4.5)."""
-    opacity_penalty: float = 0.01
+    opacity_penalty: NonNegative = 0.01
     """Weight of the mean opacity in the loss."""
-    scale_penalty: float = 0.045
+    scale_penalty: NonNegative = 0.045
     """Weight of the mean scale, in extents of the scene, in the loss (original: 0.01 in world units, at an extent of
     4.5)."""
 
@@ -210,26 +221,26 @@ class ErrorConfig:
     """Growth to a cap where the photos' errors are (sources: clsplat.training.densify.error_guided; values measured:
     docs/howto/strategies.md)."""
 
-    start: int = 500
+    start: Annotated[int, within(least=0)] = 500
     """First iteration after which Gaussians are split or removed; earlier in short runs."""
-    stop_fraction: float = 0.8
+    stop_fraction: Fraction = 0.8
     """Fraction of the iterations after which Gaussians are no longer split or removed."""
-    every: int = 100
+    every: Count = 100
     """Iterations between two rounds."""
-    growth: float = 0.05
+    growth: NonNegative = 0.05
     """Gaussians added per round, as a fraction of all; more if the cap would otherwise be reached too late."""
-    full_fraction: float = 0.4
+    full_fraction: Fraction = 0.4
     """Fraction of the iterations by which the cap is reached."""
-    views: int = 10
+    views: Count = 10
     """Photos rendered per round to locate the errors."""
-    opacity_min: float = 0.005
+    opacity_min: PartialFraction = 0.005
     """Opacity up to which Gaussians are removed."""
-    replaced: float = 0.02
+    replaced: Fraction = 0.02
     """Fraction of the Gaussians that are replaced in each round at the cap: those whose removal changes the squared
     error of the photos least."""
-    replaced_most: float = 0.05
+    replaced_most: Fraction = 0.05
     """Largest fraction that is replaced, if the removal of that many lowers the error."""
-    opacity_penalty: float = 0.01
+    opacity_penalty: NonNegative = 0.01
     """Weight of the mean opacity in the loss. Faint Gaussians that no photo needs vanish; otherwise they cover
     cameras that stand where no photo was taken."""
 
@@ -238,13 +249,13 @@ class ErrorConfig:
 class FewViewsConfig:
     """Settings for few photos (reasons: clsplat.training.few_views; effects: docs/stability.md)."""
 
-    below: int = 9
+    below: Annotated[int, within(least=0)] = 9
     """Number of training photos below which the other settings of this group apply (0: never)."""
-    dropout: float = 0.2
+    dropout: PartialFraction = 0.2
     """Fraction of the splats left out of each image at the end of the training (DropGaussian)."""
     sh_degree: Literal[0, 1, 2, 3] = 1
     """Highest degree of the spherical harmonics."""
-    growth: float = 2.0
+    growth: Positive = 2.0
     """Largest number of Gaussians, as a multiple of the scene's points."""
 
 
@@ -252,27 +263,27 @@ class FewViewsConfig:
 class TrainConfig:
     """Settings of a training; saved as ``config.json``, from which it can be repeated."""
 
-    iterations: int = 0
+    iterations: Annotated[int, within(least=0, most=UINT32_MAX)] = 0
     """Optimisation steps. 0: 30 for each training photo, but at least 3000 and at most 30 000. In runs shorter than
     7000, the paper's shorter setting, the first densification and the bands of spherical harmonics come earlier in
     proportion."""
-    seed: int = 0
+    seed: Annotated[int, within(least=0, most=UINT64_MAX)] = 0
     """Seed of the random start, of the order of the photos and of the strategy's random numbers."""
     optimizer: Literal["device", "numpy"] = "device"
     """Adam in a kernel on the device, or in NumPy on the host (slower, the same to rounding)."""
-    strategy: str = "error"
-    """Densification strategy, a name of clsplat.training.densify.STRATEGIES; adc is the paper's."""
+    strategy: Annotated[str, name_in("clsplat.training.densify:STRATEGIES")] = "error"
+    """Densification strategy; adc is the paper's."""
     size: Literal["auto", "fixed"] = "auto"
     """auto: the number of Gaussians and the degree of the spherical harmonics are chosen by photos that are held back
     until the choice is made, and train afterwards (size.json explains it). fixed: the strategy alone decides, up to
     the cap."""
-    size_price: float = 0.05
+    size_price: NonNegative = 0.05
     """Gain of quality, dB, that a doubling of the Gaussians or of the bytes must bring; with --size auto. Quality is
     the mean of PSNR and of SSIM in decibels."""
-    max_gaussians: int | None = None
+    max_gaussians: Annotated[int | None, within(least=1, most=UINT32_MAX)] = None
     """Largest number of Gaussians in any iteration. A larger start is reduced to it. The strategies mcmc and error
     grow to it and need it with --size fixed."""
-    dropout: float = 0.0
+    dropout: PartialFraction = 0.0
     """Fraction of the splats left out of each image at the end of the training; it rises from 0."""
     exposure: bool = False
     """Learn an affine map of the colours of each training photo, for photos with different exposure or white
@@ -284,13 +295,13 @@ class TrainConfig:
     poses: bool = False
     """Refine the training photos' poses, where they are inaccurate. Held-out photos are then evaluated twice: with
     their given poses, and with each camera aligned with the scene."""
-    checkpoint_every: int = 1000
+    checkpoint_every: Count = 1000
     """Iterations between two checkpoints, from which an interrupted run resumes."""
-    eval_every: int = 500
+    eval_every: Annotated[int, within(least=0)] = 500
     """Iterations between two evaluations of the held-out photos for the training curve (0: none before the end)."""
     device: str | None = None
     """Part of the platform's or device's name. Default: PYOPENCL_CTX, or the first GPU, or a CPU."""
-    memory_limit: str | None = None
+    memory_limit: Annotated[str | None, byte_size()] = None
     """Limit of device memory, such as 4GB or 512MiB (default: all memory of the device). The number of Gaussians
     stops growing where more would exceed it. Photos that do not fit are uploaded each time they are needed."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)

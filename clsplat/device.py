@@ -147,6 +147,8 @@ class Device:
         memory_limit: int | None = None,
         model: Mapping[str, float] = {},
     ):
+        if cl_device is not None and not hasattr(cl_device, "extensions"):
+            raise InputError(f"cl_device: expected a device, such as select_device(name), found {cl_device!r:.60}")
         unknown = sorted(set(model) - set(MODEL_CONSTANTS))
         if unknown:
             raise InputError(f"model: expected names of {', '.join(MODEL_CONSTANTS)}, found {', '.join(unknown)}")
@@ -329,11 +331,7 @@ class Device:
 
     def program(self, stage: str, defines: dict[str, Any]) -> cl.Program:
         """Build cl/`stage`.cl with `defines`, the model's constants and the device's real type."""
-        options = list(BUILD_OPTIONS)
-        if self.real == np.float64:
-            options.append("-DUSE_DOUBLE")
-        else:
-            options.append("-cl-single-precision-constant")
+        options = [*BUILD_OPTIONS, "-DUSE_DOUBLE" if self.real == np.float64 else "-cl-single-precision-constant"]
         values = self._model | defines
         options += [
             f"-D{name}={value!r}" if isinstance(value, float) else f"-D{name}={value}"

@@ -3,9 +3,16 @@
 A wrong value: "NAME: expected X, found Y; what to do". A failed action: "cannot read X: reason; what to do".
 """
 
+import errno
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryFile, gettempdir
+
+PROBE = 2**22
+"""Bytes that `unwritable` writes: more than a file of a driver's compiler or an empty database of COLMAP has."""
 
 
 class ClsplatError(Exception):
@@ -20,6 +27,22 @@ class DeviceError(ClsplatError, RuntimeError):
     """There is no usable OpenCL device, its limits are exceeded, or its driver failed."""
 
 
+class BuildError(DeviceError):
+    """The kernels cannot be built."""
+
+
+def unwritable(folder: Path) -> str | None:
+    """The reason why no file of `PROBE` bytes can be written in a folder; None if one can be."""
+    try:
+        with TemporaryFile(dir=folder) as file:
+            file.write(bytes(PROBE))
+            file.flush()
+    except OSError as error:
+        limited = "; `ulimit -f` limits the size of files" if error.errno == errno.EFBIG else ""
+        return f"{error.strerror or error}{limited}"
+    return None
+
+
 @contextmanager
 def driver_errors() -> Iterator[None]:
     """Raise errors of the OpenCL driver in the block as DeviceError, such as a lost device or exhausted resources."""
@@ -30,4 +53,15 @@ def driver_errors() -> Iterator[None]:
         if cl is None or not isinstance(error, cl.Error):
             raise
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        if getattr(error, "code", None) == cl.status_code.BUILD_PROGRAM_FAILURE:
+            raise BuildError(_unbuilt(reason)) from error
         raise DeviceError(f"the OpenCL driver failed: {reason}") from error
+
+
+def _unbuilt(reason: str) -> str:
+    """Sentence about kernels that a driver could not build; its compiler needs space for files."""
+    caches = [os.environ.get(name) for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME")]
+    for folder in (Path(gettempdir()), Path.home() / ".cache", *(Path(cache) for cache in caches if cache)):
+        if folder.is_dir() and (problem := unwritable(folder)):
+            return f"cannot build the kernels: the driver's compiler writes files, and {folder} takes none: {problem}"
+    return f"cannot build the kernels: {reason}"

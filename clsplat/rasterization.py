@@ -113,6 +113,8 @@ def rasterization(
     channels = colors.shape[2] if sh_degree is None else 3
     behind = np.zeros((count, channels)) if backgrounds is None else np.asarray(backgrounds, dtype=np.float64)
     _check_shape("backgrounds", behind, (count, channels))
+    if not np.isfinite(behind).all():
+        raise InputError("backgrounds: expected finite numbers, found NaN or infinity")
 
     renderer = Renderer(device)
     placed = renderer.place(gaussians)

@@ -155,7 +155,8 @@ def render(
     Raises
     ------
     InputError
-        If the Gaussians' shapes do not fit each other, sh_degree exceeds what is stored, or `device` is another text.
+        If the Gaussians' shapes do not fit each other, sh_degree exceeds what is stored, a setting is out of range,
+        the background is not three finite numbers, or `device` is another text.
     DeviceError
         If there is no OpenCL device, or a buffer exceeds its limits.
     """

@@ -12,6 +12,7 @@ from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
+from clsplat.ranges import check
 from clsplat.scene import Color
 from clsplat.stages import Bins, Dropout, Image, SplatGrads, Splats, Stages
 
@@ -77,7 +78,7 @@ class Renderer:
     Raises
     ------
     InputError
-        If `device` is another text.
+        If `device` is another text, a setting is out of range, or the background is not three finite numbers.
     DeviceError
         If there is no OpenCL device where one is needed.
     """
@@ -88,6 +89,8 @@ class Renderer:
         config: RenderConfig = RenderConfig(),
         background: Color = BLACK,
     ):
+        check(config)
+        check_color("background", background)
         self.config, self.background = config, background
         self.device: Device | None = None
         self.stages: Stages = reference
@@ -217,6 +220,16 @@ class Renderer:
             camera_grad=camera_grad,
         )
         return Gradients(v_gaussians, v_splats.means2d, *(v_camera or (None, None)))
+
+
+def check_color(name: str, color: Any) -> None:
+    """Raise an InputError, which names the argument, if a colour is not three finite numbers."""
+    try:
+        usable = np.shape(color) == (3,) and bool(np.isfinite(np.asarray(color, np.float64)).all())
+    except (TypeError, ValueError):
+        usable = False
+    if not usable:
+        raise InputError(f"{name}: expected three finite numbers, RGB, found {color!r:.60}")
 
 
 @cache

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from clsplat.bench.workloads import DEFAULT, KNOBS_DEFAULT, Workload, from_files, scaling_names, synthetic
-from clsplat.config import DataConfig, RenderConfig
+from clsplat.config import UINT32_MAX, UINT64_MAX, Count, DataConfig, RenderConfig
 from clsplat.errors import ClsplatError, InputError
+from clsplat.ranges import byte_size, within
 
 if TYPE_CHECKING:
     from clsplat.bench.cells import Cell
@@ -32,14 +33,14 @@ class Kernels:
     """File of Gaussians to time instead; requires --cameras."""
     cameras: Path | None = None
     """Dataset with the views for --scene, as for `train`."""
-    views: int = 1
+    views: Count = 1
     """Number of views of the dataset, evenly spread. Each is a workload."""
     downscale: Literal[1, 2, 4, 8] = 1
     """Factor by which the dataset's photos are reduced, as for `train`."""
     scaling: Path | None = None
     """File for a chart of time against the numbers of Gaussians and pixels (.png, .svg, .pdf); its workloads are
     timed too."""
-    repeats: int = 15
+    repeats: Count = 15
     """Number of timed steps of each kind: whole, by stages, by kernels."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """JSON file for all results."""
@@ -53,7 +54,7 @@ class Kernels:
         from clsplat.bench.kernels import bench_kernels
         from clsplat.device import Device, select_device
 
-        _check(self.repeats, self.out, "--scaling", self.scaling)
+        _check(self.out, "--scaling", self.scaling)
         workloads = self._workloads()
         device = Device(select_device(self.device))
         _say(f"device: {device.label}")
@@ -85,11 +86,11 @@ class Knobs:
     """File of Gaussians to use instead; requires --cameras."""
     cameras: Path | None = None
     """Dataset with the views for --scene, as for `train`."""
-    views: int = 1
+    views: Count = 1
     """Number of views of the dataset, evenly spread. Each is a workload."""
     downscale: Literal[1, 2, 4, 8] = 1
     """Factor by which the dataset's photos are reduced, as for `train`."""
-    repeats: int = 7
+    repeats: Count = 7
     """Number of timed runs of each setting. They alternate with runs of the default."""
     chart: Path | None = None
     """File for a chart of error against time, for the first workload (.png, .svg, .pdf)."""
@@ -106,7 +107,7 @@ class Knobs:
         from clsplat.bench.knobs import bench_knobs
         from clsplat.device import Device, select_device
 
-        _check(self.repeats, self.out, "--chart", self.chart)
+        _check(self.out, "--chart", self.chart)
         files = _of_files(self.scene, self.cameras, self.views, self.downscale)
         device = Device(select_device(self.device))
         _say(f"device: {device.label}")
@@ -155,15 +156,15 @@ class Quality:
     budgets: tuple[str, ...] = ("own",)
     """Caps on the number of Gaussians: "own" for the method's cap, a factor of it such as x0.5, or a number such as
     40000."""
-    iterations: tuple[int, ...] = ()
+    iterations: Annotated[tuple[int, ...], within(least=1, most=UINT32_MAX)] = ()
     """Numbers of iterations; default: that of each method."""
-    seeds: tuple[int, ...] = ()
+    seeds: Annotated[tuple[int, ...], within(least=0, most=UINT64_MAX)] = ()
     """Seeds, each of which repeats all trainings; default: that of each method."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("clsplat-quality")
     """Folder for results.jsonl and the charts. Finished trainings in it are not repeated; failed ones are."""
     device: str | None = None
     """Part of the platform's or device's name."""
-    memory_limit: str | None = None
+    memory_limit: Annotated[str | None, byte_size()] = None
     """Largest device memory of a training, such as 4GB."""
 
     def run(self) -> None:
@@ -188,15 +189,15 @@ class Captures:
     fern:downscale=4."""
     methods: tuple[str, ...] = ("paper-7k", "auto")
     """Presets of `train`, or configuration files as for its --config."""
-    iterations: tuple[int, ...] = ()
+    iterations: Annotated[tuple[int, ...], within(least=1, most=UINT32_MAX)] = ()
     """Numbers of iterations; default: that of each method."""
-    seeds: tuple[int, ...] = (0, 1)
+    seeds: Annotated[tuple[int, ...], within(least=0, most=UINT64_MAX)] = (0, 1)
     """Seeds. The noise of a figure comes from repetitions with several of them."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("clsplat-captures")
     """Folder for results.jsonl and captures.md. Finished trainings in it are not repeated; failed ones are."""
     device: str | None = None
     """Part of the platform's or device's name."""
-    memory_limit: str | None = None
+    memory_limit: Annotated[str | None, byte_size()] = None
     """Largest device memory of a training, such as 4GB."""
 
     def run(self) -> None:
@@ -257,10 +258,8 @@ class Chart:
         _say(f"charts: {self.out / 'index.html'}")
 
 
-def _check(repeats: int, out: Path | None, chart_option: str, chart: Path | None) -> None:
+def _check(out: Path | None, chart_option: str, chart: Path | None) -> None:
     """Check arguments that would otherwise fail after minutes of measuring."""
-    if repeats < 1:
-        raise InputError(f"--repeats: expected 1 or more, found {repeats}")
     if chart is not None and chart.suffix.lower() not in CHART_SUFFIXES:
         raise InputError(f"{chart_option}: expected a file named *{', *'.join(CHART_SUFFIXES)}, found {chart}")
     for path in filter(None, (out, chart)):

@@ -1,10 +1,13 @@
 """Captures: variants of a scene that show whether a method fits the scene or only its training photos."""
 
 from dataclasses import asdict, dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
+from clsplat.config import Count, PartialFraction
 from clsplat.errors import InputError
+from clsplat.ranges import within
 from clsplat.scene import Scene
 
 PHOTOS_MIN = 3
@@ -13,28 +16,14 @@ PHOTOS_MIN = 3
 
 @dataclass(frozen=True)
 class Capture:
-    """Settings that turn a scene into a variant of it; the defaults leave the scene as it is.
+    """Settings that turn a scene into a variant of it; the defaults leave the scene as it is."""
 
-    Raises
-    ------
-    InputError
-        If a value is out of range.
-    """
-
-    thin: int = 1
+    thin: Count = 1
     """Train on every n-th training photo by name. The held-out photos stay the same."""
-    arc: float = 0.0
+    arc: PartialFraction = 0.0
     """Hold out this fraction of all photos instead of the usual ones: those nearest to the last one by name."""
-    points: float = 1.0
+    points: Annotated[float, within(above=0, most=1)] = 1.0
     """Start from this fraction of the sparse points."""
-
-    def __post_init__(self) -> None:
-        if self.thin < 1:
-            raise InputError(f"thin: expected 1 or more, found {self.thin}")
-        if not 0 <= self.arc < 1:
-            raise InputError(f"arc: expected a fraction of the photos, at least 0 and below 1, found {self.arc}")
-        if not 0 < self.points <= 1:
-            raise InputError(f"points: expected a fraction of the points, above 0 and at most 1, found {self.points}")
 
     @property
     def options(self) -> str:

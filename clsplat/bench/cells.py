@@ -167,15 +167,9 @@ def make_cells(
         If an argument is invalid, or two datasets or two methods have the same name.
     """
     iterations, cells = list(iterations), []
-    for number in iterations:
-        if number < 1:
-            raise InputError(f"--iterations: expected 1 or more, found {number}")
-    for given in (seeds := list(seeds)):
-        if given < 0:
-            raise InputError(f"--seeds: expected 0 or more, found {given}")
     named_sources = _distinct([parse_source(text) for text in dict.fromkeys(sources)], lambda s: s.name, "data")
     named_methods = _distinct([parse_method(text) for text in dict.fromkeys(methods)], lambda m: m[0], "--methods")
-    for of_cell in product(seeds or (None,), named_sources, named_methods, list(budgets)):
+    for of_cell in product(list(seeds) or (None,), named_sources, named_methods, list(budgets)):
         seed, source, (method, base), budget = of_cell
         for number in iterations or [base.iterations]:
             config = replace(

@@ -23,6 +23,7 @@ from clsplat.dataset.coverage import rare_pixels
 from clsplat.device import Device
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import Gaussians
+from clsplat.ranges import parse_bytes
 from clsplat.renderer import Renderer, fetch
 from clsplat.scene import Scene
 from clsplat.training.loop import train
@@ -163,8 +164,6 @@ def run_cell(
     rare : list of (H, W) bool, optional
         Pixels of each held-out photo whose PSNR is measured apart.
     """
-    from clsplat.training.memory import parse_bytes
-
     limit = None if config.memory_limit is None else parse_bytes(config.memory_limit, "--memory-limit")
     facts = _facts(scene, rare)
     at = sample_iterations(config.iterations)

@@ -115,13 +115,11 @@ def from_files(scene: Path, cameras: Path, views: int, data: DataConfig) -> list
     Raises
     ------
     InputError
-        If a file is missing or damaged, or `views` is less than 1.
+        If a file is missing or damaged.
     """
     from clsplat.dataset import load_scene
     from clsplat.formats import load_gaussians
 
-    if views < 1:
-        raise InputError(f"--views: expected 1 or more, found {views}")
     gaussians, mode, offset = load_gaussians(scene)
     dataset = load_scene(cameras, data)
     gaussians.means[:] = gaussians.means + (offset - dataset.offset)

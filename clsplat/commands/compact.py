@@ -11,6 +11,7 @@ import tyro
 from clsplat.commands.console import Out, moved, open_device, say
 from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
 from clsplat.errors import InputError
+from clsplat.ranges import byte_size, parse_bytes, within
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
@@ -33,11 +34,11 @@ class Compact:
     """File of Gaussians."""
     out: Out
     """File to write; its suffix determines the format."""
-    max_gaussians: int | None = None
+    max_gaussians: Annotated[int | None, within(least=1)] = None
     """Largest number of Gaussians."""
-    max_bytes: str | None = None
+    max_bytes: Annotated[str | None, byte_size()] = None
     """Largest size of the file, such as 20MB."""
-    max_psnr_loss: float | None = None
+    max_psnr_loss: Annotated[float | None, within(above=0)] = None
     """Largest loss of PSNR, dB; the smallest file within it is chosen. The loss is measured in evaluation views,
     which do not influence what is removed."""
     cameras: Path | None = None
@@ -99,17 +100,12 @@ class Compact:
 
     def _limits(self) -> "Limits":
         from clsplat.pruning.compaction import Limits
-        from clsplat.training.memory import parse_bytes
 
         size = None if self.max_bytes is None else parse_bytes(self.max_bytes, "--max-bytes")
         if self.max_gaussians is None and size is None and self.max_psnr_loss is None:
             raise InputError(
                 "--max-gaussians, --max-bytes, --max-psnr-loss: expected at least one of these limits, found none"
             )
-        if self.max_gaussians is not None and self.max_gaussians < 1:
-            raise InputError(f"--max-gaussians: expected 1 or more, found {self.max_gaussians}")
-        if self.max_psnr_loss is not None and not self.max_psnr_loss > 0:
-            raise InputError(f"--max-psnr-loss: expected more than 0 dB, found {self.max_psnr_loss}")
         return Limits(self.max_gaussians, size, self.max_psnr_loss)
 
     def _views(

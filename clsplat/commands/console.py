@@ -1,15 +1,17 @@
 """Functions that commands share: messages to the user, opening the device, writing folders and files."""
 
 import json
+import os
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, unwritable
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -56,6 +58,18 @@ def new_folder(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot create {out}: {error.strerror or error}") from error
+
+
+def try_folder(out: Path) -> None:
+    """Raise an InputError if a folder cannot be created or no file can be written in it; nothing new remains."""
+    missing = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
+    new_folder(out)
+    problem = unwritable(out)
+    for folder in missing:
+        with suppress(OSError):
+            folder.rmdir()
+    if problem:
+        raise InputError(f"cannot write to {out}: {problem}")
 
 
 def write_json(path: Path, value: Any) -> None:

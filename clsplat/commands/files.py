@@ -10,6 +10,7 @@ from clsplat.commands import console
 from clsplat.commands.console import Out, moved, say, say_cameras
 from clsplat.config import DataConfig, Mode, SfmConfig
 from clsplat.errors import InputError
+from clsplat.ranges import within
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
@@ -46,7 +47,7 @@ class Frames:
     """The video; needs the extra `video`."""
     out: Out
     """New folder for the photos."""
-    fps: float = 2.0
+    fps: Annotated[float, within(above=0)] = 2.0
     """Photos per second of the video."""
 
     def run(self) -> None:

@@ -107,7 +107,7 @@ def dataset_lines(path: Path) -> list[str]:
     from clsplat.dataset.sfm import reconstruction as sfm
 
     record, model = sfm.read_record(path), colmap.find_model(path)
-    source = path / record["photos"] if record else path
+    source = sfm.recorded_photos(path, record) if record else path
     photos = [photo_folder(source) / name for name in list_photos(source)]
     if model is not None:
         cameras, posed, points, _ = colmap.read_model(model)

@@ -5,13 +5,14 @@ from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
-from clsplat.commands.console import Out, moved, new_folder, open_device, say, say_scores
+from clsplat.commands.console import Out, moved, new_folder, open_device, say, say_scores, try_folder
 from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
 from clsplat.errors import InputError
+from clsplat.ranges import within
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Eval:
         from clsplat.formats import load_gaussians
         from clsplat.renderer import Renderer
 
+        try_folder(self.out)
         gaussians, mode, offset = load_gaussians(self.scene)
         device = open_device(self.device)
         scene = load_scene(self.data, self.data_config)
@@ -58,9 +60,9 @@ class Render:
     """Dataset, as for `train`; its cameras are the views, or determine the orbit."""
     out: Out
     """Folder for the images."""
-    path: str = "test"
+    path: Literal["test", "orbit"] = "test"
     """test: the held-out views (all views if none is held out). orbit: a closed path around the scene."""
-    frames: int = 60
+    frames: Annotated[int, within(least=1)] = 60
     """Number of images of an orbit."""
     depth: bool = False
     """Also write the expected depth, as 16-bit PNG scaled to the largest depth."""
@@ -82,8 +84,7 @@ class Render:
         from clsplat.render import Rendering, render_views
         from clsplat.show.camera_paths import orbit
 
-        if self.path not in ("test", "orbit"):
-            raise InputError(f"--path: expected test or orbit, found {self.path!r}")
+        try_folder(self.out)
         gaussians, mode, offset = load_gaussians(self.scene)
         device = open_device(self.device)
         scene = load_scene(self.data, self.data_config)

@@ -20,11 +20,13 @@ from clsplat.commands.console import (
     say,
     say_cameras,
     say_scores,
+    try_folder,
     warn,
     write_json,
 )
-from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.config import BACKGROUNDS, UINT32_MAX, TrainConfig
 from clsplat.errors import InputError
+from clsplat.ranges import within
 from clsplat.training.presets import DATA_PATH, PRESETS, load_config, load_preset
 
 if TYPE_CHECKING:
@@ -90,6 +92,7 @@ class Train:
             raise InputError(
                 f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
             )
+        try_folder(out)
         device = open_and_name(self.settings)
         scene, config = self.prepared(out, device)
         viewer = open_viewer(scene, config, device) if self.viewer else None
@@ -261,7 +264,7 @@ class Demo:
 
     out: Out = Path("clsplat-demo")
     """Folder for everything that is made."""
-    iterations: int = 1500
+    iterations: Annotated[int, within(least=1, most=UINT32_MAX)] = 1500
     """Optimisation steps."""
     device: str | None = None
     """Part of the platform's or device's name."""

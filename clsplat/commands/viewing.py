@@ -9,6 +9,7 @@ import tyro
 
 from clsplat.commands.console import moved, open_device, say
 from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
+from clsplat.ranges import within
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class View:
     """Dataset, as for `train`: its cameras are shown, and a click on one moves the view there."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 admits other machines, with the token in the printed address."""
-    port: int = 8080
+    port: Annotated[int, within(least=0, most=65535)] = 8080
     """Port to listen on; if it is in use, the next free one."""
     device: str | None = None
     """Part of the name of the platform or device."""

@@ -15,6 +15,7 @@ from clsplat.dataset.photos import list_photos
 from clsplat.dataset.sfm import reconstruction as sfm
 from clsplat.dataset.sfm.triangulation import filled, triangulate
 from clsplat.errors import InputError
+from clsplat.ranges import check
 from clsplat.scene import Scene, View
 
 OFFSET_EXTENTS = 1000
@@ -49,23 +50,20 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
     Raises
     ------
     InputError
-        If the folder holds no dataset, a file is missing or damaged, or no photo is left to train on; the message
-        names the file.
+        If a setting is out of range, the folder holds no dataset, a file is missing or damaged, or no photo is left
+        to train on; the message names the setting or the file.
 
     Warns
     -----
     UserWarning
         If some photos with a camera have no file, or only some exist in the requested size.
     """
+    check(config)
     path = Path(path)
     if not path.is_dir():
         raise InputError(
             f"{path}: expected the folder of a dataset, found {'a file' if path.exists() else 'nothing'}"
         )
-    if config.downscale not in (1, 2, 4, 8):
-        raise InputError(f"downscale: expected 1, 2, 4 or 8, found {config.downscale}")
-    if config.test_every < 0:
-        raise InputError(f"test_every: expected 0 or more, found {config.test_every}")
     dataset = _read_dataset(path, config, verbose)
     dataset = replace(dataset, photos=by_faces(dataset.photos))
     views = sorted(load_views(dataset, config), key=lambda view: view.name)
@@ -163,7 +161,7 @@ def _read_dataset(path: Path, config: DataConfig, verbose: bool) -> Dataset:
         )
     photos, options = path, config.sfm
     if record is not None:
-        photos = path / record["photos"]
+        photos = sfm.recorded_photos(path, record)
         # Cameras that were recovered with other options are kept, unless options are given now.
         options = options if options != SfmConfig() else SfmConfig(**record["options"])
     model = sfm.reconstruct(photos, options, path, verbose)

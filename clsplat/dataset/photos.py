@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -211,13 +212,23 @@ def _rgb(image: Image.Image, background: tuple[float, float, float], path: Path)
             raise InputError(
                 f"{path}: expected 8 or 16 bits per channel, found 32 (mode {image.mode}); convert the photo"
             )
-        return np.repeat((grey.astype(np.uint16) >> 8).astype(np.uint8)[..., None], 3, axis=2)
+        shade = np.repeat((grey.astype(np.uint16) >> 8).astype(np.float32)[..., None], 3, axis=2)
+        return _over(shade, (grey != image.info.get("transparency", -1))[..., None], background)
+    colour = image.info.get("transparency")
+    if isinstance(colour, tuple) and max(colour) > 255:  # Pillow has reduced the pixels to 8 bits, but not the colour
+        raise InputError(
+            f"{path}: expected 8 bits per channel beside a transparent colour, found 16; convert the photo"
+        )
     if image.mode in TRANSPARENT or "transparency" in image.info:
         rgba = np.asarray(image.convert("RGBA"), dtype=np.float32)
-        alpha = rgba[..., 3:] / 255
-        blended = rgba[..., :3] * alpha + 255 * np.asarray(background, dtype=np.float32) * (1 - alpha)
-        return np.rint(blended).astype(np.uint8)
+        return _over(rgba[..., :3], rgba[..., 3:] / 255, background)
     return np.array(image if image.mode == "RGB" else image.convert("RGB"))
+
+
+def _over(rgb: NDArray[Any], alpha: NDArray[Any], background: tuple[float, float, float]) -> NDArray[np.uint8]:
+    """Blend RGB (H, W, 3) of 0 to 255 with a background by alpha (H, W, 1) of 0 to 1."""
+    blended = rgb * alpha + 255 * np.asarray(background, dtype=np.float32) * (1 - alpha)
+    return np.rint(blended).astype(np.uint8)
 
 
 def photo_sharpness(path: Path) -> float:

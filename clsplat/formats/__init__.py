@@ -53,6 +53,11 @@ FORMATS: dict[str, Format] = {
 """Formats by the suffix of the file name. If several suffixes fit, the longest is used."""
 
 
+SCENES = ("*", "point_cloud/iteration_*/point_cloud.ply", "scene.*")
+"""Patterns of scenes in folders of runs, the last one that fits is meant: any file, that of the original code, and
+that of ``clsplat train``."""
+
+
 def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
     """Read Gaussians from a file in a format of `FORMATS`, chosen by its suffix, or from a folder with an unpacked
     SOG.
@@ -77,6 +82,10 @@ def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float6
     InputError
         If no format has this suffix, or the file is not a valid file of its format; the message names it.
     """
+    if Path(path).is_dir() and not (Path(path) / META).exists():
+        inside = [file for pattern in SCENES for file in sorted(Path(path).glob(pattern)) if suffix_of(file)]
+        hint = f"; the scene in it is {inside[-1]}" if inside else ""
+        raise InputError(f"{path}: expected a file of Gaussians, such as scene.ply, found a folder{hint}")
     unpacked = Path(path).is_dir() or Path(path).name == META
     return load_sog(path) if unpacked else _format(path).load(path)
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from clsplat.config import TrainConfig
 from clsplat.scene import Scene
+from clsplat.training.densify.strategy import MOST_GAUSSIANS
 
 
 def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
@@ -21,7 +22,7 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
         return config
     cap = config.max_gaussians
     if len(scene.points):
-        most = round(few.growth * len(scene.points))
+        most = min(max(1, round(few.growth * len(scene.points))), MOST_GAUSSIANS)
         cap = most if cap is None else min(cap, most)
     init = replace(config.init, sh_degree=min(config.init.sh_degree, few.sh_degree))
     if config.size == "auto":  # too few photos to validate

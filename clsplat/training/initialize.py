@@ -11,6 +11,7 @@ from clsplat.constants import SH_C0
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
 from clsplat.randomness import stream
+from clsplat.ranges import check
 from clsplat.scene import Scene
 
 NEIGHBOURS = 3
@@ -45,14 +46,7 @@ def initialize(scene: Scene, config: InitConfig, seed: int, cap: int | None = No
     -------
     Gaussians
         float32, on the host.
-
-    Raises
-    ------
-    InputError
-        If the cap is not positive.
     """
-    if cap is not None and cap < 1:
-        raise InputError(f"--max-gaussians: expected at least 1, found {cap}")
     n = start_count(scene, config, cap)
     if not len(scene.points):
         return random([view.camera for view in scene.train], replace(config, random_points=n), seed)
@@ -93,8 +87,9 @@ def from_points(points: ArrayLike, colors: ArrayLike, config: InitConfig) -> Gau
     Raises
     ------
     InputError
-        If shapes differ, there is no point, or one is not finite.
+        If shapes differ, there is no point, one is not finite, or a setting is out of range.
     """
+    check(config, "init.")
     means = np.asarray(points, dtype=np.float64)
     rgb = np.asarray(colors)
     if means.ndim != 2 or means.shape[1] != 3 or not len(means) or not np.isfinite(means).all():
@@ -126,13 +121,10 @@ def random(cameras: list[Camera], config: InitConfig, seed: int) -> Gaussians:
     Raises
     ------
     InputError
-        If there is no camera, or the number or size is not positive.
+        If there is no camera, or a setting is out of range.
     """
+    check(config, "init.")
     n = _random_points(config)
-    if n < 1 or not config.random_extent > 0:
-        raise InputError(
-            f"random_points, random_extent: expected positive values, found {n} and {config.random_extent}"
-        )
     focus = focus_point(cameras)
     distance = float(np.mean([np.linalg.norm(camera.position - focus) for camera in cameras]))
     half = config.random_extent * distance
@@ -159,8 +151,6 @@ def _gaussians(
 ) -> Gaussians:
     """Isotropic Gaussians; `rgb` (N, 3) in [0, 1]."""
     opacity = OPACITY if config.opacity is None else config.opacity
-    if not 0 < opacity < 1:
-        raise InputError(f"opacity: expected a value between 0 and 1, found {opacity}")
     count = len(means)
     sh = np.zeros((count, (config.sh_degree + 1) ** 2, 3))
     sh[:, 0] = (rgb - 0.5) / SH_C0

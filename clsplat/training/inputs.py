@@ -110,15 +110,26 @@ class Inputs:
             "another choice of held-out photos": [name for name in both if (name in self.test) != (name in now.test)],
             "other pixels": [name for name in both if old[name].pixels != new[name].pixels],
             "other masks": [name for name in both if old[name].mask != new[name].mask],
-            "other cameras": [name for name in both if not _same_camera(old[name].camera, new[name].camera)],
         }
+        if self.train.keys() == now.train.keys():  # near planes follow the set of training photos
+            differing["other cameras"] = [n for n in both if not _same_camera(old[n].camera, new[n].camera)]
         found = [f"{what} ({_some(names)})" for what, names in differing.items() if names]
         return found + ["other points"] * bool(now.points and now.points != self.points)
 
 
 def _photo(view: View, scene: Scene) -> Photo:
     c = view.camera
-    numbers = [get_args(CameraModel).index(c.model), c.fx, c.fy, c.cx, c.cy, c.width, c.height, *c.distortion, c.near]
+    numbers = [
+        get_args(CameraModel).index(c.model),
+        c.fx,
+        c.fy,
+        c.cx,
+        c.cy,
+        c.width,
+        c.height,
+        *c.distortion,
+        c.near_depth,
+    ]
     pixels = _digest(view.image) if view.clear is None else _digest(view.image, view.clear)
     mask = "" if view.mask is None else _digest(view.mask)
     return Photo(pixels, mask, [float(x) for x in (*numbers, *c.viewmat[:3].flat, *scene.offset)])

@@ -5,9 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clsplat import ranges
 from clsplat.config import TrainConfig
 from clsplat.dataset.near_planes import with_near_planes
-from clsplat.errors import DeviceError, InputError, driver_errors
+from clsplat.errors import BuildError, DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import without_invisible
 from clsplat.renderer import fetch
@@ -17,7 +18,6 @@ from clsplat.training.autosize.reduction import without_useless_bands
 from clsplat.training.autosize.search import search_size
 from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
-from clsplat.training.densify import STRATEGIES
 from clsplat.training.inputs import Inputs
 from clsplat.training.preparation import open_device
 from clsplat.training.recorder import LOG, Recorder, log_file
@@ -56,10 +56,10 @@ def train(
     resume : bool
         Continue from the checkpoint in `out`, to the same bits as a run that was never interrupted.
     evaluate : callable, optional
-        Called every `config.eval_every` iterations with the Gaussians, on the device; what it returns is logged. Its
-        time does not count.
+        Called every `config.eval_every` iterations with the Gaussians, on the device, and at the end with those that
+        are returned; what it returns is logged. Its time does not count.
     evaluate_after : container of int, optional
-        Iterations after which `evaluate` is called instead.
+        Iterations after which `evaluate` is called instead; not at the end.
     progress : callable
         Called after every iteration with iteration, loss, num_gaussians and gaussians, which are the ones that train
         and must not be changed. Its time does not count. If it raises KeyboardInterrupt, a checkpoint is written
@@ -73,9 +73,9 @@ def train(
     Raises
     ------
     InputError
-        If the scene has no photos to train on, the strategy is unknown, the price is negative, or `resume` finds no
-        checkpoint, or one of other photos, masks, cameras or points, or of another configuration, or another process
-        or thread trains into the folder.
+        If a setting is out of range, the scene has no photos to train on, or `resume` finds no checkpoint, or one of
+        other photos, masks, cameras or points, or of another configuration, or another process or thread trains into
+        the folder.
     DeviceError
         If the device's memory, or its limit, is exceeded.
     ClsplatError
@@ -97,27 +97,31 @@ def train(
         else:
             state = replace(initial_state(scene, config), inputs=inputs)
         training = Training(scene, config, device, state)
-        with log_file(out / LOG, state.iteration) as log:
+        with log_file(out / LOG, min(state.iteration, config.iterations - 1)) as log:
             recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
-            try:
-                with driver_errors():
-                    if state.search:
-                        search_size(training, recorder.after, recorder.after_fork)
-                    training.run_until(config.iterations, recorder.after)
-            except DeviceError as error:
-                raise DeviceError(
-                    f"iteration {training.state.iteration + 1}: {error}; the last checkpoint in {out}, if there is "
-                    "one, is intact: --resume continues from it, and a lower --memory-limit stops growth earlier"
-                ) from error
-        return finish(training, out)
+            _run(training, recorder, out)
+            gaussians = finish(training, out)
+            recorder.end(gaussians)
+    return gaussians
+
+
+def _run(training: Training, recorder: Recorder, out: Path) -> None:
+    try:
+        with driver_errors():
+            if training.state.search:
+                search_size(training, recorder.after, recorder.after_fork)
+            training.run_until(training.config.iterations, recorder.after)
+    except DeviceError as error:
+        less = "" if isinstance(error, BuildError) else ", and a lower --memory-limit stops growth earlier"
+        raise DeviceError(
+            f"iteration {training.state.iteration + 1}: {error}; the last checkpoint in {out}, if there is one, "
+            f"is intact: --resume continues from it{less}"
+        ) from error
 
 
 def check(scene: Scene, config: TrainConfig) -> None:
     """Raise an InputError if the configuration cannot train the scene."""
-    if config.strategy not in STRATEGIES:
-        raise InputError(f"--strategy: expected one of {', '.join(STRATEGIES)}, found {config.strategy!r}")
-    if not config.size_price >= 0:
-        raise InputError(f"--size-price: expected 0 or more, found {config.size_price}")
+    ranges.check(config)
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
 

@@ -1,6 +1,5 @@
 """Device memory of a training, predicted from the buffers of each stage, and the photos kept in the rest."""
 
-import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -46,23 +45,6 @@ PER_ROW = 3 * 416  # derivatives of SSIM: rows have margins, and end with a work
 
 COPIES = 3
 """Copies of all parameters: themselves and Adam's two moments."""
-
-UNITS = {"MB": 10**6, "GB": 10**9, "MiB": 2**20, "GiB": 2**30}
-
-
-def parse_bytes(text: str, name: str) -> int:
-    """Parse a number of bytes such as 4GB, 512MiB, 1.5 GB; `name` is the argument's name in errors.
-
-    Raises
-    ------
-    InputError
-        If it is not a positive number with one of the units MB, GB (powers of ten), MiB, GiB (of two).
-    """
-    match = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?(MB|GB|MiB|GiB)", text)
-    size = int(float(match[1]) * UNITS[match[2]]) if match else 0
-    if size == 0:
-        raise InputError(f"{name}: expected a size such as 4GB or 512MiB, found {text!r}")
-    return size
 
 
 def bytes_text(size: int) -> str:

@@ -10,11 +10,12 @@ from clsplat.config import TrainConfig
 from clsplat.dataset import load_scene, with_points
 from clsplat.dataset.finding import mask_folder
 from clsplat.dataset.near_planes import with_near_planes
+from clsplat.ranges import check, parse_bytes
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
 from clsplat.training.few_views import adapted
 from clsplat.training.initialize import start_count
-from clsplat.training.memory import Footprint, parse_bytes
+from clsplat.training.memory import Footprint
 from clsplat.training.run_length import with_iterations
 from clsplat.training.state import start_config
 
@@ -63,8 +64,10 @@ def prepare(
     Raises
     ------
     InputError
-        If the dataset cannot be read, with the file's name; or if the first Gaussians do not fit the device's memory.
+        If a setting is out of range, the dataset cannot be read (the message has the file's name), or the first
+        Gaussians do not fit the device's memory.
     """
+    check(config)
     if config.data.masks is not None:
         masks = str(mask_folder(Path(path), config.data.masks).resolve())
         config = replace(config, data=replace(config.data, masks=masks))

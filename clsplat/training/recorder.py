@@ -51,7 +51,7 @@ class Recorder:
         config = training.config
         if evaluate_after is None:
             every = config.eval_every
-            evaluate_after = range(every, config.iterations + 1, every) if every else ()
+            evaluate_after = {*range(every, config.iterations, every), config.iterations} if every else ()
         self._evaluate, self._evaluate_after = evaluate, evaluate_after
         self._started = time.perf_counter() - training.state.seconds
 
@@ -61,21 +61,32 @@ class Recorder:
         check_loss(loss, state.iteration, self._out)
         state.losses.append(loss)
         state.seconds = time.perf_counter() - self._started
-        record: dict[str, Any] = {}
-        if state.iteration % LOG_EVERY == 0 or state.iteration == config.iterations:
-            record = {"loss": float(np.mean(state.losses))}
-            state.losses.clear()
-        if self._evaluate and state.iteration in self._evaluate_after:
-            record |= self._evaluate(state.shown(training.renderer))
-            self._started = time.perf_counter() - state.seconds
-        if record:
-            at = {"iteration": state.iteration, "num_gaussians": len(state.gaussians), "seconds": state.seconds}
-            self._log(at | record)
+        if state.iteration < config.iterations:  # the last line is about the scene as it is saved
+            self._line(state.shown(training.renderer) if state.iteration in self._evaluate_after else None)
         if state.iteration % config.checkpoint_every == 0 or state.iteration == config.iterations:
             self._save()
         left = time.perf_counter()
         self._tell(training, loss)
         self._started += time.perf_counter() - left
+
+    def end(self, gaussians: Gaussians) -> None:
+        """Log the end of a run, whose scene has been finished. A run that is resumed after its end logs it again."""
+        self._line(gaussians if self._training.config.iterations in self._evaluate_after else None, gaussians)
+
+    def _line(self, evaluated: Gaussians | None, finished: Gaussians | None = None) -> None:
+        """Log an iteration, if it is one of those with a line or is evaluated."""
+        state = self._training.state
+        record: dict[str, Any] = {}
+        if state.iteration % LOG_EVERY == 0 or finished is not None:
+            record = {"loss": float(np.mean(state.losses))}
+            if finished is None:
+                state.losses.clear()
+        if self._evaluate and evaluated is not None:
+            record |= self._evaluate(evaluated)
+            self._started = time.perf_counter() - state.seconds
+        if record:
+            count = len(state.gaussians if finished is None else finished)
+            self._log({"iteration": state.iteration, "num_gaussians": count, "seconds": state.seconds} | record)
 
     def after_fork(self, fork: Training, loss: float) -> None:
         """Report an iteration of a fork, which is neither logged nor saved."""

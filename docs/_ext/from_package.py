@@ -38,6 +38,7 @@ from clsplat.bench import captures_report, charts, quality_summary, results
 from clsplat.bench import kernel_report as report
 from clsplat.bench.knob_report import knobs_text
 from clsplat.bench.stability import stability_report as stability
+from clsplat.ranges import rule_of
 from clsplat.training import presets
 
 HEADER_RULE = "|---"
@@ -110,14 +111,16 @@ def config_table(name: str) -> str:
         for statement, following in zip(body, [*body[1:], None], strict=True)
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name)
     }
-    hints = typing.get_type_hints(cls)
-    rows = [_row("field", "type", "default", "meaning"), HEADER_RULE * 4 + "|"]
+    hints, annotated = typing.get_type_hints(cls), typing.get_type_hints(cls, include_extras=True)
+    rows = [_row("field", "type", "range", "default", "meaning"), HEADER_RULE * 5 + "|"]
     for field in dataclasses.fields(cls):
         hint = hints[field.name]
         nested = dataclasses.is_dataclass(hint)
         kind = f"[{hint.__name__}](#{hint.__name__.lower()})" if nested else _code(_type_name(hint))
         default = "" if nested else _code(_default(field.default))
-        rows.append(_row(_code(field.name), kind, default, _prose(texts[field.name])))
+        rule = rule_of(annotated[field.name])
+        words = _prose(rule.words) if rule else ""
+        rows.append(_row(_code(field.name), kind, words, default, _prose(texts[field.name])))
     return f"{_prose(cls.__doc__ or '')}\n\n" + "\n".join(rows)
 
 

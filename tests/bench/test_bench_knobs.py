@@ -206,7 +206,7 @@ class TestCommand:
 
     def test_invalid_input_is_refused(self, tmp_path, capsys):
         for arguments, message in (
-            (["--repeats", "0"], "--repeats: expected 1 or more, found 0"),
+            (["--repeats", "0"], "--repeats: expected an integer, 1 or more, found 0"),
             (["--scene", "a.ply"], "--scene and --cameras: expected both"),
             (["--workload", "huge"], "expected a number of Gaussians"),
             (["--chart", "chart.txt"], "--chart: expected a file named *.png"),

@@ -62,9 +62,9 @@ class TestCells:
             ("a:downscale=3", "downscale: expected 1, 2, 4, 8"),
             ("a:thinn=3", "variants: thin, arc, points.*thinn: expected one of"),
             ("a:thin=0.5", "thin: expected"),
-            ("a:thin=0", "thin: expected 1 or more, found 0"),
-            ("a:arc=1", "arc: expected a fraction of the photos, .* found 1"),
-            ("a:points=0", "points: expected a fraction of the points, .* found 0"),
+            ("a:thin=0", "thin: expected an integer, 1 or more, found 0"),
+            ("a:arc=1", "arc: expected a finite number, 0 or more and below 1, found 1"),
+            ("a:points=0", "points: expected a finite number, above 0 and at most 1, found 0"),
         ],
     )
     def test_invalid_options_are_refused(self, text, expected):
@@ -107,8 +107,6 @@ class TestCells:
         assert [(c.config.seed, c.source.name, c.method) for c in cells] == [
             (seed, scene, method) for seed in (5, 3) for scene in "ab" for method in ("mcmc", "paper-7k")
         ]
-        with pytest.raises(InputError, match="--seeds: expected 0 or more, found -1"):
-            make_cells(["a"], ["mcmc"], ["own"], [], seeds=[0, -1])
 
     def test_a_methods_own_iterations(self):
         (cell,) = make_cells(["a"], ["paper-30k"], ["own"], [])
@@ -122,8 +120,6 @@ class TestCells:
             make_cells(["a/scene", "b/scene"], ["mcmc"], ["own"], [])
         with pytest.raises(InputError, match="--methods: expected different names, found m 2 times"):
             make_cells(["a"], [str(tmp_path / "a" / "m.json"), str(tmp_path / "b" / "m.json")], ["own"], [])
-        with pytest.raises(InputError, match="--iterations: expected 1 or more, found 0"):
-            make_cells(["a"], ["mcmc"], ["own"], [0])
 
     def test_settings_are_those_that_differ_from_the_defaults(self):
         config = TrainConfig(seed=3, adc=AdcConfig(every=7), init=InitConfig(opacity=0.5))

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -231,7 +232,7 @@ def test_quiet_says_nothing_and_verbose_where_an_error_is_from(dataset: Path, tm
 
     missing = tmp_path / "no.ply"
     train = "train", dataset, "--iterations", 3, "-o"
-    assert said(*train, tmp_path / "quiet", "-q") == ""
+    assert re.fullmatch("training failed: .*\n", said(*train, tmp_path / "quiet", "-q")), "warnings only"
     assert (tmp_path / "quiet" / "scene.ply").is_file()
     for word in ("device: ", "3/3", "held-out photos"):
         assert word in said(*train, tmp_path / f"normal {word[:2].strip('/')}"), word
@@ -321,6 +322,20 @@ def test_bad_scenes(trained: Path, dataset: Path, tmp_path: Path, capsys: pytest
     assert "bad.ply" in fails(capsys, "export", bad, "-o", tmp_path / "out.ply")
     assert "suffix" in fails(capsys, "export", trained / "scene.ply", "-o", tmp_path / "out.obj")
     assert not (tmp_path / "out.ply").exists()
+
+
+def test_a_folder_is_no_scene(
+    trained: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = "expected a file of Gaussians, such as scene.ply, found a folder"
+    message = fails(capsys, "eval", trained, dataset, "-o", tmp_path / "eval")
+    assert message == f"clsplat: {trained}: {expected}; the scene in it is {trained / 'scene.ply'}"
+    original = tmp_path / "run" / "point_cloud" / "iteration_7000"
+    original.mkdir(parents=True)
+    shutil.copyfile(trained / "scene.ply", original / "point_cloud.ply")
+    message = fails(capsys, "eval", tmp_path / "run", dataset, "-o", tmp_path / "eval")
+    assert message.endswith(f"the scene in it is {original / 'point_cloud.ply'}")
+    assert fails(capsys, "eval", dataset, dataset, "-o", tmp_path / "eval").endswith(expected)
 
 
 def test_unknown_device_lists_the_known(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -98,7 +98,7 @@ def test_scenes_near_the_origin_stay(tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"downscale": 3}, "downscale"), ({"test_every": -1}, "test_every"), ({"masks": "m"}, "masks")],
+    [({"downscale": 3}, "downscale"), ({"test_every": -1}, "--test-every"), ({"masks": "m"}, "masks")],
 )
 def test_bad_options_are_refused(tmp_path, change, message):
     write_colmap(tmp_path)

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from PIL import Image
 
 from clsplat.dataset.photos import (
     is_plain,
+    is_transparent,
     list_photos,
     orientation,
     photo_size,
@@ -82,6 +84,29 @@ def test_transparent_grey_and_palette(tmp_path, mode):
     image = Image.new(mode, (4, 4), 0)
     image.save(tmp_path / "a.png", **({"transparency": 0} if mode == "P" else {}))
     assert (read(tmp_path / "a.png", (1.0, 1.0, 1.0)) == 255).all()
+
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+def test_a_transparent_colour_of_sixteen_bits(tmp_path):
+    """It is compared in 16 bits: the neighbour, which has the same upper 8 bits, is opaque."""
+    Image.fromarray(np.array([[0x1234, 0x1235, 0x8000]], np.uint16)).save(tmp_path / "a.png")
+    data = (tmp_path / "a.png").read_bytes()
+    kind, value = b"tRNS", b"\x12\x34"
+    chunk = len(value).to_bytes(4, "big") + kind + value + zlib.crc32(kind + value).to_bytes(4, "big")
+    at = data.index(b"IDAT") - 4
+    (tmp_path / "a.png").write_bytes(data[:at] + chunk + data[at:])
+    assert is_transparent(tmp_path / "a.png")
+    assert read_photo(tmp_path / "a.png", WHITE, True)[0].tolist() == [[255] * 3, [0x12] * 3, [0x80] * 3]
+
+
+def test_a_transparent_colour_that_pillow_cannot_compare_is_refused(tmp_path):
+    Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "a.png", transparency=(0x1234, 0, 0))
+    with pytest.raises(
+        InputError, match=r"a\.png: expected 8 bits per channel beside a transparent colour, found 16"
+    ):
+        read_photo(tmp_path / "a.png", WHITE, True)
 
 
 @pytest.mark.parametrize("tag", range(1, 9))

@@ -1,23 +1,29 @@
 """Structure from motion on rendered photos with known cameras, and its model on disk."""
 
+import fcntl
 import json
 import os
 import re
 import shutil
+import signal
+import subprocess
+import sys
 import tempfile
 
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
+from small_files import small_files
 
 from clsplat.camera import Camera
+from clsplat.commands.info import dataset_lines
 from clsplat.config import DataConfig, SfmConfig
 from clsplat.dataset import load_scene
 from clsplat.dataset.colmap import read_model
 from clsplat.dataset.lenses import Intrinsics, is_pinhole, undistorted
 from clsplat.dataset.sfm import reconstruction as sfm
-from clsplat.dataset.sfm.reconstruction import RECORD, read_record, reconstruct
+from clsplat.dataset.sfm.reconstruction import LOCK, RECORD, WORK, read_record, reconstruct
 from clsplat.errors import InputError
 
 CONFIG = SfmConfig(camera_model="SIMPLE_RADIAL")
@@ -235,9 +241,9 @@ def test_of_two_models_the_larger_is_taken(photos, tmp_path):
     ("options", "message"),
     [
         ({"matching": "random"}, "matching"),
-        ({"camera_model": "PINBALL"}, "camera_model.*SIMPLE_RADIAL"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model"),
-        ({"max_image_size": 0}, "max_image_size"),
+        ({"camera_model": "PINBALL"}, "--sfm.camera-model.*SIMPLE_RADIAL"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "--sfm.camera-model"),
+        ({"max_image_size": 0}, "--sfm.max-image-size"),
     ],
 )
 def test_bad_options_are_refused(solved, options, message):
@@ -323,3 +329,74 @@ def test_a_real_facade_is_recovered(shared, tmp_path):
     one, other = (points - points.mean(axis=0) for points in (one, other))
     correlation = np.linalg.svd(one.T @ other)[1].sum() / np.linalg.norm(one) / np.linalg.norm(other)
     assert correlation > 0.9999  # 1 for two point sets that differ by a similarity; 1 % of noise gives 0.99995
+
+
+STUCK = """
+import signal, sys
+from clsplat.cli import main
+from clsplat.dataset.sfm import reconstruction
+
+def stuck(*_):
+    print("ready", flush=True)
+    signal.pause()
+
+reconstruction._largest_model = stuck
+main(["sfm", sys.argv[1], "--camera-model", "PINHOLE"])
+"""
+
+
+def interrupted(folder, number):
+    """Structure from motion that gets a signal once pycolmap is loaded: its messages and its status."""
+    with subprocess.Popen(
+        [sys.executable, "-c", STUCK, str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        return process.stderr.read(), process.wait()
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_terminated_run_leaves_nothing(copy, number, status):
+    before = sorted(os.listdir(copy))
+    messages, returned = interrupted(copy, number)
+    assert returned == status
+    assert "clsplat: " in messages and "Aborted at" not in messages and "    @ " not in messages
+    assert sorted(os.listdir(copy)) == before
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(copy, runs):
+    interrupted(copy, signal.SIGKILL)
+    assert len([name for name in os.listdir(copy) if name.startswith(WORK)]) == 1
+    alive = copy / f"{WORK}alive"
+    alive.mkdir()
+    with (alive / LOCK).open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        reconstruct(copy, CONFIG)
+        assert [name for name in os.listdir(copy) if name.startswith(WORK)] == [alive.name]
+    reconstruct(copy, CONFIG)
+    assert not alive.exists() and runs == []
+
+
+def test_a_record_leads_to_no_other_photos(copy, photos, tmp_path):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    Image.fromarray(photos[0]).save(outside / "private.png")
+    path = copy / "sparse" / RECORD
+    record = json.loads(path.read_text())
+    for named in (str(outside), "../outside"):
+        path.write_text(json.dumps({**record, "photos": named}))
+        with pytest.raises(InputError, match=rf"{RECORD}: expected photos inside .* found other photos in .*outside"):
+            load_scene(copy, DataConfig())
+        with pytest.raises(InputError, match=rf"{RECORD}: expected photos inside"):
+            dataset_lines(copy)
+
+
+def test_a_limit_of_the_size_of_files_is_named(copy):
+    shutil.rmtree(copy / "sparse")
+    with small_files(), pytest.raises(InputError, match=r"cannot write the recovered .*File too large; `ulimit -f`"):
+        reconstruct(copy, CONFIG)
+    assert not [name for name in os.listdir(copy) if name.startswith(WORK)]

@@ -151,8 +151,8 @@ def test_bad_input_is_a_sentence(bloated, tmp_path, capsys):
         return fails(capsys, "compact", scene, "-o", out, *arguments)
 
     assert "expected at least one of these limits, found none" in error()
-    assert "--max-gaussians: expected 1 or more, found 0" in error("--max-gaussians", 0)
-    assert "--max-psnr-loss: expected more than 0 dB, found -1" in error("--max-psnr-loss", -1.0)
+    assert "--max-gaussians: expected an integer, 1 or more, found 0" in error("--max-gaussians", 0)
+    assert "--max-psnr-loss: expected a finite number, above 0, found -1" in error("--max-psnr-loss", -1.0)
     assert "--max-bytes: expected a size such as" in error("--max-bytes", "20")
     one = ("--max-gaussians", 9)
     assert "expected one of them, found both" in error(*one, "--photos", photos, "--cameras", photos)

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pyopencl as cl
 import pytest
+from small_files import small_files
 from test_cli import TRAIN, fails, run, write_dataset
 
 from clsplat.device import Device
-from clsplat.errors import DeviceError, driver_errors
+from clsplat.errors import BuildError, DeviceError, driver_errors
 
 KILLS = 40
 
@@ -199,6 +200,36 @@ def test_a_device_that_fails_in_any_command_is_one_sentence(
     monkeypatch.setattr(Device, "launch", failing)
     message = fails(capsys, "eval", tmp_path / "scene.ply", dataset, "-o", tmp_path / "eval")
     assert message == "clsplat: the OpenCL driver failed: clEnqueueReadBuffer failed: INVALID_COMMAND_QUEUE"
+
+
+def test_kernels_that_cannot_be_built_say_why(device: Device) -> None:
+    with pytest.raises(cl.RuntimeError) as failed:
+        cl.Program(device.context, "no kernel").build()
+    with pytest.raises(BuildError, match="cannot build the kernels: clBuildProgram failed"), driver_errors():
+        raise failed.value
+    with small_files(), pytest.raises(BuildError, match=r"compiler writes files, and .* takes none: File too large"):
+        with driver_errors():
+            raise failed.value
+
+
+def test_a_folder_that_takes_no_files_is_named_before_photos_are_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with small_files():
+        message = fails(capsys, "train", tmp_path / "none", "-o", tmp_path / "out")
+    assert message.startswith(f"clsplat: cannot write to {tmp_path / 'out'}: File too large; `ulimit -f` limits")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_memory_is_not_blamed_for_kernels(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(self: Device, *arguments: object, **named: object) -> None:
+        cl.Program(self.context, "no kernel").build()
+
+    monkeypatch.setattr(Device, "launch", failing)
+    message = fails(capsys, "train", dataset, "-o", tmp_path, *TRAIN)
+    assert "iteration 1: cannot build the kernels" in message and "--memory-limit" not in message
 
 
 def test_only_the_drivers_errors_become_sentences() -> None:

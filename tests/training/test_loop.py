@@ -165,7 +165,8 @@ def test_it_is_evaluated_when_asked(
         return {"psnr": float(len(seen))}
 
     config = replace(CONFIG, eval_every=20)
-    train(scene, config, tmp_path, device, evaluate=evaluate, evaluate_after=after)
+    result = train(scene, config, tmp_path, device, evaluate=evaluate, evaluate_after=after)
+    assert after is not None or seen[-1] is result  # as saved, not as it was before the last step of the training
     log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [record["iteration"] for record in log if "psnr" in record] == expected
     assert len(seen) == len(expected)
@@ -218,11 +219,6 @@ def test_the_cap_holds_in_every_iteration(
     assert 0 < len(result) <= cap
     assert all(np.isfinite(a).all() for a in result.arrays().values())
     assert 0 < len(initial_state(scene, config).gaussians) <= min(cap, 40)
-
-
-def test_a_cap_of_none_is_refused(scene: Scene, device: Device, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--max-gaussians: expected at least 1, found 0"):
-        train(scene, replace(CONFIG, max_gaussians=0), tmp_path, device)
 
 
 @pytest.mark.parametrize("optimizer", ["device", "numpy"])
@@ -327,17 +323,6 @@ def test_each_round_surveys_photos_of_its_own(
     assert shares == [5 / len(scene.train)] * 4
     assert len({tuple(sorted(names)) for names in rounds}) > 1
     assert set().union(*rounds) <= {view.name for view in scene.train}
-
-
-def test_an_unknown_strategy_is_refused(scene: Scene, device: Device, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"--strategy: expected one of {', '.join(STRATEGIES)}, found 'best'"):
-        train(scene, replace(CONFIG, strategy="best"), tmp_path, device)
-
-
-@pytest.mark.parametrize("price", [-1.0, float("nan")])
-def test_a_price_that_is_none_is_refused(price: float, scene: Scene, device: Device, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"--size-price: expected 0 or more, found {price}"):
-        train(scene, replace(CONFIG, size_price=price), tmp_path, device)
 
 
 def test_a_search_starts_from_few_random_gaussians() -> None:

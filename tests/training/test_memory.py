@@ -15,12 +15,13 @@ from clsplat.config import AdcConfig, OptimConfig, RenderConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
+from clsplat.ranges import parse_bytes
 from clsplat.render import render_views
 from clsplat.scene import Scene, View
 from clsplat.training.checkpoint import load_state
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.loop import train
-from clsplat.training.memory import INTERSECTIONS, Footprint, Photos, parse_bytes
+from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
 
 FIXED_N = AdcConfig(stop_fraction=0)
 """No densification."""

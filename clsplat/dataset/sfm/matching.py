@@ -7,6 +7,7 @@ doi:10.1109/CVPR.2016.445.
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -68,9 +69,12 @@ match_share(sys.argv[2], sys.argv[3], sys.argv[4] == "verbose")
 
 @contextmanager
 def quiet(verbose: bool) -> Iterator[None]:
-    """Suppress COLMAP's messages, unless `verbose`."""
+    """Suppress COLMAP's messages, unless `verbose`, and the stack trace that it prints when it is terminated."""
     from pycolmap import logging
 
+    if threading.current_thread() is threading.main_thread():
+        # On import pycolmap has replaced the handler without Python's knowledge.
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     before = logging.minloglevel
     logging.minloglevel = before if verbose else int(logging.ERROR)
     try:

@@ -11,15 +11,14 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from clsplat.config import SfmConfig
-from clsplat.dataset.lenses import camera_models
 
 # This also imports Pillow before pycolmap. Loaded after pycolmap 4.2.1, Pillow uses parts of the zlib inside pycolmap
 # and crashes when it writes a PNG.
@@ -33,11 +32,15 @@ from clsplat.dataset.photos import (
     write_upright_png,
 )
 from clsplat.dataset.sfm.matching import SEED, extract, is_sliver, match, quiet
-from clsplat.errors import InputError
+from clsplat.errors import InputError, unwritable
+from clsplat.ranges import check
 
 RECORD = "clsplat_sfm.json"
 """Name of the file next to the model's folder ``0`` that records the photos and options from which the model was
 made."""
+
+WORK, LOCK = ".clsplat_sfm_", "lock"
+"""Beginning of the names of temporary folders, and name of the file in each that the process locks which uses it."""
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
@@ -60,7 +63,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         return None
     try:
         record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        SfmConfig(**record["options"])
+        check(SfmConfig(**record["options"]))
         if not isinstance(record["hashes"], dict) or not isinstance(record["registered"], int):
             raise TypeError("hashes or registered of another type")
         return {**record, "photos": str(record["photos"])}
@@ -69,6 +72,36 @@ def read_record(folder: Path) -> dict[str, Any] | None:
             f"cannot read {path}, the record of a structure from motion: {error!r}; delete its folder to recover the "
             "cameras again"
         ) from error
+
+
+def recorded_photos(folder: Path, record: dict[str, Any]) -> Path:
+    """Folder of the photos from which the model in `folder` was made.
+
+    A record from elsewhere must not lead to other files: photos outside `folder` must be those that it describes.
+
+    Raises
+    ------
+    InputError
+        If the record names a folder outside `folder` with other photos.
+    """
+    photos: Path = folder / record["photos"]
+    inside = photos.resolve().is_relative_to(folder.resolve())
+    if not inside and photos.is_dir() and _hashes(photos) != record["hashes"]:
+        raise InputError(
+            f"{folder / 'sparse' / RECORD}: expected photos inside {folder}, or the photos outside from which the "
+            f"cameras were recovered, found other photos in {photos}; recover the cameras again with `clsplat sfm "
+            f"{photos} -o {folder}`"
+        )
+    return photos
+
+
+def _hashes(photos: Path) -> dict[str, str]:
+    """BLAKE2 of each photo by its name."""
+    folder = photo_folder(photos)
+    return {
+        name: hashlib.blake2b((folder / name).read_bytes(), digest_size=16).hexdigest()
+        for name in list_photos(photos)
+    }
 
 
 def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, verbose: bool = False) -> Path:
@@ -95,18 +128,19 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
     Raises
     ------
     InputError
-        If there are too few photos, one is damaged, too few can be registered, or the output folder cannot be written
-        or holds a model from elsewhere.
+        If an option is out of range, there are too few photos, one is damaged, too few can be registered, or the
+        output folder cannot be written or holds a model from elsewhere.
     """
+    check(config, "sfm.")
     photos = Path(photos)
     output = photos if output is None else Path(output)
     if not photos.is_dir():
         raise InputError(f"{photos}: expected a folder of photos, found {'a file' if photos.exists() else 'nothing'}")
     folder, names = photo_folder(photos), list_photos(photos)
-    if len(names) < max(config.min_registered, 2):
-        raise InputError(f"{folder}: expected at least {max(config.min_registered, 2)} photos, found {len(names)}")
-    _check_options(config)
-    hashes = {name: hashlib.blake2b((folder / name).read_bytes(), digest_size=16).hexdigest() for name in names}
+    if len(names) < config.min_registered:
+        raise InputError(f"{folder}: expected at least {config.min_registered} photos, found {len(names)}")
+    _remove_abandoned(output)
+    hashes = _hashes(photos)
     model = output / "sparse" / "0"
     registered = _registered_before(output, hashes, config)
     if registered is not None:
@@ -151,15 +185,6 @@ def _registered_before(output: Path, hashes: dict[str, str], config: SfmConfig) 
     return int(record["registered"]) if made_with == config else None
 
 
-def _check_options(config: SfmConfig) -> None:
-    if config.matching not in ("auto", "exhaustive", "sequential"):
-        raise InputError(f"matching: expected auto, exhaustive or sequential, found {config.matching!r}")
-    if config.camera_model not in camera_models():
-        raise InputError(f"camera_model: expected one of {', '.join(camera_models())}, found {config.camera_model!r}")
-    if config.max_image_size < 1:
-        raise InputError(f"max_image_size: expected a number of pixels, found {config.max_image_size}")
-
-
 def _matched(config: SfmConfig, folder: Path) -> SfmConfig:
     """Resolve `matching` "auto" for the photos in `folder`."""
     if config.matching != "auto":
@@ -168,10 +193,10 @@ def _matched(config: SfmConfig, folder: Path) -> SfmConfig:
 
 
 def _check_registered(registered: int, count: int, photos: Path, config: SfmConfig) -> None:
-    if registered < max(config.min_registered, 2):
+    if registered < config.min_registered:
         raise InputError(
             f"cannot recover the cameras of {photos}: found the poses of {registered} of {count} photos, expected at "
-            f"least {max(config.min_registered, 2)}; take more photos: sharp, overlapping by two thirds, from "
+            f"least {config.min_registered}; take more photos: sharp, overlapping by two thirds, from "
             "different positions, of a scene with texture"
         )
 
@@ -179,19 +204,45 @@ def _check_registered(registered: int, count: int, photos: Path, config: SfmConf
 @contextmanager
 def _workspace(output: Path) -> Iterator[Path]:
     """Create a temporary folder inside `output`, so that its content can be moved to `output` by renaming."""
+    elsewhere = (
+        "copy the photos to a writable folder, or write the cameras elsewhere with `clsplat sfm PHOTOS -o DIR` and "
+        "then use DIR instead of the photos"
+    )
     try:
         output.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=".clsplat_sfm_", dir=output))
+        work = Path(tempfile.mkdtemp(prefix=WORK, dir=output))
+        lock = (work / LOCK).open("w")
     except OSError as error:
-        raise InputError(
-            f"cannot write the recovered cameras to {output}: {error.strerror}; copy the photos to a writable "
-            "folder, or write the cameras elsewhere with `clsplat sfm PHOTOS -o DIR` and then use DIR instead of the "
-            "photos"
-        ) from error
+        raise InputError(f"cannot write the recovered cameras to {output}: {error.strerror}; {elsewhere}") from error
     try:
+        _locked(lock)
+        if problem := unwritable(work):
+            raise InputError(f"cannot write the recovered cameras to {output}: {problem}; {elsewhere}")
         yield work
     finally:
+        lock.close()
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _locked(file: IO[str]) -> bool:
+    """Lock an open file until it is closed or the process ends; False if another process has, or nothing can."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _remove_abandoned(output: Path) -> None:
+    """Remove the temporary folders of processes that were killed."""
+    for work in output.glob(f"{WORK}*"):
+        with suppress(OSError), (work / LOCK).open("w") as lock:
+            if _locked(lock):
+                shutil.rmtree(work)
 
 
 def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path:
@@ -248,7 +299,7 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
     match(database, pairs, verbose)
 
     options = pycolmap.IncrementalPipelineOptions(
-        min_model_size=max(config.min_registered, 2), random_seed=SEED, num_threads=1
+        min_model_size=config.min_registered, random_seed=SEED, num_threads=1
     )
     (work / "models").mkdir()
     with tqdm(total=len(names), desc="poses", unit="photo", dynamic_ncols=True) as bar:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from clsplat.camera import Camera
 from clsplat.dataset.sfm.matching import SEED, extract, is_sliver, match, quiet
-from clsplat.errors import InputError
+from clsplat.errors import InputError, unwritable
 from clsplat.randomness import stream
 from clsplat.scene import View
 
@@ -88,12 +88,14 @@ def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[n
     Raises
     ------
     InputError
-        If a camera is neither a pinhole nor a fisheye.
+        If a camera is neither a pinhole nor a fisheye, or temporary files cannot be written.
     """
     import pycolmap
 
     with TemporaryDirectory(prefix="clsplat_triangulate_") as folder, quiet(verbose):
         work = Path(folder)
+        if problem := unwritable(work):
+            raise InputError(f"cannot triangulate points: {work.parent} takes no files: {problem}")
         database = work / "database.db"
         cameras = _database(views, database, work)
         chosen = pairs(list(cameras.values()))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.config import TrainConfig
+from clsplat.config import UINT32_MAX, TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import download
 from clsplat.stages import Stages
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-MOST_GAUSSIANS = 2**32 - 1
+MOST_GAUSSIANS = UINT32_MAX
 """Largest number of Gaussians: indices on the device have 32 bits."""
 
 

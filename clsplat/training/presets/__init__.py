@@ -5,16 +5,15 @@ Belongs here: reading and writing configurations. Does not belong here: the mean
 """
 
 import json
-import sys
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from types import NoneType
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import yaml
 
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
+from clsplat.ranges import checked
 
 FOLDER = Path(__file__).parent
 
@@ -28,8 +27,6 @@ DATA_PATH = "data_path"
 """Key in config.json for the path of the dataset, which is not a part of the configuration."""
 
 Settings = TypeVar("Settings")
-
-EXPECTED = {int: "an integer", float: "a finite number", str: "text", bool: "true or false", NoneType: "null"}
 
 
 def load_preset(name: str) -> TrainConfig:
@@ -57,7 +54,7 @@ def load_config(path: Path) -> TrainConfig:
     ------
     InputError
         If the file cannot be read or is not an object of settings, if `TrainConfig` has no such setting, or if a
-        value has another type or is not among its choices; the message names file and setting.
+        value has another type, is not among its choices or is out of range; the message names file and setting.
     """
     settings = read_settings(path)
     settings.pop(DATA_PATH, None)
@@ -115,9 +112,9 @@ def with_settings(base: Settings, settings: dict[str, Any], source: str, within:
     Raises
     ------
     InputError
-        If there is no such setting, or a value has another type or is not among its choices.
+        If there is no such setting, or a value has another type, is not among its choices or is out of range.
     """
-    hints = get_type_hints(type(base))
+    hints = get_type_hints(type(base), include_extras=True)
     known = {field.name for field in fields(base)}  # type: ignore[arg-type]
     for name in settings:
         if name not in known:
@@ -127,31 +124,10 @@ def with_settings(base: Settings, settings: dict[str, Any], source: str, within:
     values: dict[str, Any] = {}
     for name, value in settings.items():
         where = f"{source}: {within}{name}"
-        if is_dataclass(hints[name]):
+        if is_dataclass(getattr(base, name)):
             if not isinstance(value, dict):
                 raise InputError(f"{where}: expected an object of settings, found {value!r:.60}")
             values[name] = with_settings(getattr(base, name), value, source, f"{within}{name}.")
         else:
-            values[name] = _checked(value, hints[name], where)
+            values[name] = checked(value, hints[name], where)
     return replace(base, **values)  # type: ignore[type-var]
-
-
-def _checked(value: Any, hint: Any, where: str) -> Any:
-    """Check a value of JSON against the type of a setting, and return it."""
-    choices = get_args(hint) if get_origin(hint) is not Literal else ()
-    for kind in choices or (hint,):
-        if get_origin(kind) is Literal:
-            # 1 == True == 1.0, but only one of them is a valid choice.
-            if any(value == choice and type(value) is type(choice) for choice in get_args(kind)):
-                return value
-        elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-            if abs(value) <= sys.float_info.max:  # neither NaN nor infinite, nor an integer that no float64 holds
-                return float(value)
-        elif type(value) is kind:
-            return value
-    expected = " or ".join(_words(kind) for kind in choices or (hint,))
-    raise InputError(f"{where}: expected {expected}, found {value!r:.60}")
-
-
-def _words(kind: Any) -> str:
-    return EXPECTED[kind] if kind in EXPECTED else ", ".join(map(repr, get_args(kind)))
