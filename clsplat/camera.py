@@ -291,7 +291,9 @@ def default_near(means: NDArray[np.floating]) -> float:
     -------
     float
         `NEAR_EXTENTS` times the median distance of the means from their median, in world units; `NEAR` if that is 0.
+        Means that are not finite do not count.
     """
     some = means[:: max(1, len(means) // NEAR_MEANS)].astype(np.float64)
-    spread = float(np.median(np.linalg.norm(some - np.median(some, axis=0), axis=1)))
+    some = some[np.isfinite(some).all(axis=1)]
+    spread = float(np.median(np.linalg.norm(some - np.median(some, axis=0), axis=1))) if len(some) else 0.0
     return max(NEAR_EXTENTS * spread, float(np.finfo(np.float32).tiny)) if spread > 0 else NEAR

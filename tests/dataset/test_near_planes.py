@@ -84,6 +84,8 @@ def test_default_near_planes():
     """By hand: the median distance of 1, 1, 1, 1 and 0 from their median 0 is 1."""
     means = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0]], np.float32)
     assert default_near(means) == pytest.approx(NEAR_EXTENTS)
+    poisoned = np.append(means, [[np.nan, 0, 0], [0, np.inf, 0]], axis=0).astype(np.float32)
+    assert default_near(poisoned) == default_near(means) and default_near(poisoned[5:]) == NEAR
     assert default_near(1e-30 * means) > np.finfo(np.float32).tiny
     assert default_near(means[:1]) == NEAR == Camera(np.eye(4), 1, 1, 1, 1, 2, 2).near_depth
 

@@ -18,7 +18,7 @@ def left_by_pruning(min_gaussians: int, n: int = 1000) -> int:
 
     Opacities decay like this in a training that receives no gradients.
     """
-    config = TrainConfig()
+    config = TrainConfig(iterations=3000)
     config = replace(config, adc=replace(config.adc, min_gaussians=min_gaussians))
     gaussians = synthetic_scene(n)[0].astype(np.float32)
     gaussians.logit_opacities[:] = logit(np.float32(0.001))
