@@ -1,0 +1,184 @@
+"""Measure which changes of the mathematics the tests see: one operator, constant or index at a time.
+
+Mutants are drawn at random from the kernels, their launches, the densification and the choice of the size. Each is
+applied to a copy of the project, in which the tests of that file run until one fails. The results are one JSON object
+per line; mutants that are in them already are not repeated. Requires a system that can fork a process.
+
+    $ python tests/mutants/measure_mutants.py --count 320 -o docs/results/mutants.jsonl
+"""
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import NoReturn
+
+from sites import Mutant, drawn
+
+ROOT = Path(__file__).resolve().parents[2]
+
+NOT_MEASURED = ("cl/roof.cl", "cl/power.h", "clsplat/ops/__init__.py")
+"""Files without mathematics of the method: kernels that measure a device, and a list of the stages."""
+
+PROCESSOR_SECONDS = 900
+"""Limit of a mutant's processor time: loops may never end. All tests of a file take at most half of it."""
+
+NO_TESTS = 3
+"""Exit status of a process in which pytest itself has failed."""
+
+WHOLE = ("tests/test_gold.py", "tests/test_render.py", "tests/training/test_loop.py")
+"""Tests of the whole renderer and of training, for mutants that the tests of their file do not see."""
+
+PROJECT = ("tests/test_project.py", "tests/test_lens.py", "tests/test_project_degenerate.py")
+COMPOSITE = ("tests/test_composite.py", "tests/test_composite_gpu.py", "tests/test_composite_sorted.py")
+TESTS: dict[str, tuple[str, ...]] = {
+    "common": ("tests/test_composite.py", *PROJECT),
+    "composite": COMPOSITE,
+    "composite_blocks": COMPOSITE,
+    "composite_cpu": COMPOSITE[:1],
+    "composite_gpu": COMPOSITE[1:2],
+    "composite_sorted": COMPOSITE[2:],
+    "composite_splats": COMPOSITE,
+    "ellipse": ("tests/test_bin.py", *COMPOSITE[:1]),
+    "lens": PROJECT,
+    "linalg": PROJECT,
+    "project": PROJECT,
+    "sh": PROJECT,
+    "structs": PROJECT,
+    "philox": ("tests/test_noise.py", "tests/test_dropout.py"),
+}
+"""Tests by the stem of the file. Those of other stages are named after it."""
+
+TRAINING = {
+    "clsplat/training/densify": tuple(
+        f"tests/training/test_{name}.py" for name in ("densify", "mcmc", "error_guided", "loop")
+    ),
+    "clsplat/training/autosize": ("tests/training/test_autosize.py", "tests/commands/test_cli.py"),
+}
+"""Tests of folders of the training."""
+
+
+def measured_files() -> list[Path]:
+    """Files with the mathematics of the method."""
+    folders = [("cl", "*.cl"), ("cl", "*.h"), ("clsplat/ops", "*.py")] + [(folder, "*.py") for folder in TRAINING]
+    found = [path for folder, pattern in folders for path in sorted((ROOT / folder).glob(pattern))]
+    return [path for path in found if path.relative_to(ROOT).as_posix() not in NOT_MEASURED]
+
+
+def tests_of(path: str) -> tuple[str, ...]:
+    """Tests that should see a change of a file, the quickest first."""
+    for folder, tests in TRAINING.items():
+        if path.startswith(folder):
+            return tests
+    stem = Path(path).stem
+    return tuple(dict.fromkeys((*TESTS.get(stem, (f"tests/test_{stem}.py",)), *WHOLE)))
+
+
+def run_tests(copy: Path, tests: tuple[str, ...]) -> tuple[bool, str]:
+    """Whether tests pass in a copy of the project, and the first one that does not or how their process ended.
+
+    They run in a fork of this process, which has imported the libraries, but nothing of clsplat.
+    """
+    report = copy / "first-failure"
+    report.unlink(missing_ok=True)
+    child = os.fork()
+    if not child:
+        try:
+            _run_here(copy, tests, report)
+        finally:
+            os._exit(NO_TESTS)
+    status = os.waitpid(child, 0)[1]
+    if os.WIFSIGNALED(status):
+        return False, signal.Signals(os.WTERMSIG(status)).name
+    return os.WEXITSTATUS(status) == 0, report.read_text() if report.exists() else f"exit {os.WEXITSTATUS(status)}"
+
+
+def _run_here(copy: Path, tests: tuple[str, ...], report: Path) -> NoReturn:
+    os.chdir(copy)
+    resource.setrlimit(resource.RLIMIT_CPU, (PROCESSOR_SECONDS, PROCESSOR_SECONDS + 10))
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+    sys.path.insert(0, str(copy))
+    import pytest
+
+    class First:
+        def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+            if report.failed:
+                path.write_text(report.nodeid)
+
+    path, options = report, ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(copy)]
+    os._exit(int(pytest.main([*options, *tests], plugins=[First()])))
+
+
+def measure(mutant: Mutant, copy: Path) -> dict[str, object]:
+    """Run the tests on a mutant; the copy is left as it was."""
+    path = copy / mutant.path
+    text = path.read_text(encoding="utf-8")
+    started = time.perf_counter()
+    path.write_text(mutant.applied(text), encoding="utf-8")
+    try:
+        passed, by = run_tests(copy, tests_of(mutant.path))
+    finally:
+        path.write_text(text, encoding="utf-8")
+    context = text.splitlines()[mutant.line - 1].strip()
+    seconds = round(time.perf_counter() - started, 1)
+    return asdict(mutant) | {"code": context, "killed": not passed, "by": None if passed else by, "seconds": seconds}
+
+
+def key(mutant: Mutant, text: str) -> tuple[str, str, str, str, int]:
+    """Identity of a mutant in results, which lines moved elsewhere in the file do not change."""
+    code = text.splitlines()[mutant.line - 1].strip()
+    column = mutant.start - text.rfind("\n", 0, mutant.start)
+    return mutant.path, code, mutant.before, mutant.after, column
+
+
+def main() -> None:
+    """Measure the mutants that are not in the results."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=320, help="number of mutants that are drawn")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("-o", "--out", type=Path, required=True, help="results, JSON lines")
+    arguments = parser.parse_args()
+    import numpy  # noqa: F401
+    import pyopencl  # noqa: F401
+    import pytest  # noqa: F401
+    import scipy.spatial  # noqa: F401
+
+    done = set()
+    if arguments.out.exists():
+        done = {tuple(json.loads(line)["key"]) for line in arguments.out.read_text().splitlines()}
+    with tempfile.TemporaryDirectory() as folder, arguments.out.open("a") as out:
+        copy = Path(folder) / "project"
+        ignore = shutil.ignore_patterns(".git", "docs", "notebooks", "build", "__pycache__", "*.egg-info")
+        shutil.copytree(ROOT, copy, ignore=ignore)
+        os.environ |= {"POCL_CACHE_DIR": str(Path(folder) / "kernels"), "PYTHONDONTWRITEBYTECODE": "1"}
+        sound: dict[tuple[str, ...], bool] = {}
+        chosen = drawn(measured_files(), ROOT, arguments.count, arguments.seed)
+        for number, mutant in enumerate(chosen, 1):
+            identity = key(mutant, (ROOT / mutant.path).read_text(encoding="utf-8"))
+            if identity in done:
+                continue
+            tests = tests_of(mutant.path)
+            if tests not in sound:
+                sound[tests], by = run_tests(copy, tests)
+                if not sound[tests]:
+                    sys.exit(f"{' '.join(tests)}: expected to pass without a mutant, failed: {by}")
+            result = measure(mutant, copy) | {"key": identity}
+            out.write(json.dumps(result) + "\n")
+            out.flush()
+            verdict = "killed" if result["killed"] else "SURVIVED"
+            print(
+                f"[{number}/{len(chosen)}] {mutant.path}:{mutant.line} {mutant.before} -> {mutant.after}: {verdict}"
+            )
+
+
+if __name__ == "__main__":
+    main()
