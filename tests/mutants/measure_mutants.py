@@ -81,17 +81,18 @@ def tests_of(path: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*TESTS.get(stem, (f"tests/test_{stem}.py",)), *WHOLE)))
 
 
-def run_tests(copy: Path, tests: tuple[str, ...]) -> tuple[bool, str]:
+def run_tests(copy: Path, tests: tuple[str, ...], seconds: int) -> tuple[bool, str]:
     """Whether tests pass in a copy of the project, and the first one that does not or how their process ended.
 
-    They run in a fork of this process, which has imported the libraries, but nothing of clsplat.
+    They run for at most `seconds` of processor time, in a fork of this process, which has imported the libraries, but
+    nothing of clsplat.
     """
     report = copy / "first-failure"
     report.unlink(missing_ok=True)
     child = os.fork()
     if not child:
         try:
-            _run_here(copy, tests, report)
+            _run_here(copy, tests, seconds, report)
         finally:
             os._exit(NO_TESTS)
     status = os.waitpid(child, 0)[1]
@@ -100,9 +101,9 @@ def run_tests(copy: Path, tests: tuple[str, ...]) -> tuple[bool, str]:
     return os.WEXITSTATUS(status) == 0, report.read_text() if report.exists() else f"exit {os.WEXITSTATUS(status)}"
 
 
-def _run_here(copy: Path, tests: tuple[str, ...], report: Path) -> NoReturn:
+def _run_here(copy: Path, tests: tuple[str, ...], seconds: int, report: Path) -> NoReturn:
     os.chdir(copy)
-    resource.setrlimit(resource.RLIMIT_CPU, (PROCESSOR_SECONDS, PROCESSOR_SECONDS + 10))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
     silent = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silent, 1)
     os.dup2(silent, 2)
@@ -125,7 +126,7 @@ def measure(mutant: Mutant, copy: Path) -> dict[str, object]:
     started = time.perf_counter()
     path.write_text(mutant.applied(text), encoding="utf-8")
     try:
-        passed, by = run_tests(copy, tests_of(mutant.path))
+        passed, by = run_tests(copy, tests_of(mutant.path), PROCESSOR_SECONDS)
     finally:
         path.write_text(text, encoding="utf-8")
     context = text.splitlines()[mutant.line - 1].strip()
@@ -160,17 +161,15 @@ def main() -> None:
         ignore = shutil.ignore_patterns(".git", "docs", "notebooks", "build", "__pycache__", "*.egg-info")
         shutil.copytree(ROOT, copy, ignore=ignore)
         os.environ |= {"POCL_CACHE_DIR": str(Path(folder) / "kernels"), "PYTHONDONTWRITEBYTECODE": "1"}
-        sound: dict[tuple[str, ...], bool] = {}
         chosen = drawn(measured_files(), ROOT, arguments.count, arguments.seed)
+        tests = tuple(dict.fromkeys(test for mutant in chosen for test in tests_of(mutant.path)))
+        passed, by = run_tests(copy, tests, resource.RLIM_INFINITY)
+        if not passed:
+            sys.exit(f"tests: expected to pass without a mutant, failed: {by}")
         for number, mutant in enumerate(chosen, 1):
             identity = key(mutant, (ROOT / mutant.path).read_text(encoding="utf-8"))
             if identity in done:
                 continue
-            tests = tests_of(mutant.path)
-            if tests not in sound:
-                sound[tests], by = run_tests(copy, tests)
-                if not sound[tests]:
-                    sys.exit(f"{' '.join(tests)}: expected to pass without a mutant, failed: {by}")
             result = measure(mutant, copy) | {"key": identity}
             out.write(json.dumps(result) + "\n")
             out.flush()
