@@ -178,6 +178,8 @@ class Command:
             found.append(f"printed {ended.printed[-2000:]}")
         if ended.status == 0:
             return found
+        if point.kind in ("unlink", "rmdir"):
+            found.append(f"ended because a file could not be removed: {sentences}")
         if ended.status != 2 or len(sentences) != 1:
             found.append(f"status {ended.status}, {sentences}: {ended.printed[-2000:]}")
         elif "a file:" in sentences[0] and point.kind != "read":  # the system names no file that is open
