@@ -1,6 +1,6 @@
 PYTHON = python
 
-.PHONY: test test-slow stability fuzz soak lint docs check-races bench bench-knobs bench-quality bench-captures bench-stability \
+.PHONY: test test-slow stability fuzz faults soak lint docs check-races bench bench-knobs bench-quality bench-captures bench-stability \
   formats
 
 # Run the default tests: a few minutes on two cores.
@@ -19,6 +19,13 @@ stability:
 CASES = 4000
 fuzz:
 	CLSPLAT_FUZZ=$(CASES) $(PYTHON) -m pytest --hypothesis-profile=fuzz $(shell ls tests/stability/test_fuzz_*.py)
+
+# Fail each call of the system and of the device in turn, in every command of tests/training/measure_faults.py:
+# build/faults/faults.json. EVERY=10 takes each tenth call.
+EVERY = 1
+faults:
+	PYTHONPATH=tests/training:tests/commands:$(PYTHONPATH) $(PYTHON) tests/training/measure_faults.py --every $(EVERY) \
+	  -o build/faults
 
 # Train for MINUTES under a viewer whose clients come and go, and check that the memory does not grow and that the bits
 # stay: build/soak/soak.png and soak.json. Linux only.

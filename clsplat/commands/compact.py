@@ -79,7 +79,7 @@ class Compact:
         loss = LossMeter(gaussians, evaluation, self.photos is not None, renderer)
 
         def stored(version: "Gaussians") -> "tuple[Gaussians, int]":
-            with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # the warnings for the final file are shown
                 path = Path(folder) / f"scene{suffix}"
                 save_gaussians(path, version, mode, offset)

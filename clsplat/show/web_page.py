@@ -64,7 +64,7 @@ def save_page(path: str | Path, gaussians: Gaussians, mode: Mode, start: Viewpoi
     """
     path = Path(path)
     turn, camera = upright(start.up), start.camera
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         scene = Path(folder) / "scene.sog"
         save_sog(scene, rotated(gaussians, turn), mode)
         data = base64.b64encode(scene.read_bytes()).decode()

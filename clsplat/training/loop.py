@@ -97,11 +97,11 @@ def train(
         else:
             state = replace(initial_state(scene, config), inputs=inputs)
         training = Training(scene, config, device, state)
-        with log_file(out / LOG, min(state.iteration, config.iterations - 1)) as log:
-            recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
-            _run(training, recorder, out)
-            gaussians = finish(training, out)
-            recorder.end(gaussians)
+        log = log_file(out / LOG, min(state.iteration, config.iterations - 1))
+        recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
+        _run(training, recorder, out)
+        gaussians = finish(training, out)
+        recorder.end(gaussians)
     return gaussians
 
 

@@ -3,20 +3,25 @@
 import json
 import time
 from collections.abc import Callable, Container, Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from clsplat.atomic import replacing
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.training.checkpoint import CHECKPOINT, save_state
 from clsplat.training.divergence import check_loss, check_state
+from clsplat.training.event_log import event_log
 from clsplat.training.session import Training
 
 LOG = "log.jsonl"
 """File name of the log in the folder of a run."""
+
+EVENTS = "tensorboard"
+"""Name of the folder, in that of a run, of the log for TensorBoard."""
 
 LOG_EVERY = 10
 """Iterations per line of the log; the loss of a line is their mean, since losses of single photos differ much."""
@@ -108,9 +113,8 @@ class Recorder:
         save_state(self._out / CHECKPOINT, training.state, training.config)
 
 
-@contextmanager
-def log_file(path: Path, iteration: int) -> Iterator[Append]:
-    """Open a log of JSON lines after an iteration; yields the function that appends a record.
+def log_file(path: Path, iteration: int) -> Append:
+    """Begin a log of JSON lines after an iteration; return the function that appends a record.
 
     Lines of later iterations, written after the last checkpoint of an interrupted run, are dropped: the resumed run
     writes them again.
@@ -118,7 +122,7 @@ def log_file(path: Path, iteration: int) -> Iterator[Append]:
     Raises
     ------
     InputError
-        If the file cannot be written.
+        If the file, or the log for TensorBoard beside it, cannot be written; the function raises it too.
     """
     kept = []
     if iteration and path.exists():
@@ -130,26 +134,24 @@ def log_file(path: Path, iteration: int) -> Iterator[Append]:
                 continue
     with replacing(path) as file:
         file.writelines(f"{line}\n".encode() for line in kept)
-    events = event_writer(path.parent / "tensorboard", iteration)
-    with path.open("a") as log, closing(events) if events else nullcontext():
+    with _written(path.parent / EVENTS):
+        append_event = event_log(path.parent / EVENTS, iteration)
 
-        def append(record: dict[str, Any]) -> None:
+    def append(record: dict[str, Any]) -> None:
+        # Opened for each line: a file that stays open would write what failed again when it is closed.
+        with _written(path), path.open("a") as log:
             log.write(json.dumps(record) + "\n")
-            log.flush()
-            if events:
-                for name in record.keys() - {"iteration"}:
-                    events.add_scalar(name, record[name], record["iteration"])
+        if append_event:
+            with _written(path.parent / EVENTS):
+                append_event(record)
 
-        yield append
+    return append
 
 
-def event_writer(folder: Path, iteration: int) -> Any:
-    """Writer of the log for TensorBoard, after an iteration; None where tensorboardX is not installed."""
+@contextmanager
+def _written(path: Path) -> Iterator[None]:
+    """Raise the system's errors in the block as an InputError that names the path."""
     try:
-        from tensorboardX import SummaryWriter
-    except ImportError:
-        return None
-    # The names of its files differ by whole seconds alone.
-    return SummaryWriter(
-        str(folder), purge_step=iteration + 1 if iteration else None, filename_suffix=f".{iteration}"
-    )
+        yield
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from error

@@ -58,9 +58,9 @@ def held(out: Path) -> Iterator[None]:
         yield
     finally:
         if not again:  # the lock's file goes while it is locked: a process that opened it before notices
-            with suppress(OSError):
-                (out / HOLDER).unlink()
-                (out / LOCK).unlink()
+            for name in (HOLDER, LOCK):
+                with suppress(OSError):
+                    (out / name).unlink()
         lock.release()
         for folder in missing:
             with suppress(OSError):  # it holds a run

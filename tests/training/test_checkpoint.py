@@ -89,9 +89,9 @@ def test_the_log_is_also_written_for_tensorboard(tmp_path: Path) -> None:
     """A resumed run's first step says that what was there from it on no longer counts."""
     event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
     for begin, end in ((0, 20), (10, 30)):
-        with log_file(tmp_path / "log.jsonl", begin) as append:
-            for iteration in range(begin + 10, end + 1, 10):
-                append({"iteration": iteration, "loss": iteration / 100})
+        append = log_file(tmp_path / "log.jsonl", begin)
+        for iteration in range(begin + 10, end + 1, 10):
+            append({"iteration": iteration, "loss": iteration / 100})
     found = []
     for path in sorted((tmp_path / "tensorboard").iterdir(), key=lambda p: int(p.suffix[1:])):
         content, at = path.read_bytes(), 0
@@ -108,8 +108,7 @@ def test_the_log_is_also_written_for_tensorboard(tmp_path: Path) -> None:
 def test_the_log_drops_what_a_resumed_run_repeats(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     path.write_text('{"iteration": 10}\n{"iteration": 20}\n{"iteration": 30}\n{"iter')
-    with log_file(path, 20) as append:
-        append({"iteration": 30, "again": 1})
+    log_file(path, 20)({"iteration": 30, "again": 1})
     assert [json.loads(line) for line in path.read_text().splitlines()] == [
         {"iteration": 10},
         {"iteration": 20},

@@ -92,7 +92,7 @@ def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[n
     """
     import pycolmap
 
-    with TemporaryDirectory(prefix="clsplat_triangulate_") as folder, quiet(verbose):
+    with TemporaryDirectory(prefix="clsplat_triangulate_", ignore_cleanup_errors=True) as folder, quiet(verbose):
         work = Path(folder)
         if problem := unwritable(work):
             raise InputError(f"cannot triangulate points: {work.parent} takes no files: {problem}")
@@ -173,9 +173,15 @@ def _database(views: Iterable[View], database: Path, work: Path) -> dict[str, Ca
             raise InputError(f"{view.name}: expected a pinhole or fisheye camera, found {camera.model}")
         if is_sliver(camera.width, camera.height, EDGE_MAX):
             continue
-        Image.fromarray(view.image).save(work / name, compress_level=1)  # a temporary file: fast rather than small
         counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
-        Image.fromarray(counts).save(work / "masks" / f"{name}.png")  # COLMAP skips photos without a mask
+        try:
+            # Temporary files: fast rather than small. COLMAP skips photos without a mask.
+            Image.fromarray(view.image).save(work / name, compress_level=1)
+            Image.fromarray(counts).save(work / "masks" / f"{name}.png")
+        except OSError as error:
+            raise InputError(
+                f"cannot triangulate points: cannot write to {work.parent}: {error.strerror or error}"
+            ) from error
         lens = ("OPENCV_FISHEYE", camera.distortion) if camera.model == "fisheye" else ("PINHOLE", ())
         params = (camera.fx, camera.fy, camera.cx, camera.cy, *lens[1])
         reader = pycolmap.ImageReaderOptions(camera_model=lens[0], camera_params=",".join(map(repr, params)))

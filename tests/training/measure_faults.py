@@ -1,0 +1,353 @@
+"""Faults at every call: a command runs again and again, and each time another one of its calls fails.
+
+``make faults``, which sets the path of the test modules. The report, faults.json, has the number of points by command
+and kind of call, and what went wrong.
+"""
+
+import hashlib
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import pytest
+import tyro
+from failing_calls import FAULTS, Calls, Point, watched
+from filelock import FileLock, Timeout
+from test_cli import write_dataset
+
+from clsplat import cli
+from clsplat.atomic import PART
+from clsplat.commands.console import Out
+from clsplat.renderer import default_device
+from clsplat.training import recorder
+from clsplat.training.checkpoint import CHECKPOINT
+from clsplat.training.recorder import LOG
+from clsplat.training.run_folder import LOCK
+
+PHOTOS = 5
+"""Photos of the dataset: one is held out."""
+
+HANG = 30.0
+"""Time after which a command counts as hanging, s; it takes less than one."""
+
+TRAIN = (
+    *("train", "data", "-o", "out", "--iterations", "30", "--checkpoint-every", "10", "--eval-every", "10"),
+    *("--init.random-points", "60", "--adc.start", "5", "--adc.every", "10", "--adc.grad-threshold", "1e-5"),
+)
+COMPACT = ("compact", "scene.ply", "-o", "out/small.spz", "--cameras", "data", "--max-gaussians", "20")
+EXPOSURES = ("--exposure", "--filter-3d", "--strategy", "mcmc")
+COMMANDS = {
+    "train": TRAIN,
+    "train exposures": (*TRAIN[:5], "6", "--checkpoint-every", "3", "--eval-every", "3", *TRAIN[10:12], *EXPOSURES),
+    "eval": ("eval", "scene.ply", "data", "-o", "out"),
+    "render": ("render", "scene.ply", "data", "-o", "out", "--depth"),
+    "export": ("export", "scene.ply", "out/scene.sog"),
+    "page": ("export", "scene.ply", "out/scene.html"),
+    "compact": COMPACT,
+}
+"""Commands by name. Those that train go on with --resume where there is a checkpoint."""
+
+
+class Hung(BaseException):
+    """The command did not end."""
+
+
+class Ended(NamedTuple):
+    """How a command ended: its status, what it printed, and exceptions that nothing caught."""
+
+    status: int
+    printed: str
+    stray: list[str]
+
+
+class Command:
+    """A command in a folder of its own, and what it does when nothing fails.
+
+    Parameters
+    ----------
+    name : str
+        One of `COMMANDS`.
+    root : Path
+        Folder, with the dataset and the scene that `prepared` makes.
+    """
+
+    def __init__(self, name: str, root: Path):
+        self._arguments, self._root, self._out = COMMANDS[name], root, root / "out"
+        self._trains = self._arguments[0] == "train"
+        self._resumed: set[frozenset[tuple[str, str]]] = set()
+        self._versions: set[tuple[str, str]] = set()
+        self._clear()
+        calls = Calls()
+        ended = self._run(calls, fresh=True)
+        assert ended.status == 0 and not ended.stray, ended
+        self.points, self._whole = calls.points, self._files()
+        self._log = (self._out / LOG).read_text().splitlines() if self._trains else []
+
+    def cases(self, per_kind: int | None = None) -> list[tuple[Point, str]]:
+        """Calls and their errors: all of them, or at most so many of each kind, evenly spaced."""
+        groups: dict[tuple[str, str], list[Point]] = {}
+        for point in self.points:
+            for fault in FAULTS[point.kind]:
+                groups.setdefault((point.kind, fault), []).append(point)
+        return [
+            (points[(2 * i + 1) * len(points) // (2 * count)], fault)
+            for (_, fault), points in groups.items()
+            for count in [min(per_kind or len(points), len(points))]
+            for i in range(count)
+        ]
+
+    def problems(self, point: Point, fault: str) -> list[str] | None:
+        """What is wrong after a call has failed, and after the run that follows; None if the call was not reached."""
+        self._clear()
+        calls = Calls(point, FAULTS[point.kind][fault])
+        ended = self._run(calls, fresh=opens_device(point))
+        if not calls.failed:
+            return None
+        found = self._wrong_end(ended, point) + self._wrong_files(point) + self._held()
+        whole = ended.status == 0
+        if whole and self._files() != self._whole:
+            found.append(f"ended well, with other files: {self._differing()}")
+        state = frozenset(self._files().items())
+        if not found and not whole and state not in self._resumed:
+            found += self._wrong_again()
+            self._resumed.add(state)
+        return found
+
+    def _wrong_again(self) -> list[str]:
+        """What is wrong after the command ran again without a fault."""
+        resume = ["--resume"] if self._trains and (self._out / CHECKPOINT).exists() else []
+        ended = self._run(Calls(), resume)
+        found = [f"again: {what}" for what in self._held()]
+        if ended.status != 0 or ended.stray:
+            found.append(f"again: ended with {ended.status}: {ended.printed[-2000:]} {ended.stray}")
+        elif self._files() != self._whole:
+            found.append(f"again: other files: {self._differing()}")
+        return found
+
+    def _clear(self) -> None:
+        for folder in (self._out, self._root / "tmp"):
+            shutil.rmtree(folder, ignore_errors=True)
+        (self._root / "tmp").mkdir()
+        if not self._trains:
+            self._out.mkdir()
+
+    def _run(self, calls: Calls, more: Iterable[str] = (), fresh: bool = False) -> Ended:
+        if fresh:
+            default_device.cache_clear()
+
+        def replaced(path: Path) -> None:
+            if not calls.failed and path.resolve().is_relative_to(self._out):
+                self._versions.add((self._name(path), digest(path)))
+
+        with outside(self._root) as stray, watched(self._root, calls, replaced):
+            printed = io.StringIO()
+            with redirect_stderr(printed), redirect_stdout(printed):
+                status = status_of([*self._arguments, *more])
+        return Ended(status, printed.getvalue(), stray)
+
+    def _name(self, path: Path) -> str:
+        return str(path.resolve().relative_to(self._out.resolve()))
+
+    def _files(self) -> dict[str, str]:
+        files = [path for path in self._out.rglob("*") if path.is_file() and "tensorboard" not in path.parts]
+        return {self._name(path): digest(path) for path in files}
+
+    def _differing(self) -> list[str]:
+        now = self._files()
+        return sorted(name for name in {*now, *self._whole} if now.get(name) != self._whole.get(name))
+
+    def _wrong_end(self, ended: Ended, point: Point) -> list[str]:
+        sentences = [line for line in ended.printed.splitlines() if line.startswith("clsplat: ")]
+        found = [f"stray: {what}" for what in ended.stray]
+        if re.search("Traceback|Exception", ended.printed):
+            found.append(f"printed {ended.printed[-2000:]}")
+        if ended.status == 0:
+            return found
+        if point.kind in ("unlink", "rmdir"):
+            found.append(f"ended because a file could not be removed: {sentences}")
+        if ended.status != 2 or len(sentences) != 1:
+            found.append(f"status {ended.status}, {sentences}: {ended.printed[-2000:]}")
+        elif "a file:" in sentences[0] and point.kind != "read":  # the system names no file that is open
+            found.append(f"names no file: {sentences[0]}")
+        return found
+
+    def _wrong_files(self, point: Point) -> list[str]:
+        """Files that the run without a fault never wrote: half of one, or one of a temporary name."""
+        removal = point.kind in ("unlink", "rmdir", "list")
+        unlocked = point.kind == "lock"  # another process may hold the file: it stays
+        found = []
+        for name, content in self._files().items():
+            last = Path(name).name
+            if name == LOG:
+                # The last line may be cut off, and a line after a write that failed.
+                lines = (self._out / LOG).read_text().splitlines()
+                if [line for line in lines if is_json(line)] != self._log[: sum(map(is_json, lines))]:
+                    found.append(f"{name}: {lines}")
+            elif PART.fullmatch(last) or last.startswith(LOCK):
+                if not removal and not (unlocked and last == LOCK):
+                    found.append(f"{name} is left")
+            elif (name, content) not in self._versions:
+                found.append(f"{name} is not whole")
+        left = [path.name for path in (self._root / "tmp").iterdir()]
+        if left and not removal and not point.about.startswith("tmp"):
+            found.append(f"temporary files are left: {left}")
+        return found
+
+    def _held(self) -> list[str]:
+        """Whether the folder, or a file in it, is still held."""
+        found = []
+        if sys.platform == "linux":
+            numbers = [Path("/proc/self/fd") / number for number in os.listdir("/proc/self/fd")]
+            targets = [os.readlink(number) for number in numbers if os.path.lexists(number)]
+            found += [f"{path} is open" for path in targets if path.startswith(str(self._root))]
+        if self._out.is_dir() and self._trains:
+            lock = FileLock(self._out / LOCK, blocking=False)
+            try:
+                lock.acquire()
+            except Timeout:
+                found.append("the folder is locked")
+            else:
+                lock.release()
+                (self._out / LOCK).unlink(missing_ok=True)
+        return found
+
+
+def opens_device(point: Point) -> bool:
+    """Whether a call is made only where a device is opened, or a program is built on it for the first time."""
+    return point.kind in ("context", "queue", "build") or Path(point.about).suffix in (".cl", ".h")
+
+
+def status_of(arguments: list[str]) -> int:
+    """The status that the command line ends with; 1, with a traceback, for an exception that it does not catch."""
+    try:
+        cli.main(arguments)
+    except SystemExit as exit_:
+        return int(exit_.code or 0)
+    except (Exception, Hung):
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+@contextmanager
+def outside(root: Path) -> Iterator[list[str]]:
+    """Run the block in a folder as a process of its own would, at a clock that stands still; yields stray exceptions.
+
+    Arguments are parsed once, and charts are blank: both take longer than all the rest.
+    """
+    stray: list[str] = []
+    parse = tyro.cli
+
+    def parse_once(*arguments: Any, args: list[str], **named: Any) -> Any:
+        if tuple(args) not in PARSED:
+            PARSED[tuple(args)] = parse(*arguments, args=args, **named)
+        return PARSED[tuple(args)]
+
+    def hang(*_: object) -> None:
+        raise Hung
+
+    def blank(self: Any, file: Any, **_: Any) -> None:
+        file.write(bytes(20000))
+
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        patch.chdir(root)
+        patch.setattr(tempfile, "tempdir", str(root / "tmp"))
+        patch.setattr(tyro, "cli", parse_once)
+        patch.setattr("matplotlib.figure.Figure.savefig", blank)
+        patch.setattr(recorder, "time", SimpleNamespace(perf_counter=lambda: 0.0))
+        patch.setattr(threading, "excepthook", lambda about: stray.append(f"{about.exc_type}: {about.exc_value}"))
+        patch.setattr(sys, "unraisablehook", lambda about: stray.append(f"{about.exc_value!r} {about.object!r}"))
+        signal.signal(signal.SIGALRM, hang)
+        signal.setitimer(signal.ITIMER_REAL, HANG)
+        try:
+            yield stray
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+
+PARSED: dict[tuple[str, ...], Any] = {}
+"""Commands by their arguments."""
+
+
+def digest(path: Path) -> str:
+    """Digest of a file's bytes."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def is_json(line: str) -> bool:
+    """Whether a line is whole."""
+    try:
+        return isinstance(json.loads(line), dict)
+    except ValueError:
+        return False
+
+
+def prepared(root: Path) -> Path:
+    """Write a dataset and a scene that is trained on it to a folder."""
+    write_dataset(root / "data", PHOTOS)
+    (root / "tmp").mkdir()
+    with outside(root):
+        cli.main([*TRAIN[:3], "first", TRAIN[4], "10", *TRAIN[10:12]])
+    (root / "first" / "scene.ply").rename(root / "scene.ply")
+    shutil.rmtree(root / "first")
+    return root
+
+
+def measure(out: Out, commands: tuple[str, ...] = tuple(COMMANDS), every: int = 1) -> None:
+    """Fail each call of the commands in turn, or only each so many-th."""
+    report: dict[str, Any] = {}
+    failures = 0
+    with tempfile.TemporaryDirectory() as folder:
+        root = prepared(Path(folder).resolve())
+        for name in commands:
+            started = time.perf_counter()
+            command = Command(name, root)
+            tried: Counter[str] = Counter()
+            unreached, wrong = [], []
+            cases = command.cases()[::every]
+            for number, (point, fault) in enumerate(cases):
+                found = command.problems(point, fault)
+                if found is None:
+                    unreached.append([*point, fault])
+                else:
+                    tried[f"{point.kind} {fault}"] += 1
+                if found:
+                    wrong.append({"point": [*point, fault], "found": found})
+                    print(json.dumps(wrong[-1]), flush=True)
+                if number % 200 == 0:
+                    print(f"{name}: {number} of {len(cases)}, {time.perf_counter() - started:.0f} s", flush=True)
+            report[name] = {
+                "calls": len(command.points),
+                "points": tried.total(),
+                "by kind": dict(sorted(tried.items())),
+                "unreached": unreached,
+                "failures": wrong,
+                "seconds": round(time.perf_counter() - started),
+            }
+            failures += len(wrong)
+            out.mkdir(parents=True, exist_ok=True)
+            (out / "faults.json").write_text(json.dumps(report, indent=1) + "\n")
+    sys.exit(failures > 0)
+
+
+if __name__ == "__main__":
+    tyro.cli(measure)
