@@ -19,8 +19,8 @@ from pathlib import Path
 
 from mutations import mutated, packed
 
-TIMEOUT = 30
-"""Seconds after which a case counts as a hang; the slowest cases that are none take a few."""
+TIMEOUT = 120
+"""Seconds after which a case counts as a hang. The slowest cases take a few; making a finding smaller takes more."""
 
 RSS_MAX = 4096
 """Memory of the process, MiB, that counts as a finding: a case may decode Pillow's largest image."""
@@ -28,15 +28,18 @@ RSS_MAX = 4096
 INPUT_MAX = 2**17
 """Largest case, bytes; the files of the corpus have a few kB."""
 
-SMALLER_TRIES = 400
+SMALLER_TRIES = 200
 """Cases that are tried to make a finding smaller."""
 
+
+FRESH = 0.5
+"""Fraction of the cases that are changes of a file in the corpus, rather than of any input that reached new code."""
 
 MEASURED_EVERY = 8
 """Cases per case whose memory is measured."""
 
 
-def smaller(content, fails, rng):
+def smaller(content, fails):
     """Remove parts of a case as long as it fails in the same way: members of a ZIP, then ranges of bytes."""
     import io
     import zipfile
@@ -78,6 +81,7 @@ def child(options):
     folder = Path(tempfile.mkdtemp())
     saved = options.out / options.reader
     counts = {"cases": 0, "read": 0, "refused": 0, "none": 0, "findings": {}}
+    starts = [path.read_bytes() for path in sorted((readers.CORPUS / options.reader).iterdir())]
     end = time.monotonic() + options.seconds if options.seconds else None
 
     def outcome(content):
@@ -94,7 +98,10 @@ def child(options):
             counts[result] += 1
         elif result not in counts["findings"]:
             text = "".join(traceback.format_exception(error))
-            least = smaller(content, lambda c: outcome(c)[0] == result, random.Random(0))
+            counts["findings"][result] = ""  # is being made smaller: a hang leaves the case as it is
+            (saved / "found-whole").write_bytes(content)
+            least = smaller(content, lambda c: outcome(c)[0] == result)
+            (saved / "found-whole").unlink()
             name = f"found-{hashlib.sha256(least).hexdigest()[:10]}"
             counts["findings"][result] = name
             (saved / name).write_bytes(least)
@@ -106,7 +113,9 @@ def child(options):
             os._exit(0)
 
     def changed(content, most, seed):
-        result = mutated(content, random.Random(seed))
+        rng = random.Random(seed)
+        # Most inputs that reach new code are refused, and so are changes of them: half of the cases start anew.
+        result = mutated(rng.choice(starts) if rng.random() < FRESH else content, rng)
         return result if len(result) <= most else content[:most]
 
     flags = [f"-seed={options.seed}", f"-timeout={TIMEOUT}", f"-rss_limit_mb={RSS_MAX}", f"-max_len={INPUT_MAX}"]

@@ -1,24 +1,19 @@
-"""Write the corpus that fuzzing starts from: ``python tests/stability/make_corpus.py``. Found cases stay.
+"""Write the corpus that fuzzing starts from; found cases stay.
 
+Run it as ``PYTHONPATH=.:tests:tests/dataset python tests/stability/make_corpus.py`` from the root of the project.
 The files come from clsplat's own writers and those of its tests; the pictures cover the kinds that Pillow writes.
 """
 
-import gzip
 import io
 import json
-import sys
 import tempfile
 import warnings
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, PngImagePlugin
-
-for part in ("", "dataset", "stability"):
-    sys.path.insert(0, str(Path(__file__).parents[1] / part))
-
 from mutations import packed
+from PIL import Image, PngImagePlugin
 from readers import CHECKPOINT_CONFIG, CORPUS, READERS
 from test_colmap import write_bin, write_txt
 from test_loading import write_transforms
@@ -47,7 +42,9 @@ def put(reader, name, content):
 
 def tree(folder):
     """A ZIP of the files in a folder."""
-    return packed({p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()})
+    return packed(
+        {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    )
 
 
 def picture(image, form="PNG", **options):
@@ -117,7 +114,7 @@ def pictures():
     }
     for name, content in images.items():
         put("photo", name, content)
-    black_and_white = Image.fromarray(np.repeat(RNG.integers(0, 2, (12, 16), dtype=np.uint8) * 255, 1, axis=1))
+    black_and_white = Image.fromarray(RNG.integers(0, 2, (12, 16), dtype=np.uint8) * 255)
     put("mask", "grey.png", picture(black_and_white))
     put("mask", "bit-1.png", picture(black_and_white.convert("1")))
     put("mask", "alpha.png", picture(black_and_white.convert("RGBA")))
@@ -180,7 +177,8 @@ def recovered(folder):
 
     root = folder / "recovered"
     model(root, write_bin, CAMERAS[:1], [(f"{k}.png", 1, (1.0, 0.0, 0.0, 0.0), (k, 0.0, 2.0)) for k in range(3)])
-    scene = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=3, num_points3D=4))
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=3, num_points3D=4)
+    scene = pycolmap.synthesize_dataset(options)
     scene.write_binary(root / "sparse" / "0")
     hashes = reconstruction._hashes(root)
     record = {"photos": ".", "registered": 3, "options": asdict(SfmConfig()), "hashes": hashes}
@@ -209,20 +207,20 @@ def checkpoint(folder):
 
 
 def settings():
-    scene = FORMATS[".ply"]
     path = CORPUS / "ply" / "degree-0"
     lines = [{"iteration": k, "num_gaussians": 6, "seconds": k / 10, "loss": 0.1} for k in (10, 20)]
     lines[-1] |= {"psnr": 20.5, "ssim": 0.5}
     log = "".join(json.dumps(line) + "\n" for line in lines).encode()
     config = json.dumps({"data_path": "photos", **asdict(TrainConfig())}, indent=1).encode()
-    assert scene.load(path)
     put("run", "finished", packed({"log.jsonl": log, "config.json": config, "scene.ply": path.read_bytes()}))
     put("run", "in-progress", packed({"log.jsonl": log, "config.json": config}))
     put("config-json", "whole", config)
     for name in PRESETS:
         put("config-json", name, json.dumps({"iterations": load_preset(name).iterations}).encode())
-    put("config-yaml", "part", b"# a part\niterations: 100\nsize: fixed\noptim:\n  means_lr: 1.0e-4\ninit: {opacity: 0.1}\n")
-    put("config-yaml", "anchors", b"iterations: &n 100\neval_every: *n\ndevice: ~\nseed: 0x10\nrender:\n  mode: classic\n")
+    part = b"# a part\niterations: 100\nsize: fixed\noptim:\n  means_lr: 1.0e-4\ninit: {opacity: 0.1}\n"
+    put("config-yaml", "part", part)
+    anchors = b"iterations: &n 100\neval_every: *n\ndevice: ~\nseed: 0x10\nrender:\n  mode: classic\n"
+    put("config-yaml", "anchors", anchors)
     key = {"scene": "fox", "method": "auto", "max_gaussians": None, "iterations": 8, "seed": 0, "device": "here"}
     about = {"driver": "1", "version": "0.1", "commit": "abc", "load": 0.5, "date": "2026-11-22T00:00:00+00:00"}
     about |= {"compute_units": 2, "settings": {"downscale": 4}}
@@ -241,8 +239,6 @@ def main():
         recovered(folder)
         checkpoint(folder)
         settings()
-    path = CORPUS / "spz" / "degree-0"
-    assert path.stat().st_size and gzip
 
 
 if __name__ == "__main__":

@@ -22,8 +22,15 @@ DEEP = 3000
 DIGITS = 5000
 """Digits of an integer: more than Python converts from text."""
 EDGE_MAX = 256
-"""Pictures with longer edges are not decoded to change their pixels, which would take the time of many other cases."""
-LONG_VALUES = [b"[" * DEEP + b"]" * DEEP, b'{"a":' * DEEP + b"1" + b"}" * DEEP, b"9" * DIGITS, b'"' + b"x" * DIGITS + b'"']
+"""Pictures with longer edges are not decoded to change their pixels, which takes long."""
+LONG_VALUES = [
+    b"[" * DEEP + b"]" * DEEP,
+    b'{"a":' * DEEP + b"1" + b"}" * DEEP,
+    b"9" * DIGITS,
+    b'"' + b"x" * DIGITS + b'"',
+]
+YAML = ["!!map [1]", "!!timestamp 2020-13-45", "&a [*a]", "!!binary x", "~", "- x", "? [1]", "<<: 3", "*n"]
+"""Values of YAML that its parser makes into other objects than JSON has."""
 MODES = ["1", "L", "LA", "P", "RGB", "RGBA", "I;16", "I", "F", "CMYK"]
 
 
@@ -123,6 +130,8 @@ def npy_changed(content, rng):
         data[at * array.itemsize : at * array.itemsize + len(new)] = new
         array = np.frombuffer(bytes(data), array.dtype).reshape(array.shape)
     elif kind < 0.65:
+        if array.dtype.kind == "U":
+            return raw(content, rng)
         with np.errstate(all="ignore"):
             array = array.astype(rng.choice(["f2", "f4", "f8", ">f4", "c8", "i4", "i8", "u1", "U3", "?"]), copy=True)
     elif kind < 0.8:
@@ -156,7 +165,20 @@ def png_changed(content, rng):
         except zlib.error:
             chosen[1] = raw(chosen[1], rng)
     elif kind < 0.85:
-        names = [b"tRNS", b"PLTE", b"eXIf", b"gAMA", b"sRGB", b"iCCP", b"zTXt", b"tEXt", b"acTL", b"fcTL", b"pHYs", b"bKGD"]
+        names = [
+            b"tRNS",
+            b"PLTE",
+            b"eXIf",
+            b"gAMA",
+            b"sRGB",
+            b"iCCP",
+            b"zTXt",
+            b"tEXt",
+            b"acTL",
+            b"fcTL",
+            b"pHYs",
+            b"bKGD",
+        ]
         chunks.insert(rng.randrange(len(chunks)), [rng.choice(names), rng.randbytes(rng.choice([0, 1, 2, 6, 40]))])
     elif kind < 0.93:
         chunks.remove(chosen)
@@ -186,7 +208,9 @@ def picture_changed(content, rng):
                 result = result.resize([max(1, e + rng.choice([-4, -1, 0, 1, 60])) for e in result.size])
             elif kind < 0.85:
                 mode = rng.choice(MODES)
-                result = Image.new(mode, result.size, rng.choice([0, 1, 255])) if mode == "I;16" else result.convert(mode)
+                result = (
+                    Image.new(mode, result.size, rng.choice([0, 1, 255])) if mode == "I;16" else result.convert(mode)
+                )
             else:
                 exif[0x0112] = rng.choice([0, 1, 3, 6, 8, 9, 65535])
             file = io.BytesIO()
@@ -202,9 +226,11 @@ def json_changed(value, rng):
     for _ in range(rng.choice([1, 1, 2, 3])):
         value = changed(value, rng.randrange(2**20), rng.choice([*JSON_VALUES, ...]))
     content = json.dumps(value).encode()
-    return damaged(content, [("number", rng.randrange(2**20), "@")]).replace(b"@", rng.choice(LONG_VALUES), 1) if (
-        rng.random() < 0.03
-    ) else content
+    return (
+        damaged(content, [("number", rng.randrange(2**20), "@")]).replace(b"@", rng.choice(LONG_VALUES), 1)
+        if (rng.random() < 0.03)
+        else content
+    )
 
 
 def lines_changed(content, rng):
@@ -217,9 +243,7 @@ def lines_changed(content, rng):
         except (ValueError, RecursionError):
             lines[at] = raw(lines[at], rng)
     elif kind < 0.5:
-        numbers = [*NUMBERS, "!!map [1]", "!!timestamp 2020-13-45", "&a [*a]", "!!binary x", "~", "- x", "? [1]", "<<: 3"]
-        place = rng.randrange(2**20)
-        return damaged(content, [("number", place, rng.choice(numbers))])
+        return damaged(content, [("number", rng.randrange(2**20), rng.choice([*NUMBERS, *YAML]))])
     elif kind < 0.6:
         del lines[at]
     elif kind < 0.7:

@@ -78,21 +78,25 @@ def read_sparse(model: Path) -> SparseModel:
 
     try:
         found = pycolmap.Reconstruction(model)
-    except (OSError, RuntimeError, ValueError) as error:
+        images = sorted((i for i in found.images.values() if i.has_pose), key=lambda image: image.name)
+        poses = [image.cam_from_world() for image in images]
+        points = list(found.points3D.values())
+        result = SparseModel(
+            [image.name for image in images],
+            np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3),
+            np.array([pose.rotation.matrix()[2] for pose in poses]).reshape(-1, 3),
+            np.array([image.num_points3D for image in images]),
+            np.array([point.xyz for point in points]).reshape(-1, 3),
+            np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+            float(found.compute_mean_reprojection_error()),
+            float(found.compute_mean_track_length()),
+        )
+    # COLMAP raises errors of many kinds on damaged files: IndexError, RuntimeError, MemoryError ...
+    except Exception as error:
         raise InputError(f"cannot read {model} as a COLMAP model: {error}") from error
-    images = sorted((i for i in found.images.values() if i.has_pose), key=lambda image: image.name)
-    poses = [image.cam_from_world() for image in images]
-    points = list(found.points3D.values())
-    return SparseModel(
-        [image.name for image in images],
-        np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3),
-        np.array([pose.rotation.matrix()[2] for pose in poses]).reshape(-1, 3),
-        np.array([image.num_points3D for image in images]),
-        np.array([point.xyz for point in points]).reshape(-1, 3),
-        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        float(found.compute_mean_reprojection_error()),
-        float(found.compute_mean_track_length()),
-    )
+    if not all(np.isfinite(array).all() for array in (result.positions, result.directions, result.points)):
+        raise InputError(f"{model}: expected finite poses and points, found others")
+    return result
 
 
 @dataclass(frozen=True, eq=False)
