@@ -1,4 +1,4 @@
-"""Fuzz the readers of clsplat, guided by coverage: ``make fuzz MINUTES=10``. Needs Atheris (pip install atheris).
+"""Fuzz the readers of clsplat, guided by coverage: ``make fuzz MINUTES=15``. Needs the extra `fuzz`.
 
 Each reader runs in a process of its own, from the files in ``corpus/READER``. Inputs that reach new code are kept and
 changed further (libFuzzer); changes are those of `mutations`. Whatever fails is made smaller and saved in
@@ -145,7 +145,7 @@ def main():
     """Run all readers, one after the other, and print what they covered and found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("readers", nargs="*", help="readers; default: all")
-    parser.add_argument("--minutes", type=float, default=10, help="for all readers together")
+    parser.add_argument("--minutes", type=float, default=15, help="for all readers together")
     parser.add_argument("--runs", type=int, help="cases of each reader, instead of --minutes")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("build/fuzz"))
