@@ -18,7 +18,7 @@ from clsplat.bench.captures_report import details, summary
 from clsplat.bench.quality_summary import failures, trainings
 from clsplat.bench.results import read_records
 from clsplat.commands.info import dataset_lines, run_lines, scene_lines
-from clsplat.config import DataConfig, TrainConfig
+from clsplat.config import DataConfig, InitConfig, TrainConfig
 from clsplat.dataset import load_scene
 from clsplat.dataset.photos import (
     is_plain,
@@ -35,6 +35,7 @@ from clsplat.errors import InputError
 from clsplat.formats import FORMATS, load_gaussians
 from clsplat.formats.quantisation import EXPANSION_FREE
 from clsplat.training.checkpoint import load_state
+from clsplat.training.initialize import initialize
 from clsplat.training.presets import load_config
 from clsplat.training.recorder import log_file
 
@@ -116,9 +117,14 @@ def read_dataset(path):
     scene = load_scene(path, DataConfig(test_every=0))
     finite(points=scene.points, offset=scene.offset, extent=scene.extent)
     expect(len(scene.points) == len(scene.colors) and scene.colors.dtype == np.uint8, "points unlike their colours")
+    for part in (scene.train, scene.test):
+        expect(len({view.name for view in part}) == len(part), "two photos of one name")
+    if len(scene.points):
+        finite(**initialize(scene, InitConfig(), 0, None).arrays())
     for view in scene.train + scene.test:
         camera = view.camera
-        finite(viewmat=camera.viewmat, focal=(camera.fx, camera.fy), near=camera.near_depth)
+        finite(viewmat=camera.viewmat, near=np.float32(camera.near_depth))
+        expect(np.float32(min(camera.fx, camera.fy)) > 0, "a focal length of 0 in single precision")
         expect(view.image.shape == (camera.height, camera.width, 3), "a photo unlike its camera")
         expect(view.mask is None or view.mask.shape == view.image.shape[:2], "a mask unlike its photo")
 
