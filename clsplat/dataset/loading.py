@@ -80,7 +80,9 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
                 raise InputError(f"{path}: expected a camera for each photo, found several for {view.name}")
     scene = _near_origin(Scene(train, test, dataset.points, dataset.colors))
     if np.abs(scene.points).max(initial=0) > FLOAT32_MAX:
-        raise InputError(f"{path}: expected points in the range of single precision, found {np.abs(scene.points).max()}")
+        raise InputError(
+            f"{path}: expected points in the range of single precision, found {np.abs(scene.points).max()}"
+        )
     return with_near_planes(scene)
 
 
