@@ -1,7 +1,7 @@
 PYTHON = python
 
-.PHONY: test test-slow stability fuzz faults soak lint docs check-races bench bench-knobs bench-quality bench-captures bench-stability \
-  formats
+.PHONY: test test-slow stability fuzz fuzz-cases faults mutants soak lint docs check-races bench bench-knobs bench-quality \
+  bench-captures bench-stability formats
 
 # Run the default tests: a few minutes on two cores.
 test:
@@ -15,9 +15,16 @@ test-slow:
 stability:
 	$(PYTHON) -m pytest -m slow tests/stability tests/training/test_faults.py
 
+# Fuzz every reader of files for MINUTES in all, guided by coverage; needs the extra `fuzz` (Linux). With RUNS, each
+# reader gets that number of cases instead, and the same SEED draws the same ones. READER selects readers.
+fuzz: MINUTES = 15
+fuzz:
+	$(PYTHON) tests/stability/fuzz_readers.py $(READER) $(if $(RUNS),--runs $(RUNS),--minutes $(MINUTES)) \
+	  $(if $(SEED),--seed $(SEED))
+
 # Run the fuzzed tests with CASES new random cases each: more than 100 000 cases, about half an hour.
 CASES = 4000
-fuzz:
+fuzz-cases:
 	CLSPLAT_FUZZ=$(CASES) $(PYTHON) -m pytest --hypothesis-profile=fuzz $(shell ls tests/stability/test_fuzz_*.py)
 
 # Fail each call of the system and of the device in turn, in every command of tests/training/measure_faults.py:
@@ -27,9 +34,16 @@ faults:
 	PYTHONPATH=tests/training:tests/commands:$(PYTHONPATH) $(PYTHON) tests/training/measure_faults.py --every $(EVERY) \
 	  -o build/faults
 
+# Change the mathematics in COUNT places, one at a time, and list which changes the tests see: build/mutants.jsonl. It
+# takes hours, and goes on where it was interrupted.
+COUNT = 320
+mutants:
+	mkdir -p build
+	$(PYTHON) -u tests/mutants/measure_mutants.py --count $(COUNT) -o build/mutants.jsonl
+
 # Train for MINUTES under a viewer whose clients come and go, and check that the memory does not grow and that the bits
 # stay: build/soak/soak.png and soak.json. Linux only.
-MINUTES = 180
+soak: MINUTES = 180
 soak:
 	$(PYTHON) tests/show/measure_soak.py --minutes $(MINUTES) -o build/soak
 

@@ -85,8 +85,8 @@ class Camera:
         values = np.abs(np.append(viewmat, intrinsics))
         if not (values <= np.finfo(np.float32).max).all():
             raise InputError(f"camera: expected finite viewmat and intrinsics, as float32, found {values.max()}")
-        if self.fx <= 0 or self.fy <= 0:
-            raise InputError(f"camera: expected positive focal lengths, found fx={self.fx}, fy={self.fy}")
+        if min(self.fx, self.fy) < np.finfo(np.float32).tiny:
+            raise InputError(f"camera: expected positive focal lengths, as float32, found fx={self.fx}, fy={self.fy}")
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: expected a size of at least 1x1, found {self.width}x{self.height}")
         if self.near is not None and not np.finfo(np.float32).tiny <= self.near <= np.finfo(np.float32).max:
@@ -121,7 +121,8 @@ class Camera:
         This is the angle of the image's farthest corner, enlarged by FRUSTUM_MARGIN. It is limited to
         FISHEYE_ANGLE_MAX and to the range in which the radius in the image grows with the angle.
         """
-        k1, k2, k3, k4 = self.distortion
+        # Coefficients that are 0 in single precision: quotients by the last of them would overflow.
+        k1, k2, k3, k4 = (k if abs(k) >= np.finfo(np.float32).tiny else 0.0 for k in self.distortion)
         turns = np.roots([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])  # d theta_d/d theta, in theta^2
         turns = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0)]
         most = min(FISHEYE_ANGLE_MAX, float(np.sqrt(turns.min(initial=np.inf))))

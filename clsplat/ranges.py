@@ -9,6 +9,7 @@ from ctypes import c_float
 from dataclasses import dataclass, fields, is_dataclass
 from decimal import Decimal
 from importlib import import_module
+from reprlib import Repr
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -196,7 +197,18 @@ def _one(value: Any, kinds: tuple[Any, ...], rule: Rule | None, name: str) -> An
     rounded = ""
     if isinstance(value, float) and isinstance(rule, Range) and rule.contains(value) and not rule.holds(value):
         rounded = f", which is {single(value)} in single precision"
-    raise InputError(f"{name}: expected {expected}, found {value!r:.60}{rounded}")
+    raise InputError(f"{name}: expected {expected}, found {shown(value)}{rounded}")
+
+
+def shown(value: Any) -> str:
+    """Text of a value for a message, at most 60 characters.
+
+    Nested values are abbreviated before they are written: aliases in YAML can stand for more text than memory holds.
+    """
+    brief = Repr()
+    brief.maxlevel = 2
+    brief.maxstring = brief.maxlong = brief.maxother = 60
+    return brief.repr(value)[:60]
 
 
 def _is_of(value: Any, kind: Any) -> bool:

@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, settings
 
 from clsplat.device import Device
 
-# No clock and no chance in the default run: the same cases each time, however slow the machine. `make fuzz` draws new
-# ones.
+# No clock and no chance in the default run: the same cases each time, however slow the machine. `make fuzz-cases`
+# draws new ones.
 EVERYWHERE = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck), "print_blob": True}
 settings.register_profile("default", derandomize=True, max_examples=60, **EVERYWHERE)
 settings.register_profile("fuzz", max_examples=int(os.environ.get("CLSPLAT_FUZZ", 6000)), **EVERYWHERE)

@@ -23,7 +23,7 @@ STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__i
 # A unit is a package or a module of the top level. It imports only from the rows above its own.
 LAYERS = """
     constants errors randomness display
-    ranges
+    ranges json_lines
     config atomic
     camera gaussians
     scene stages metrics panorama device

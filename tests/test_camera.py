@@ -29,7 +29,7 @@ def random_camera(seed=0):
         ({"viewmat": np.eye(3)}, r"viewmat: expected shape \(4, 4\), found \(3, 3\)"),
         ({"viewmat": np.full((4, 4), np.nan)}, "expected finite viewmat"),
         ({"cx": np.inf}, "expected finite viewmat and intrinsics"),
-        ({"fx": 0}, "positive focal lengths, found fx=0"),
+        ({"fx": 0}, "positive focal lengths, as float32, found fx=0"),
         ({"fy": -1}, "positive focal lengths"),
         ({"width": 0}, "at least 1x1, found 0x48"),
         ({"viewmat": viewmat_with(np.diag([1, 1, -1]))}, "determinant -1"),

@@ -2,10 +2,11 @@
 
 import json
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from clsplat.atomic import replacing
-from clsplat.errors import InputError
+from clsplat.json_lines import KNOWN, read_json_lines
 
 Record = dict[str, Any]
 
@@ -14,6 +15,23 @@ FILE = "results.jsonl"
 
 KEYS = ("scene", "method", "max_gaussians", "iterations", "seed", "device")
 """Entries of every record. Records that agree in all of them belong to one training."""
+
+FIGURES = (
+    *("psnr", "ssim", "flip", "worst", "rare_psnr", "best", "train_psnr", "fps", "load"),
+    *("seconds", "cpu_seconds", "num_gaussians", "spz_bytes", "memory_bytes"),
+)
+"""Entries that are numbers, or None where they were not measured."""
+
+TEXTS = ("scene", "method", "device", "failed", "driver", "version", "date")
+
+KINDS: dict[str, tuple[type, ...]] = {
+    **{name: KNOWN for name in FIGURES},
+    **{name: (str,) for name in TEXTS},
+    **{name: (int,) for name in ("iterations", "iteration", "seed", "compute_units")},
+    "max_gaussians": (int, NoneType),
+    "commit": (str, NoneType),
+}
+"""Types of the entries of a record that charts and reports use."""
 
 
 def read_records(path: Path) -> list[Record]:
@@ -28,20 +46,7 @@ def read_records(path: Path) -> list[Record]:
     """
     if not path.exists():
         return []
-    try:
-        lines = path.read_text(encoding="utf-8").split("\n")[:-1]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from error
-    records = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            record = json.loads(line)
-            if not set(KEYS) <= record.keys():
-                raise ValueError(f"expected {', '.join(KEYS)}")
-        except (ValueError, AttributeError) as error:
-            raise InputError(f"{path}, line {number}: expected a record of a bench, found {line[:60]!r}") from error
-        records.append(record)
-    return records
+    return read_json_lines(path, "a record of a bench", KINDS, KEYS)
 
 
 def append_record(path: Path, record: Record) -> None:

@@ -23,6 +23,9 @@ BAR = 40
 BINS = 10
 """Number of bars of a histogram."""
 
+LOG_SIZE_MAX = 700.0
+"""Largest magnitude of a logarithm that is drawn: exp(700) is a float64, exp(710) is not."""
+
 
 @dataclass(frozen=True)
 class Info:
@@ -83,9 +86,9 @@ def run_lines(folder: Path) -> list[str]:
     if config.is_file():
         try:
             settings = json.loads(config.read_text(encoding="utf-8"))
-            total = f" of {settings['iterations']:,}"
+            total = f" of {int(settings['iterations']):,}"
             rows |= {"dataset": str(settings[DATA_PATH])} if DATA_PATH in settings else {}
-        except (ValueError, KeyError, TypeError) as error:
+        except (ArithmeticError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(f"{config}: expected the settings of a run, found {error!r}") from error
         rows["iterations"] = f"{last['iteration']:,}{total}"
     rows["time"] = f"{last['seconds']:.0f} s"
@@ -141,7 +144,8 @@ def dataset_lines(path: Path) -> list[str]:
 
 def _histograms(gaussians: "Gaussians") -> list[str]:
     opacities = _histogram(gaussians.opacities, np.linspace(0, 1, BINS + 1))
-    sizes = np.exp(gaussians.log_scales.mean(axis=1, dtype=np.float64))
+    logs = gaussians.log_scales.mean(axis=1, dtype=np.float64)
+    sizes = np.exp(np.clip(logs, -LOG_SIZE_MAX, LOG_SIZE_MAX))
     low, high = np.percentile(sizes, [0.5, 99.5])
     edges = np.geomspace(low, max(high, low * 1.01), BINS + 1)
     return [

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from clsplat.dataset.photos import list_photos
 from clsplat.dataset.sfm import reconstruction as sfm
 from clsplat.dataset.sfm.triangulation import filled, triangulate
 from clsplat.errors import InputError
-from clsplat.ranges import check
+from clsplat.ranges import FLOAT32_MAX, check
 from clsplat.scene import Scene, View
 
 OFFSET_EXTENTS = 1000
@@ -50,8 +51,9 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
     Raises
     ------
     InputError
-        If a setting is out of range, the folder holds no dataset, a file is missing or damaged, or no photo is left
-        to train on; the message names the setting or the file.
+        If a setting is out of range, the folder holds no dataset, a file is missing or damaged, a photo has several
+        cameras, a point is not finite in single precision, or no photo is left to train on; the message names the
+        setting or the file.
 
     Warns
     -----
@@ -72,7 +74,16 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
         raise InputError(
             f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
         )
-    return with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
+    for part in (train, test):
+        for before, view in pairwise(part):  # sorted by name
+            if before.name == view.name:
+                raise InputError(f"{path}: expected a camera for each photo, found several for {view.name}")
+    scene = _near_origin(Scene(train, test, dataset.points, dataset.colors))
+    if np.abs(scene.points).max(initial=0) > FLOAT32_MAX:
+        raise InputError(
+            f"{path}: expected points in the range of single precision, found {np.abs(scene.points).max()}"
+        )
+    return with_near_planes(scene)
 
 
 def _split(views: list[View], dataset: Dataset, test_every: int) -> tuple[list[View], list[View]]:

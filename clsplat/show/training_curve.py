@@ -1,6 +1,5 @@
 """The training log as a chart."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +7,10 @@ import numpy as np
 
 from clsplat.atomic import replacing
 from clsplat.errors import InputError
+from clsplat.json_lines import KNOWN, NUMBER, read_json_lines
+
+KINDS = {"iteration": (int,), "num_gaussians": (int,), "seconds": NUMBER, "loss": NUMBER, "psnr": KNOWN}
+"""Types of the entries of a training log that are used."""
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
@@ -20,20 +23,7 @@ def read_log(path: Path) -> list[dict[str, Any]]:
     InputError
         If the log cannot be read, is empty or has an invalid line.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").split("\n")[:-1]
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot read {path}: {reason}") from error
-    records = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            record = json.loads(line)
-            if not {"iteration", "num_gaussians", "seconds"} <= record.keys():
-                raise ValueError("expected iteration, num_gaussians and seconds")
-        except (ValueError, AttributeError) as error:
-            raise InputError(f"{path}, line {number}: expected a record of training, found {line[:60]!r}") from error
-        records.append(record)
+    records = read_json_lines(path, "a record of training", KINDS, ("iteration", "num_gaussians", "seconds"))
     if not records:
         raise InputError(f"{path}: expected the records of a training run, found none")
     return records

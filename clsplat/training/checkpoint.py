@@ -4,7 +4,7 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +19,8 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import download, fetch
 from clsplat.scene import Scene
-from clsplat.training.autosize.rule import Candidate, Search, SmallSide, Trial
+from clsplat.training import photo_exposures, photo_poses
+from clsplat.training.autosize.rule import Candidate, Search, SmallSide
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.inputs import Inputs
 from clsplat.training.optimizer import Moments
@@ -139,6 +140,11 @@ def load_state(path: Path, extent: float, config: TrainConfig, inputs: Inputs | 
         state = None if saved != asked else _to_state(arrays, extent, config)
     if state is None:
         raise InputError(f"{path}: expected the configuration it was made with, found other {', '.join(changed)}")
+    for learned in (state.exposures, state.poses):
+        if learned and made_from.train and sorted(learned.names) != sorted(made_from.train):
+            raise InputError(
+                f"{path}: expected a checkpoint of clsplat, found a damaged file: parameters of other photos"
+            )
     state.inputs = made_from
     return state
 
@@ -154,24 +160,32 @@ def _damage_named(path: Path) -> Iterator[None]:
 def _to_state(arrays: Arrays, extent: float, config: TrainConfig) -> State:
     search = None
     if "search" in arrays:
-        saved = json.loads(str(arrays["search"]))
-        trials = [Trial(grows, Candidate(*small), Candidate(*large)) for grows, small, large in saved["trials"]]
-        degrees, small_side = [Candidate(*c) for c in saved["degrees"]], None
+        saved, small_side = json.loads(str(arrays["search"])), None
         if "small_side" in saved:
-            small_side = SmallSide(_to_rows(arrays, "small_side.", extent, config), Candidate(*saved["small_side"]))
-        known = {name: saved[name] for name in SEARCH} | {"trials": trials, "degrees": degrees}
-        search = Search(**known, small_side=small_side)
+            candidate = Candidate.restored(saved["small_side"])
+            small_side = SmallSide(_to_rows(arrays, "small_side.", extent, config), candidate)
+        search = Search.restored(saved, small_side)
+    iteration, rows = arrays["iteration"], _to_rows(arrays, "", extent, config)
+    if iteration.dtype.kind != "i" or not 0 <= iteration <= (config.iterations or iteration):
+        raise ValueError(f"iteration {iteration} of {config.iterations}")
+    for name in ("seconds", "intersections", "losses"):
+        array = arrays[name]
+        if array.dtype != np.float64 or array.ndim != (name == "losses") or not np.isfinite(array).all():
+            raise ValueError(f"{name} = {array}")
+    pixels = arrays.get("pixels")
+    if pixels is not None and (pixels.dtype != np.float32 or pixels.shape != (len(rows.gaussians),)):
+        raise ValueError(f"pixels of type {pixels.dtype} and shape {pixels.shape}")
     return State(
-        iteration=int(arrays["iteration"]),
+        iteration=int(iteration),
         seconds=float(arrays["seconds"]),
         extent=extent,
-        rows=_to_rows(arrays, "", extent, config),
+        rows=rows,
         intersections=float(arrays["intersections"]),
         losses=[float(loss) for loss in arrays["losses"]],
         search=search,
-        exposures=_to_photo_parameters(arrays, "exposures."),
-        poses=_to_photo_parameters(arrays, "poses."),
-        filter=SmoothingFilter(arrays.get("pixels")) if config.filter_3d else None,
+        exposures=_to_photo_parameters(arrays, "exposures.", photo_exposures.start) if config.exposure else None,
+        poses=_to_photo_parameters(arrays, "poses.", photo_poses.start) if config.poses else None,
+        filter=SmoothingFilter(pixels) if config.filter_3d else None,
     )
 
 
@@ -179,9 +193,8 @@ def _with_prefix(arrays: Arrays, prefix: str) -> Arrays:
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
-def _to_photo_parameters(arrays: Arrays, prefix: str) -> PerPhoto | None:
-    learned = _with_prefix(arrays, prefix)
-    return PerPhoto.restored(learned) if learned else None
+def _to_photo_parameters(arrays: Arrays, prefix: str, start: Callable[[list[str]], PerPhoto]) -> PerPhoto:
+    return PerPhoto.restored(_with_prefix(arrays, prefix), start)
 
 
 def _to_rows(arrays: Arrays, prefix: str, extent: float, config: TrainConfig) -> Rows:
@@ -197,6 +210,8 @@ def _to_gaussians(arrays: Arrays, prefix: str, like: Gaussians | None = None) ->
     for name, array in gaussians.arrays().items():
         if array.dtype != np.float32 or array.shape != (like or gaussians).arrays()[name].shape:
             raise ValueError(f"{prefix}{name} of type {array.dtype} and shape {array.shape}")
+        if not np.isfinite(array).all():  # a run that diverges saves no checkpoint
+            raise ValueError(f"{prefix}{name} with values that are not finite")
     return gaussians
 
 

@@ -1,5 +1,6 @@
 """Parameters learned per training photo, with an optimiser (Adam) of their own on the host."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,7 +54,20 @@ class PerPhoto:
         return {**vars(self), "names": np.array(self.names)}
 
     @classmethod
-    def restored(cls, arrays: dict[str, Array]) -> "PerPhoto":
-        """Parameters from the arrays that `arrays` returned."""
-        numbers = (arrays[name] for name in ("values", "first", "second", "steps"))
-        return cls([str(name) for name in arrays["names"]], *numbers)
+    def restored(cls, arrays: dict[str, Array], start: "Callable[[list[str]], PerPhoto]") -> "PerPhoto":
+        """Parameters from the arrays that `arrays` returned; `start` makes those of their kind.
+
+        Raises
+        ------
+        KeyError, ValueError
+            If an array is missing, or has another type or shape; if values are not finite or steps negative.
+        """
+        names = [str(name) for name in arrays["names"]]
+        fresh = start(names).arrays()
+        for name in ("values", "first", "second", "steps"):
+            array = arrays[name]
+            if (array.dtype, array.shape) != (fresh[name].dtype, fresh[name].shape):
+                raise ValueError(f"{name} of type {array.dtype} and shape {array.shape} for {len(names)} photos")
+        if not np.isfinite(arrays["values"]).all() or (arrays["steps"] < 0).any():
+            raise ValueError("values that are not finite, or negative steps")
+        return cls(names, *(arrays[name] for name in ("values", "first", "second", "steps")))

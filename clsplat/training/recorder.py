@@ -126,11 +126,12 @@ def log_file(path: Path, iteration: int) -> Append:
     """
     kept = []
     if iteration and path.exists():
-        for line in path.read_text().splitlines():
+        for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
             try:
                 if json.loads(line)["iteration"] <= iteration:
                     kept.append(line)
-            except (json.JSONDecodeError, KeyError):  # a line cut off when the run was killed
+            # A line cut off when the run was killed, or whose blocks the disk lost.
+            except (ValueError, KeyError, TypeError, RecursionError):
                 continue
     with replacing(path) as file:
         file.writelines(f"{line}\n".encode() for line in kept)

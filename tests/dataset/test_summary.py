@@ -100,7 +100,7 @@ def test_the_model_is_read(dataset):
     )
     assert model.points_seen.tolist() == [1, 1, 1]
     np.testing.assert_array_equal(model.colors, [[10, 20, 30]])
-    with pytest.raises(InputError, match=r"cannot read .* as a COLMAP model"):
+    with pytest.raises(InputError, match=r"cannot find .*cameras\.bin"):
         read_sparse(dataset)
 
 

@@ -4,7 +4,7 @@ Mutants are drawn at random from the kernels, their launches, the densification 
 applied to a copy of the project, in which the tests of that file run until one fails. The results are one JSON object
 per line; mutants that are in them already are not repeated. Requires a system that can fork a process.
 
-    $ python tests/mutants/measure_mutants.py --count 320 -o docs/results/mutants.jsonl
+    $ make mutants COUNT=320
 """
 
 import argparse

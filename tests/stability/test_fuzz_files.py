@@ -2,7 +2,7 @@
 memory.
 
 A file is written correctly. Then bytes are cut, flipped and spliced, and numbers are replaced by extreme ones, also
-inside its compressed parts. `make fuzz` runs the same tests with many more cases.
+inside its compressed parts. `make fuzz-cases` runs the same tests with many more cases.
 """
 
 import gzip
@@ -18,6 +18,7 @@ from damage import ANY, BINARY, JSON_CHANGES, JSON_VALUES, TEXT, changed, damage
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from readers import MEMORY_MAX, PHOTO_MEMORY_MAX
 from test_colmap import write_bin, write_photos, write_txt
 from test_loading import write_transforms
 
@@ -26,18 +27,10 @@ from clsplat.dataset import colmap, load_scene, transforms
 from clsplat.dataset.photos import orientation, photo_size, read_photo
 from clsplat.errors import InputError
 from clsplat.formats import FORMATS, load_gaussians, save_gaussians
-from clsplat.formats.quantisation import EXPANSION_FREE
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
 from clsplat.training.checkpoint import load_state, save_state
 from clsplat.training.loop import initial_state
-
-MEMORY_MAX = 3 * EXPANSION_FREE
-"""Largest memory for reading a file of a few kB, bytes: the limit on decompressed data, and float copies of it."""
-
-PHOTO_MEMORY_MAX = 8 * 2 * Image.MAX_IMAGE_PIXELS
-"""The same for photos, bytes. A PNG of one colour takes a byte per thousand pixels, so that only the number of pixels
-is bounded: Pillow refuses more than twice MAX_IMAGE_PIXELS. A pixel takes two copies of its colour, and a byte."""
 
 
 def read(load, name, memory=MEMORY_MAX):

@@ -1,7 +1,7 @@
 """Scenes and cameras with extreme values: images and gradients are finite, or there is an InputError, but no crash.
 
 Single values or whole fields of a random scene are replaced by values that a diverged training, a converter or an
-attacker may produce (Brush's fuzz tests; Faster-GS). `make fuzz` runs the same test with many more cases.
+attacker may produce (Brush's fuzz tests; Faster-GS). `make fuzz-cases` runs the same test with many more cases.
 """
 
 import numpy as np

@@ -66,8 +66,10 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         check(SfmConfig(**record["options"]))
         if not isinstance(record["hashes"], dict) or not isinstance(record["registered"], int):
             raise TypeError("hashes or registered of another type")
-        return {**record, "photos": str(record["photos"])}
-    except (ValueError, KeyError, TypeError) as error:
+        photos = str(record["photos"])
+        (folder / photos).resolve().is_dir()  # raises an error for a text that cannot be a path
+        return {**record, "photos": photos}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
             f"cannot read {path}, the record of a structure from motion: {error!r}; delete its folder to recover the "
             "cameras again"

@@ -1,13 +1,16 @@
 """Summary of a structure from motion before training: figures, warnings, and a picture of the cameras."""
 
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
+from clsplat.dataset import colmap
 from clsplat.dataset.photos import list_photos, photo_folder, photo_sharpness
 from clsplat.dataset.sfm.reconstruction import read_record
 from clsplat.errors import InputError
@@ -76,23 +79,33 @@ def read_sparse(model: Path) -> SparseModel:
     """
     import pycolmap
 
+    colmap.read_model(model)  # COLMAP itself allocates and loops as often as a damaged file declares
     try:
-        found = pycolmap.Reconstruction(model)
-    except (OSError, RuntimeError, ValueError) as error:
+        with TemporaryDirectory() as folder:
+            # Without rigs and frames: nothing else checks their counts, and nothing here needs them.
+            for path in model.iterdir():
+                if path.stem in ("cameras", "images", "points3D"):
+                    shutil.copy(path, folder)
+            found = pycolmap.Reconstruction(folder)
+        images = sorted((i for i in found.images.values() if i.has_pose), key=lambda image: image.name)
+        poses = [image.cam_from_world() for image in images]
+        points = list(found.points3D.values())
+        result = SparseModel(
+            [image.name for image in images],
+            np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3),
+            np.array([pose.rotation.matrix()[2] for pose in poses]).reshape(-1, 3),
+            np.array([image.num_points3D for image in images]),
+            np.array([point.xyz for point in points]).reshape(-1, 3),
+            np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+            float(found.compute_mean_reprojection_error()),
+            float(found.compute_mean_track_length()),
+        )
+    # COLMAP raises errors of many kinds on damaged files: IndexError, RuntimeError, MemoryError ...
+    except Exception as error:
         raise InputError(f"cannot read {model} as a COLMAP model: {error}") from error
-    images = sorted((i for i in found.images.values() if i.has_pose), key=lambda image: image.name)
-    poses = [image.cam_from_world() for image in images]
-    points = list(found.points3D.values())
-    return SparseModel(
-        [image.name for image in images],
-        np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3),
-        np.array([pose.rotation.matrix()[2] for pose in poses]).reshape(-1, 3),
-        np.array([image.num_points3D for image in images]),
-        np.array([point.xyz for point in points]).reshape(-1, 3),
-        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        float(found.compute_mean_reprojection_error()),
-        float(found.compute_mean_track_length()),
-    )
+    if not all(np.isfinite(array).all() for array in (result.positions, result.directions, result.points)):
+        raise InputError(f"{model}: expected finite poses and points, found others")
+    return result
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,11 +10,12 @@ doubling of the bytes. After that all photos train.
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import ceil, log2, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from clsplat.config import TrainConfig
+from clsplat.ranges import checked
 from clsplat.scene import Scene
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.rows import Rows
@@ -75,6 +76,16 @@ class Candidate(NamedTuple):
     quality: float
     views: list[float]
     cost: float
+
+    @classmethod
+    def restored(cls, saved: list[Any]) -> "Candidate":
+        """A candidate from its fields, as JSON gives them; other values raise TypeError or ValueError."""
+        iteration, n, sh_degree, quality, views, cost = saved
+        for number in (iteration, n, sh_degree):
+            checked(number, int, "candidate")
+        if min(iteration, n, sh_degree) < 0:
+            raise ValueError(f"candidate {saved}")
+        return cls(iteration, n, sh_degree, float(quality), [float(view) for view in views], float(cost))
 
     @property
     def worth(self) -> float:
@@ -142,6 +153,29 @@ class Search:
     settled: int = 0
     validated: list[list[float]] = field(default_factory=list)
     small_side: SmallSide | None = None
+
+    @classmethod
+    def restored(cls, saved: dict[str, Any], small_side: SmallSide | None) -> "Search":
+        """A search from its fields, as JSON gives them; other values raise KeyError, TypeError or ValueError."""
+        trials = [
+            Trial(checked(grows, bool, "grows"), Candidate.restored(smaller), Candidate.restored(larger))
+            for grows, smaller, larger in saved["trials"]
+        ]
+        validated = [[float(view) for view in views] for views in saved["validated"]]
+        sizes = {len(c.views) for trial in trials for c in (trial.smaller, trial.larger)} | {*map(len, validated)}
+        search = cls(
+            most=checked(saved["most"], int, "most"),
+            pace=checked(saved["pace"], float, "pace"),
+            grows=checked(saved["grows"], bool, "grows"),
+            trials=trials,
+            degrees=[Candidate.restored(degree) for degree in saved["degrees"]],
+            settled=checked(saved["settled"], int, "settled"),
+            validated=validated,
+            small_side=small_side,
+        )
+        if len(sizes) > 1 or search.most < 1 or search.pace <= 0 or search.settled < 0:
+            raise ValueError(f"search {saved}")
+        return search
 
     def holds_back(self, iteration: int) -> bool:
         """Whether photos are held back in an iteration: up to the one in which the search settles."""

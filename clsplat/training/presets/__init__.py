@@ -13,7 +13,7 @@ import yaml
 
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
-from clsplat.ranges import checked
+from clsplat.ranges import checked, shown
 
 FOLDER = Path(__file__).parent
 
@@ -75,6 +75,9 @@ def read_settings(path: Path) -> dict[str, Any]:
         """YAML loader that makes the same objects as JSON."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            named = isinstance(node, yaml.MappingNode)
+            if not named or not all(isinstance(key, yaml.ScalarNode) for key, _ in node.value):
+                raise yaml.constructor.ConstructorError(None, None, "expected settings by name", node.start_mark)
             return once(
                 [(str(self.construct_object(key)), self.construct_object(value, True)) for key, value in node.value]
             )
@@ -87,12 +90,14 @@ def read_settings(path: Path) -> dict[str, Any]:
             settings = json.loads(text, object_pairs_hook=once)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: expected JSON, found: {error}") from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise InputError(f"{path}: expected YAML, found: {' '.join(str(error).split())}") from error
+    except InputError:
+        raise
+    # PyYAML raises errors of many kinds for values such as the date 2020-13-45.
+    except (yaml.YAMLError, ArithmeticError, AttributeError, RecursionError, TypeError, ValueError) as error:
+        kind = "YAML" if path.suffix in YAML else "JSON"
+        raise InputError(f"{path}: expected {kind}, found: {' '.join(str(error).split())}") from error
     if not isinstance(settings, dict):
-        raise InputError(f"{path}: expected an object of settings, found {settings!r:.60}")
+        raise InputError(f"{path}: expected an object of settings, found {shown(settings)}")
     return settings
 
 
@@ -126,7 +131,7 @@ def with_settings(base: Settings, settings: dict[str, Any], source: str, within:
         where = f"{source}: {within}{name}"
         if is_dataclass(getattr(base, name)):
             if not isinstance(value, dict):
-                raise InputError(f"{where}: expected an object of settings, found {value!r:.60}")
+                raise InputError(f"{where}: expected an object of settings, found {shown(value)}")
             values[name] = with_settings(getattr(base, name), value, source, f"{within}{name}.")
         else:
             values[name] = checked(value, hints[name], where)
