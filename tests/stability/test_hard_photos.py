@@ -1,7 +1,8 @@
 """Photos that no scene explains, and photos that change or disappear: a usable scene or a sentence, nothing else."""
 
 import json
-import resource
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -16,12 +17,23 @@ from clsplat.commands import train as train_command
 from clsplat.config import InitConfig
 from clsplat.dataset import decoding
 from clsplat.dataset.photos import read_photo
+from clsplat.errors import InputError
 from clsplat.evaluate import mean_metrics
 from clsplat.renderer import Renderer
 from clsplat.training import preparation, recorder
 from clsplat.training.initialize import initialize
 from clsplat.training.loop import train
 from clsplat.training.outcome import failure
+
+
+DECODE = """
+import resource, sys
+from pathlib import Path
+from clsplat.dataset.photos import read_photo
+print(*read_photo(Path(sys.argv[1]), (0, 0, 0), upright=True).shape[:2])
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+"""Decodes a photo, and prints its size and the peak of the memory of a process that does nothing else, KiB."""
 
 
 @pytest.fixture(scope="module")
@@ -127,15 +139,14 @@ def test_a_wrong_focal_length_costs_quality(scene, device, tmp_path):
     gaussians = train(wrong, config, tmp_path, device)
     assert failure(gaussians, wrong.train, Renderer(device)) is None
     found = mean_metrics(gaussians, scene.test, Renderer(device))["psnr"]
-    # Measured: PLACE.
-    assert 12 < found < held_out_psnr(scene, scene.test, device, config) - 6
+    # Measured: 15.3 dB, and 21.7 dB with the right one.
+    assert 12 < found < held_out_psnr(scene, scene.test, device, config) - 4
 
 
 def test_masks_remove_an_object_that_moves(scene, device):
-    config = replace(CONFIG, iterations=100)
-    plain, masked = (held_out_psnr(moving_object(scene, masked=m), scene.test, device, config) for m in (False, True))
-    # Measured: PLACE
-    assert 20 < plain < masked
+    plain, masked = (held_out_psnr(moving_object(scene, masked=m), scene.test, device) for m in (False, True))
+    # Measured: 28.5 dB, 28.8 dB with masks, 29.1 dB without the object.
+    assert 25 < plain < masked - 0.1
 
 
 @pytest.mark.parametrize("change", ["removed", "replaced"])
@@ -250,11 +261,10 @@ def test_a_photo_of_16384_by_16384_is_refused_and_a_smaller_one_decoded_within_3
     """Of 13000x13000 the decoded pixels alone take 0.5 GB."""
     path = tmp_path / "large.png"
     Image.new("L", (16384, 16384)).save(path, compress_level=1)
-    with pytest.raises(ValueError, match="more than 179 million pixels"):
+    with pytest.raises(InputError, match="more than 179 million pixels"):
         read_photo(path, (0, 0, 0), upright=True)
     Image.new("RGB", (13000, 13000), (10, 20, 30)).save(path, compress_level=1)
-    with pytest.warns(Image.DecompressionBombWarning):
-        assert read_photo(path, (0, 0, 0), upright=True).shape == (13000, 13000, 3)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"peak memory: {peak:.2f} GiB")
-    assert peak < 3
+    done = subprocess.run([sys.executable, "-c", DECODE, str(path)], capture_output=True, text=True, check=True)
+    width, height, peak = map(int, done.stdout.split())
+    print(f"peak memory: {peak / 2**20:.2f} GiB")
+    assert (width, height) == (13000, 13000) and peak < 3 * 2**20
