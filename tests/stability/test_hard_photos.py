@@ -25,7 +25,6 @@ from clsplat.training.initialize import initialize
 from clsplat.training.loop import train
 from clsplat.training.outcome import failure
 
-
 DECODE = """
 import resource, sys
 from pathlib import Path
@@ -71,11 +70,10 @@ def enlarged(view, factor):
     return replace(view, image=image, camera=replace(c, width=size[0], height=size[1], **numbers))
 
 
-@pytest.mark.parametrize("size", ["fixed", "auto"])
-def test_photos_of_noise_fail_by_a_sentence(scene, trained, size):
+def test_photos_of_noise_fail_by_a_sentence(scene, trained):
     rng = np.random.default_rng(0)
     noise = with_photos(scene, lambda view, _: rng.integers(0, 256, view.image.shape, dtype=np.uint8))
-    found = trained(noise, size=size)
+    found = trained(noise, size="auto")
     assert "where a constant colour for each has" in found.sentence
 
 
@@ -150,9 +148,7 @@ def test_masks_remove_an_object_that_moves(scene, device):
 
 
 @pytest.mark.parametrize("change", ["removed", "replaced"])
-def test_photos_that_change_after_they_were_loaded_change_nothing(
-    scene, capsys, device, tmp_path, monkeypatch, change
-):
+def test_photos_that_change_later_change_nothing(scene, capsys, device, tmp_path, monkeypatch, change):
     """All photos are in memory: neither the training nor the evaluation reads a file again."""
     data = write(tmp_path / "data", scene)
     expected = end(capsys, device, data, tmp_path / "expected").gaussians
