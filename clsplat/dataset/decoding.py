@@ -23,6 +23,9 @@ SIZE_MAX = 1 << 20
 """Largest width or height of a photo, px. A larger declared size means a damaged file; undistortion would take time
 in proportion to it."""
 
+CHANNELS = 3
+"""Bytes of a decoded pixel."""
+
 ASPECT_TOLERANCE = 0.01
 """Largest relative difference between the aspect ratios of a photo and its camera. The size of a smaller copy may
 differ by up to a pixel in addition."""
@@ -130,14 +133,38 @@ def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
     ------
     InputError
         If a pose is not a rigid motion, a photo or mask cannot be decoded, or its shape differs from its camera's;
-        the message names it.
+        the message names it. If the photos do not fit the machine's memory.
     """
     from tqdm import tqdm
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         plans = list(pool.map(lambda photo: _plan(photo, dataset, config.invert_masks), dataset.photos))
+        _check_memory(plans, config)
         views = pool.map(lambda plan: _view(plan, dataset.reduce, config), plans)
         return list(tqdm(views, "photos", len(plans), unit="photo", dynamic_ncols=True, leave=False))
+
+
+def _check_memory(plans: list[_Plan], config: DataConfig) -> None:
+    """Raise an InputError if the photos, all of which stay in memory, and the largest file do not fit the machine."""
+    need = sum(CHANNELS * plan.camera.width * plan.camera.height for plan in plans)
+    largest = max(CHANNELS * plan.size[0] * plan.size[1] for plan in plans)
+    available = physical_memory()
+    if available is None or need + largest <= available:
+        return
+    fitting = [d for d in (2, 4, 8, 16) if need / d**2 + largest <= available]
+    remedy = f"--downscale {config.downscale * fitting[0]}" if fitting else "use fewer or smaller photos"
+    raise InputError(
+        f"{plans[0].photo.path.parent}: expected photos that fit this machine's memory of {available / 1e9:.2f} GB, "
+        f"found {len(plans)} that take {need / 1e9:.2f} GB; {remedy}"
+    )
+
+
+def physical_memory() -> int | None:
+    """Memory of the machine in bytes; None where the system does not tell it."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError):  # Windows has no sysconf
+        return None
 
 
 def load_view(photo: PosedPhoto, dataset: Dataset, config: DataConfig) -> View:

@@ -67,6 +67,11 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
             f"{path}: expected the folder of a dataset, found {'a file' if path.exists() else 'nothing'}"
         )
     dataset = _read_dataset(path, config, verbose)
+    if not (np.abs(dataset.points) <= np.finfo(np.float32).max).all():
+        raise InputError(
+            f"{path}: expected points with finite coordinates, as float32, found {np.abs(dataset.points).max():.3g}; "
+            "remove such points"
+        )
     dataset = replace(dataset, photos=by_faces(dataset.photos))
     views = sorted(load_views(dataset, config), key=lambda view: view.name)
     train, test = _split(views, dataset, config.test_every)

@@ -88,6 +88,12 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             yield image
     except InputError:
         raise
+    except Image.DecompressionBombError as error:
+        most = 2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6  # Pillow refuses twice the pixels of which it warns
+        raise InputError(
+            f"cannot read {path}: it has more than {most:.0f} million pixels, the most that are decoded; write "
+            "smaller copies of the photos"
+        ) from error
     # Decoders raise many kinds of exceptions on damaged files: OSError, SyntaxError, zlib.error ...
     except Exception as error:
         raise InputError(f"cannot read {path} as an image: {error or type(error).__name__}") from error

@@ -92,8 +92,10 @@ def from_points(points: ArrayLike, colors: ArrayLike, config: InitConfig) -> Gau
     check(config, "init.")
     means = np.asarray(points, dtype=np.float64)
     rgb = np.asarray(colors)
-    if means.ndim != 2 or means.shape[1] != 3 or not len(means) or not np.isfinite(means).all():
-        raise InputError(f"points: expected at least one finite point, shape (P, 3), found shape {means.shape}")
+    if means.ndim != 2 or means.shape[1] != 3 or not len(means):
+        raise InputError(f"points: expected at least one point, shape (P, 3), found shape {means.shape}")
+    if not (np.abs(means) <= np.finfo(np.float32).max).all():
+        raise InputError(f"points: expected finite coordinates, as float32, found {np.abs(means).max():.3g}")
     if rgb.shape != means.shape or rgb.dtype != np.uint8:
         raise InputError(f"colors: expected shape {means.shape} of uint8, found {rgb.shape} of {rgb.dtype}")
     return _gaussians(means, _variances(means), rgb / 255, config)
@@ -139,9 +141,12 @@ def _variances(points: NDArray[np.float64]) -> NDArray[np.float64]:
     neighbours = min(NEIGHBOURS, len(points) - 1)
     if neighbours == 0:
         return np.ones(1)
+    # A tree cannot divide equal points, and would search all of them for each: it holds as many as can be neighbours.
+    places, rows, counts = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+    tree = cKDTree(np.repeat(places, np.minimum(counts, neighbours + 1), axis=0))
     # The nearest point is the point itself, or a duplicate of it at the same distance 0.
-    distances, _ = cKDTree(points).query(points, k=neighbours + 1, workers=-1)
-    variances = np.mean(distances[:, 1:] ** 2, axis=1)
+    distances, _ = tree.query(places, k=neighbours + 1, workers=-1)
+    variances = np.mean(distances[:, 1:] ** 2, axis=1)[rows.ravel()]
     median = np.median(variances[variances > 0]) if variances.any() else 1.0
     return np.maximum(variances, VARIANCE_SHARE * median)
 

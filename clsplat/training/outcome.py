@@ -1,6 +1,7 @@
 """Check of a scene that has been trained: whether it shows anything of its photos."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.gaussians import Gaussians
 from clsplat.render import renderings
@@ -16,6 +17,12 @@ CHECKED = 8
 
 LEVEL = 1 / 255
 """Root mean square of a photo's differences from its mean colour up to which it shows nothing."""
+
+NOTHING_SHOWN = (
+    "each of its photos has a single colour, or no pixel that counts, and no scene follows from that; look at the "
+    "photos and masks"
+)
+"""Reason of a failure where no photo shows anything."""
 
 
 def failure(gaussians: Gaussians, views: list[View], renderer: Renderer) -> str | None:
@@ -42,13 +49,27 @@ def failure(gaussians: Gaussians, views: list[View], renderer: Renderer) -> str 
     for view, rendering in zip(chosen, renderings(renderer, gaussians, [v.camera for v in chosen]), strict=True):
         counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
         photo = view.image[counts] / 255
-        if len(photo) and photo.var(axis=0).mean() > LEVEL**2:
+        if _varies(photo):
             errors.append(np.mean((np.clip(rendering.rgb[counts], 0, 1) - photo) ** 2))
             variances.append(photo.var(axis=0).mean())
-    if not errors or np.mean(errors) < np.mean(variances):
+    if not errors:
+        return None if any(map(_shows_something, views)) else f"training failed: {NOTHING_SHOWN}"
+    if np.mean(errors) < np.mean(variances):
         return None
     found, constant = (-10 * np.log10(np.mean(values)) for values in (errors, variances))
     return (
         f"training failed: its photos have {found:.1f} dB, where a constant colour for each has {constant:.1f} dB; "
         f"{advice}"
     )
+
+
+def _varies(pixels: NDArray[np.float64]) -> bool:
+    """Whether pixels (P, 3) in [0, 1] differ from one colour."""
+    return len(pixels) > 0 and float(pixels.var(axis=0).mean()) > LEVEL**2
+
+
+def _shows_something(view: View) -> bool:
+    """Whether a photo has more than one colour, or a transparency with a shape."""
+    counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+    layers = [view.image] if view.clear is None else [view.image, view.clear[..., None]]
+    return any(_varies(layer[counts] / 255) for layer in layers)

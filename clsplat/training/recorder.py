@@ -65,7 +65,8 @@ class Recorder:
         state, config = training.state, training.config
         check_loss(loss, state.iteration, self._out)
         state.losses.append(loss)
-        state.seconds = time.perf_counter() - self._started
+        # Virtual machines exist whose clock has gone back; a time is never less than an earlier one.
+        state.seconds = max(state.seconds, time.perf_counter() - self._started)
         if state.iteration < config.iterations:  # the last line is about the scene as it is saved
             self._line(state.shown(training.renderer) if state.iteration in self._evaluate_after else None)
         if state.iteration % config.checkpoint_every == 0 or state.iteration == config.iterations:

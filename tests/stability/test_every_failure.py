@@ -28,10 +28,12 @@ FAILURES = {
     "dark areas turning transparent": ["dark-areas"],
     "floaters near cameras": ["floaters"],
     "images of mixed size, orientation, EXIF rotation, 16-bit, grey, RGBA, CMYK, corrupt": ["images"],
+    "wrong intrinsics": ["focal-length"],
+    "moving objects": ["moving-object"],
 }
 """Failures known from papers and issue threads, with the experiments that measure them."""
 
-OPEN = {"wide-angle"}
+OPEN = {"wide-angle", "focal-length"}
 """Experiments on failures without a remedy."""
 
 

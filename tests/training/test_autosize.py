@@ -275,8 +275,8 @@ def test_a_fifth_of_many_photos_says_what_gaussians_are_worth(photos: int, prici
 
 
 def test_flat_walls_need_little(device: Device, tmp_path: Path) -> None:
-    """Grey all around: what is off by less than a level in 255 is not improved. Measured: 171 Gaussians, no error; the
-    start has 200, and growth goes up to 476 while holes are filled."""
+    """Grey all around: what is off by less than a level in 255 is not improved. Measured: 171 Gaussians, no error;
+    the start has 200, and growth goes up to 476 while holes are filled."""
     scene = known_scene(20, device, copies=10)
     walls = [replace(view, image=np.full_like(view.image, 128)) for view in (*scene.train, *scene.test)]
     scene = replace(scene, train=walls[:32], test=walls[32:])

@@ -31,15 +31,16 @@ def test_almost_no_gaussians_are_a_failure(scene, device):
     assert f"{FEWEST_GAUSSIANS - 1} Gaussians" in failure(few, scene.train, Renderer(device))
 
 
-def test_photos_that_show_nothing_ask_for_nothing(scene, device):
-    """Black photos are matched by black Gaussians, and none of their errors is said to be a failure."""
+def test_photos_that_show_nothing_are_a_failure_if_all_do(scene, device):
     black = [replace(view, image=np.zeros_like(view.image)) for view in scene.train]
     gaussians = initialize(scene, InitConfig(opacity=0.9), seed=0)
-    assert failure(gaussians, black, Renderer(device)) is None
+    assert "single colour" in failure(gaussians, black, Renderer(device))
+    many = [*black, scene.train[0], *black]  # those that are compared are all black
+    assert failure(gaussians, many, Renderer(device)) is None
 
 
 def test_only_the_pixels_of_the_mask_count(scene, device):
     gaussians = initialize(scene, InitConfig(opacity=0.9), seed=0)
     masked = [replace(view, mask=np.zeros(view.image.shape[:2], bool)) for view in scene.train]
     gaussians.sh[:] = -10
-    assert failure(gaussians, masked, Renderer(device)) is None
+    assert "no pixel that counts" in failure(gaussians, masked, Renderer(device))

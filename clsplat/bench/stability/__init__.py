@@ -15,6 +15,7 @@ from clsplat.bench.stability import (
     popping,
     projection,
     sh_extrapolation,
+    wrong_data,
 )
 from clsplat.bench.stability.experiment import Experiment
 
@@ -34,5 +35,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "blow-up": growth.BLOW_UP,
     "sh-extrapolation": sh_extrapolation.EXTRAPOLATION,
     "images": images.KINDS,
+    "focal-length": wrong_data.FOCAL_LENGTH,
+    "moving-object": wrong_data.MOVING,
 }
 """Experiments by name. One line here adds an experiment to the command and its report."""

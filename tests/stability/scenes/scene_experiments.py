@@ -30,6 +30,8 @@ ORDER = (
     *("jacobian", "wide-angle", "scales", "exposure", "poses", "few-views", "floaters", "dark-areas", "constants"),
     *("everything-pruned", "opacity-reset", "blow-up", "random-start", "sh-extrapolation", "dead-gaussians"),
     "images",
+    "focal-length",
+    "moving-object",
 )
 """Names of the experiments in the order of docs/stability.md."""
 
