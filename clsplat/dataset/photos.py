@@ -163,7 +163,10 @@ def write_upright_png(source: Path, target: Path) -> None:
     """
     with _opened(source) as image:
         upright = ImageOps.exif_transpose(image)
-        exif = upright.getexif()
+        try:
+            exif = upright.getexif().tobytes()
+        except Exception:  # damaged tags, which Pillow reads but cannot write: the pixels are those of the photo
+            exif = b""
         rgb = Image.fromarray(_rgb(upright, (0.0, 0.0, 0.0), source))
     target.parent.mkdir(parents=True, exist_ok=True)
     rgb.save(target, format="PNG", exif=exif, compress_level=1)  # a temporary file: fast rather than small
