@@ -49,7 +49,7 @@ TRAIN = (
     *("train", "data", "-o", "out", "--iterations", "30", "--checkpoint-every", "10", "--eval-every", "10"),
     *("--init.random-points", "60", "--adc.start", "5", "--adc.every", "10", "--adc.grad-threshold", "1e-5"),
 )
-COMPACT = ("compact", "scene.ply", "-o", "out/small.spz", "--cameras", "data", "--max-gaussians", "20")
+COMPACT = ("compact", "scene.ply", "-o", "out/small.spz", "--cameras", "data", "--max-gaussians", "55")
 EXPOSURES = ("--exposure", "--filter-3d", "--strategy", "mcmc")
 COMMANDS = {
     "train": TRAIN,
