@@ -172,8 +172,7 @@ def read_checkpoint(path):
 def read_run(path):
     with suppress(InputError):
         run_lines(path)
-    with log_file(path / "log.jsonl", 10):
-        pass
+    log_file(path / "log.jsonl", 10)
 
 
 def read_results(path):
