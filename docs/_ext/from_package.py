@@ -103,7 +103,7 @@ def _default(value: Any) -> str:
 
 
 def config_table(name: str) -> str:
-    """Docstring of a configuration class and table of its fields, as Markdown."""
+    """Docstring of a configuration class and table of its fields with their ranges, as Markdown."""
     cls = getattr(config, name)
     body = ast.parse(inspect.getsource(cls)).body[0].body
     texts = {
@@ -112,15 +112,15 @@ def config_table(name: str) -> str:
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name)
     }
     hints, annotated = typing.get_type_hints(cls), typing.get_type_hints(cls, include_extras=True)
-    rows = [_row("field", "type", "range", "default", "meaning"), HEADER_RULE * 5 + "|"]
+    rows = [_row("field", "type", "default", "meaning, and range"), HEADER_RULE * 4 + "|"]
     for field in dataclasses.fields(cls):
         hint = hints[field.name]
         nested = dataclasses.is_dataclass(hint)
         kind = f"[{hint.__name__}](#{hint.__name__.lower()})" if nested else _code(_type_name(hint))
         default = "" if nested else _code(_default(field.default))
         rule = rule_of(annotated[field.name])
-        words = _prose(rule.words) if rule else ""
-        rows.append(_row(_code(field.name), kind, words, default, _prose(texts[field.name])))
+        words = f" *Range: {_prose(rule.words)}.*" if rule else ""
+        rows.append(_row(_code(field.name), kind, default, _prose(texts[field.name]) + words))
     return f"{_prose(cls.__doc__ or '')}\n\n" + "\n".join(rows)
 
 
