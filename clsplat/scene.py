@@ -109,3 +109,8 @@ class Scene:
         return display.facts(
             "Scene", rows, display.figure(plan, "cameras from above; hollow: held out"), f"<div>{photos}</div>"
         )
+
+
+def evenly_spaced(views: list[View], most: int) -> list[View]:
+    """Choose at most `most` of the views, evenly spaced from the first to the last."""
+    return [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), most)).round().astype(int)]

@@ -15,7 +15,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, ssim
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
-from clsplat.scene import View
+from clsplat.scene import View, evenly_spaced
 
 FRAMES = 5
 """Number of times that each held-out view is rendered for the rate of frames."""
@@ -93,8 +93,7 @@ def rare_share(views: list[View], rare: Masks | None) -> float | None:
 
 def training_psnr(gaussians: Gaussians, views: list[View], renderer: Renderer) -> Record:
     """Mean PSNR of at most `TRAINING_PHOTOS` training photos, evenly spaced, as the entry `train_psnr`."""
-    chosen = np.linspace(0, len(views) - 1, min(len(views), TRAINING_PHOTOS)).round().astype(int)
-    figures = mean_metrics(gaussians, [views[i] for i in chosen], renderer, metrics=(psnr,))
+    figures = mean_metrics(gaussians, evenly_spaced(views, TRAINING_PHOTOS), renderer, metrics=(psnr,))
     return _finite({"train_psnr": figures["psnr"]})
 
 

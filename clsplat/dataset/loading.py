@@ -67,7 +67,7 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
             f"{path}: expected the folder of a dataset, found {'a file' if path.exists() else 'nothing'}"
         )
     dataset = _read_dataset(path, config, verbose)
-    if not (np.abs(dataset.points) <= np.finfo(np.float32).max).all():
+    if not (np.abs(dataset.points) <= FLOAT32_MAX).all():
         raise InputError(
             f"{path}: expected points with finite coordinates, as float32, found {np.abs(dataset.points).max():.3g}; "
             "remove such points"
@@ -83,12 +83,7 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
         for before, view in pairwise(part):  # sorted by name
             if before.name == view.name:
                 raise InputError(f"{path}: expected a camera for each photo, found several for {view.name}")
-    scene = _near_origin(Scene(train, test, dataset.points, dataset.colors))
-    if np.abs(scene.points).max(initial=0) > FLOAT32_MAX:
-        raise InputError(
-            f"{path}: expected points in the range of single precision, found {np.abs(scene.points).max()}"
-        )
-    return with_near_planes(scene)
+    return with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
 
 
 def _split(views: list[View], dataset: Dataset, test_every: int) -> tuple[list[View], list[View]]:

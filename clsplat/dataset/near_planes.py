@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.constants import NEAR_EXTENTS
 from clsplat.dataset.coverage import projected
+from clsplat.ranges import FLOAT32_TINY
 from clsplat.scene import Scene, View
 
 NEAR_SHARE = 0.3
@@ -16,9 +17,6 @@ NEAR_SHARE = 0.3
 NEAR_QUANTILE = 0.01
 """Quantile of the depths of the points in a photo that counts as the depth of the nearest points. The nearest point
 itself may be an outlier."""
-
-TINY = float(np.finfo(np.float32).tiny)
-"""Smallest depth of a near plane, in any unit."""
 
 NEAR_POINTS = 10_000
 """Approximate number of points from which the near plane is computed; the others are skipped."""
@@ -42,7 +40,7 @@ def near_plane(camera: Camera, points: NDArray[np.float64]) -> float | None:
         Depth in world units: `NEAR_SHARE` times the depth of the nearest points in the photo. None if the photo shows
         too few points.
     """
-    _, depths, inside = projected(replace(camera, near=TINY), points)
+    _, depths, inside = projected(replace(camera, near=FLOAT32_TINY), points)
     seen = depths[inside]
     if len(seen) * NEAR_QUANTILE < 1:  # the quantile would be the nearest point
         return None

@@ -12,16 +12,16 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
+from clsplat.camera import Camera, default_near
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import Gaussians
-from clsplat.renderer import Renderer
+from clsplat.renderer import Renderer, download
 from clsplat.show.browser_cameras import client_camera, whole_view, wxyz_of
 from clsplat.show.camera_paths import Viewpoint
 from clsplat.show.frames import MODES, picture
@@ -133,6 +133,7 @@ class Viewer:
         self._clients: dict[int, _Client] = {}
         self._asked = threading.Event()
         self._mode, self._version, self._paused = MODES[0], 0, False
+        self._near: float | None = None
         self._pause: Any = None
         self._failed = False
         self._facts, self._drawn, self._written = "", "", 0.0
@@ -270,6 +271,9 @@ class Viewer:
         assert camera is not None
         small = camera.resized(*(max(1, round(share * edge)) for edge in (camera.width, camera.height)))
         try:
+            if self._near is None and len(gaussians):  # once: the means may be on the device
+                self._near = default_near(download(gaussians.means))
+            small = replace(small, near=self._near)
             frame, legend = picture(self._renderer, gaussians, small, mode)
         except Exception as error:  # of any type: it must not end a training
             frame, legend = np.zeros((1, 1, 3), np.uint8), _reason(error)

@@ -11,7 +11,7 @@ from clsplat.constants import SH_C0
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
 from clsplat.randomness import stream
-from clsplat.ranges import check
+from clsplat.ranges import FLOAT32_MAX, check
 from clsplat.scene import Scene
 
 NEIGHBOURS = 3
@@ -94,7 +94,7 @@ def from_points(points: ArrayLike, colors: ArrayLike, config: InitConfig) -> Gau
     rgb = np.asarray(colors)
     if means.ndim != 2 or means.shape[1] != 3 or not len(means):
         raise InputError(f"points: expected at least one point, shape (P, 3), found shape {means.shape}")
-    if not (np.abs(means) <= np.finfo(np.float32).max).all():
+    if not (np.abs(means) <= FLOAT32_MAX).all():
         raise InputError(f"points: expected finite coordinates, as float32, found {np.abs(means).max():.3g}")
     if rgb.shape != means.shape or rgb.dtype != np.uint8:
         raise InputError(f"colors: expected shape {means.shape} of uint8, found {rgb.shape} of {rgb.dtype}")

@@ -20,8 +20,12 @@ DIGEST_BYTES = 16
 """Length of a digest: among 10^12 photos, the chance that two of them share one is 10^-15."""
 
 CAMERA_TOLERANCE = 1e-9
-"""Difference of a camera's numbers, relative and absolute, up to which it counts as the same. Poses come from linear
-algebra in float64, whose rounding depends on the processor; a run may move to another machine."""
+"""Relative difference up to which a camera counts as the same: of each intrinsic number, of each row of the rotation,
+of the translation. Poses come from linear algebra in float64, whose rounding depends on the processor; a run may move
+to another machine."""
+
+POSE = 15
+"""Length of a pose in the numbers of a camera: three rows of a rotation, a translation, the scene's offset."""
 
 NAMED = 3
 """Number of photos that a message names."""
@@ -132,7 +136,8 @@ def _photo(view: View, scene: Scene) -> Photo:
     ]
     pixels = _digest(view.image) if view.clear is None else _digest(view.image, view.clear)
     mask = "" if view.mask is None else _digest(view.mask)
-    return Photo(pixels, mask, [float(x) for x in (*numbers, *c.viewmat[:3].flat, *scene.offset)])
+    pose = (*c.viewmat[:3, :3].flat, *c.viewmat[:3, 3], *scene.offset)
+    return Photo(pixels, mask, [float(x) for x in (*numbers, *pose)])
 
 
 def _digest(*arrays: NDArray[Any]) -> str:
@@ -144,7 +149,12 @@ def _digest(*arrays: NDArray[Any]) -> str:
 
 
 def _same_camera(a: list[float], b: list[float]) -> bool:
-    return len(a) == len(b) and np.allclose(a, b, rtol=CAMERA_TOLERANCE, atol=CAMERA_TOLERANCE)
+    if len(a) != len(b):
+        return False
+    (intrinsics_a, pose_a), (intrinsics_b, pose_b) = ((v[:-POSE], np.reshape(v[-POSE:], (-1, 3))) for v in (a, b))
+    return np.allclose(intrinsics_a, intrinsics_b, rtol=CAMERA_TOLERANCE, atol=0) and all(
+        np.abs(x - y).max() <= CAMERA_TOLERANCE * np.linalg.norm(x) for x, y in zip(pose_a, pose_b, strict=True)
+    )
 
 
 def _some(names: list[str]) -> str:

@@ -3,14 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.config import AdcConfig
 from clsplat.gaussians import Gaussians
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
-from clsplat.scene import View
+from clsplat.scene import View, evenly_spaced
 
-FEWEST_GAUSSIANS = 16
-"""Number of Gaussians below which a training has failed. The strategies leave at least this number while they prune,
-and no photo is described by fewer."""
+FEWEST_GAUSSIANS = AdcConfig.min_gaussians
+"""Number of Gaussians below which a training has failed: what pruning leaves at least."""
 
 CHECKED = 8
 """Number of training photos, evenly spaced, that are compared with a constant colour."""
@@ -44,7 +44,7 @@ def failure(gaussians: Gaussians, views: list[View], renderer: Renderer) -> str 
     advice = "look at the photos, their poses and masks, and train for more --iterations"
     if len(gaussians) < FEWEST_GAUSSIANS:
         return f"training failed: only {len(gaussians)} Gaussians are left; {advice}"
-    chosen = [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), CHECKED)).round().astype(int)]
+    chosen = evenly_spaced(views, CHECKED)
     errors, variances = [], []
     for view, rendering in zip(chosen, renderings(renderer, gaussians, [v.camera for v in chosen]), strict=True):
         counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask

@@ -6,8 +6,7 @@ from clsplat.config import TrainConfig
 from clsplat.scene import Scene
 
 VISITS = 30
-"""Iterations for each training photo (measured: docs/benchmarks.md). Quality is no longer rising steeply after this
-number of steps with each photo."""
+"""Iterations for each training photo (measured: docs/benchmarks.md)."""
 
 FEWEST_ITERATIONS = 3000
 """Fewest iterations: few photos, too, need time for growth."""
