@@ -176,3 +176,20 @@ def test_inputs_survive_json(scene: Scene, device: Device) -> None:
     inputs = Inputs.of(scene, device)
     assert Inputs.restored(json.loads(json.dumps(asdict(inputs)))) == inputs
     assert inputs.points and len(inputs.train) == len(scene.train)
+
+
+def test_poses_are_compared_in_the_unit_of_the_scene(scene: Scene, device: Device) -> None:
+    """A pose that is off by a thousandth, in a scene of 10^-8 units."""
+
+    def scaled(s: Scene, unit: float) -> Scene:
+        def view(v: View) -> View:
+            viewmat = v.camera.viewmat.copy()
+            viewmat[:3, 3] *= unit
+            return replace(v, camera=replace(v.camera, viewmat=viewmat))
+
+        return replace(s, train=[view(v) for v in s.train], test=[view(v) for v in s.test])
+
+    old = Inputs.of(scaled(scene, 1e-8), device)
+    assert old.continued(Inputs.of(scaled(scene, 1e-8 * (1 + 1e-12)), device), Path("checkpoint.npz"))
+    with pytest.raises(InputError, match="other cameras"):
+        old.continued(Inputs.of(scaled(scene, 1.001e-8), device), Path("checkpoint.npz"))
