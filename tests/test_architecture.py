@@ -13,7 +13,8 @@ import pyopencl as cl
 import pytest
 
 from clsplat import ops, reference
-from clsplat.device import MODEL_CONSTANTS, inline_includes, kernel_folder
+from clsplat.device import MODEL_CONSTANTS
+from clsplat.programs import inline_includes, kernel_folder
 from clsplat.stages import FUNCTIONS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -26,10 +27,10 @@ LAYERS = """
     ranges json_lines
     config atomic
     camera gaussians
-    scene stages metrics panorama device
-    structs reference
+    scene stages metrics panorama programs
+    structs reference device
     ops testing formats
-    renderer
+    renderer selftest
     render dataset demo
     rasterization pruning
     training show
@@ -55,7 +56,7 @@ BENCH_KERNELS = {"roof"}
 
 # The only units that may import certain third-party packages, which are optional or slow to import.
 ONLY_IN = {
-    "pyopencl": {"device", "ops"},
+    "pyopencl": {"device", "programs", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
     "av": {"dataset"},
@@ -210,7 +211,7 @@ DEFINES = {
     "noise": {"GATE_SLOPE": 100.0, "GATE_OPACITY": 0.005},
     "bin": {"TILE": 16, "GRADIENTS": 1},
     "composite_cpu": {"TILE": 8, "CHANNELS": 1, "LANES": 8},
-    "composite_gpu": {"TILE": 8, "CHANNELS": 1, "BATCH": 16, "SUBGROUPS": 0},
+    "composite_gpu": {"TILE": 8, "CHANNELS": 1, "ITEMS": 32, "BATCH": 16, "SUBGROUPS": 0},
     "composite_sorted": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "WINDOW": 2},
     "count": {"TILE": 16},
     "filter": {"FILTER_VARIANCE": 0.2, "LENS": "FISHEYE"},
@@ -232,6 +233,7 @@ FORBIDDEN = [
     ("composite_cpu", "LANES", 4),
     ("composite_gpu", "TILE", 32),
     ("composite_gpu", "CHANNELS", 0),
+    ("composite_gpu", "ITEMS", 48),
     ("composite_gpu", "BATCH", 0),
     ("composite_gpu", "SUBGROUPS", 2),
     ("composite_sorted", "TILE", 12),

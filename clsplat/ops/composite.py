@@ -16,7 +16,7 @@ WINDOW = 32
 
 def gpu_batch(device: Device) -> int:
     """Number of splats per batch of the GPU variant: the work-items of a subgroup, if there are subgroups."""
-    return device.subgroup_size or GPU_BATCH
+    return device.group(device.subgroup_size or GPU_BATCH)
 
 
 def variant(device: Device, compositor: str = "auto", disparities: Any = None) -> str:
@@ -31,7 +31,11 @@ def variant(device: Device, compositor: str = "auto", disparities: Any = None) -
 def _defines(device: Device, bins: Bins, channels: int, stage: str) -> dict[str, Any]:
     own: dict[str, dict[str, int]] = {
         "composite_cpu": {"LANES": device.vector_width},
-        "composite_gpu": {"BATCH": gpu_batch(device), "SUBGROUPS": int(device.subgroup_size > 0)},
+        "composite_gpu": {
+            "ITEMS": device.group(bins.tile_size**2),
+            "BATCH": gpu_batch(device),
+            "SUBGROUPS": int(device.subgroup_size > 0),
+        },
         "composite_sorted": {"LANES": device.vector_width, "WINDOW": WINDOW},
     }
     return {"TILE": bins.tile_size, "CHANNELS": channels} | own[stage]
@@ -52,7 +56,7 @@ def _launch(device: Device, stage: str, kernel: str, bins: Bins, channels: int, 
     tiles = bins.tile_ranges.shape[0]
     group = 1
     if stage == "composite_gpu":
-        group = bins.tile_size**2 if kernel == "composite_fwd" else gpu_batch(device)
+        group = device.group(bins.tile_size**2) if kernel == "composite_fwd" else gpu_batch(device)
     arguments = [bins.width, bins.height, arguments[0], bins.gauss_ids, bins.tile_ranges, *arguments[1:]]
     device.launch(
         stage, kernel, (tiles * group,), arguments, defines=_defines(device, bins, channels, stage), group=(group,)

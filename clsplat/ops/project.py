@@ -138,15 +138,16 @@ def _backward(
     if not defines["CAMERA_GRAD"]:
         device.launch("project", kernel, (n,), arguments, defines=defines)
         return None
-    groups = -(-n // CAMERA_GROUP)
+    group = device.group(CAMERA_GROUP)
+    groups = -(-n // group)
     partial = device.empty("v_camera", (groups, 16))
     device.launch(
         "project",
         kernel,
-        (groups * CAMERA_GROUP,),
+        (groups * group,),
         [*arguments, partial],
-        defines=defines | {"GROUP": CAMERA_GROUP},
-        group=(CAMERA_GROUP,),
+        defines=defines | {"GROUP": group},
+        group=(group,),
     )
     total = partial.get().astype(np.float64).sum(axis=0)
     v_viewmat = np.zeros((4, 4))

@@ -3,7 +3,7 @@
 import numpy as np
 from pyopencl.array import Array
 
-from clsplat.device import Device
+from clsplat.device import GROUP, Device
 from clsplat.errors import DeviceError
 
 
@@ -48,7 +48,7 @@ def queue_scan(device: Device, values: Array) -> tuple[Array, Array]:
     # A few chunks per core on a CPU; otherwise enough work-items to fill any GPU.
     chunks = 4 * device.cl_device.max_compute_units if device.is_cpu else 8192
     chunks = min(chunks, n)
-    defines = {"GROUP": 1 if device.is_cpu else 64}
+    defines = {"GROUP": 1 if device.is_cpu else device.group(GROUP)}
     partial = device.empty("scan", chunks + 1, np.uint64)
     sums = device.empty("scan", n + 1, np.uint32)
     # On a CPU, a group runs on one core, so each group has one chunk.

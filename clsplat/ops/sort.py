@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from clsplat.device import Device
+from clsplat.device import GROUP, Device
 from clsplat.errors import InputError
 from clsplat.ops.scan import queue_scan
 
@@ -22,9 +22,9 @@ def _defines(device: Device, keys: Array, **changes: Any) -> dict[str, Any]:
         "KEY_BITS": 8 * keys.dtype.itemsize,
         # The 2048 counters of a core fit into its L1 cache. A work-item of a GPU has 16 counters in local memory.
         "DIGIT_BITS": 11 if device.is_cpu else 4,
-        "GROUP": 1 if device.is_cpu else 64,
+        "GROUP": 1 if device.is_cpu else device.group(GROUP),
         "BITONIC": BITONIC_MAX,
-        "BITONIC_GROUP": 64,
+        "BITONIC_GROUP": device.group(GROUP),
     } | changes
 
 
@@ -64,7 +64,8 @@ def argsort(
         sorted_keys = device.empty("sort keys", n, keys.dtype)
         order = device.empty("sort order", n, np.uint32)
         arguments = [n, positions, keys, order if values is None else values, sorted_keys, order]
-        device.launch("sort", "sort_bitonic", (64,), arguments, defines=defines, group=(64,))
+        group = (defines["BITONIC_GROUP"],)
+        device.launch("sort", "sort_bitonic", group, arguments, defines=defines, group=group)
         return sorted_keys, order
 
     group, digit_bits = defines["GROUP"], defines["DIGIT_BITS"]
