@@ -324,7 +324,7 @@ class Device:
         none, so that it warns once.
         """
         source, values = inline_includes(f"{stage}.cl", kernel_folder()), self._model | defines
-        if not values.get("SUBGROUPS"):
+        if values.get("SUBGROUPS") != 1:
             return build(self.context, source, build_options(self.real, values))
         try:
             return build(self.context, source, build_options(self.real, values, self._subgroups.language))
