@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from math import log2
 from typing import Any
+from weakref import ref
 
 import numpy as np
 import pyopencl as cl
@@ -143,6 +144,7 @@ class Device:
         self._constants: dict[str, tuple[bytes, cl.array.Array]] = {}
         self._kernels: dict[tuple[str, tuple[Any, ...]], cl.Kernel] = {}
         self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}
+        self._kept: dict[str, tuple[Any, ...]] = {}
 
     @property
     def label(self) -> str:
@@ -281,6 +283,17 @@ class Device:
         if what not in self._constants or self._constants[what][0] != host.tobytes():
             self._constants[what] = host.tobytes(), self.upload(what, host)
         return self._constants[what][1]
+
+    def keep(self, what: str, owner: tuple[cl.array.Array, ...], result: cl.array.Array) -> None:
+        """Keep what was computed from the arrays of `owner`, for `kept`, until the first of them is freed."""
+        whole = tuple(map(ref, owner[1:]))
+        self._kept[what] = ref(owner[0], lambda _: self._kept.pop(what, None)), *whole, result
+
+    def kept(self, what: str, owner: tuple[cl.array.Array, ...]) -> cl.array.Array | None:
+        """The last array named `what` that was kept, if it was computed from these arrays."""
+        *owners, result = self._kept.get(what, (None,))
+        same = len(owners) == len(owner) and all(o() is array for o, array in zip(owners, owner, strict=True))
+        return result if same else None
 
     def launch(
         self,

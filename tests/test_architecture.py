@@ -223,7 +223,10 @@ DEFINES = {
     "removal": {"TILE": 8, "CHANNELS": 1, "LANES": 16},
     "roof": {"WIDTH": 16, "HALVES": 1},
     "scan": {"GROUP": 32},
-    "sort": {"KEY_BITS": 64, "DIGIT_BITS": 4, "GROUP": 32, "BITONIC": 64, "BITONIC_GROUP": 32},
+    "sort": {
+        **{"KEY_BITS": 64, "DIGIT_BITS": 8, "GROUP": 32, "SEGMENT_BITS": 4, "SEGMENT_GROUP": 16},
+        **{"BITONIC": 64, "BITONIC_GROUP": 32},
+    },
 }
 FORBIDDEN = [
     ("bin", "TILE", 0),
@@ -258,7 +261,10 @@ FORBIDDEN = [
     ("scan", "GROUP", 0),
     ("sort", "KEY_BITS", 16),
     ("sort", "DIGIT_BITS", 17),
+    ("sort", "DIGIT_BITS", 11),
     ("sort", "GROUP", 0),
+    ("sort", "SEGMENT_BITS", 12),
+    ("sort", "SEGMENT_GROUP", 0),
     ("sort", "BITONIC", 100),
     ("sort", "BITONIC_GROUP", 64),
 ]

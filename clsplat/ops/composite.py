@@ -49,6 +49,8 @@ def packed(device: Device, splats: Splats, bins: Bins, stage: str) -> Any:
     device.launch(
         stage, "composite_pack", (n,), [n, *geometry, result], defines=_defines(device, bins, channels, stage)
     )
+    if bins.slots is not None:
+        device.keep("packed splats", splats, result)  # for the backward pass
     return result
 
 
@@ -112,7 +114,7 @@ def composite_bwd(
     Parameters
     ----------
     splats, bins, compositor, disparities
-        As given to `composite_fwd`.
+        As given to `composite_fwd`. The splats must not have changed since.
     image : Image
         Its result.
     v_image : Image
@@ -131,7 +133,10 @@ def composite_bwd(
     m = bins.gauss_ids.shape[0]
     records = device.empty("gradients per intersection", (max(m, 1), 6 + channels))
     stage = variant(device, compositor, disparities)
-    arguments = [packed(device, splats, bins, stage), bins.slots, *image, *v_image, records]
+    pack = device.kept("packed splats", splats)
+    if pack is None:
+        pack = packed(device, splats, bins, stage)
+    arguments = [pack, bins.slots, *image, *v_image, records]
     arguments += [] if disparities is None else [disparities]
     _launch(device, stage, "composite_bwd", bins, channels, arguments)
     v = SplatGrads(
