@@ -37,33 +37,12 @@
 // -DSUBGROUPS=0|1   1: the device has the functions of subgroups, by cl_khr_subgroups or OpenCL 2.1 and later
 #include "common.h"
 
-#if TILE != 8 && TILE != 16
-#error "-DTILE must be 8 or 16: TILE*TILE work-items must fit the work-groups of every GPU"
-#endif
 #if !defined(ITEMS) || ITEMS < 1 || TILE * TILE % ITEMS
 #error "-DITEMS must divide TILE*TILE, the number of pixels of a tile"
 #endif
-#if !defined(BATCH) || BATCH < 1
-#error "-DBATCH must give the number of splats per batch, 1 or more"
-#endif
-#if !defined(SUBGROUPS) || SUBGROUPS & ~1
-#error "-DSUBGROUPS must be 0 or 1"
-#endif
-#ifdef cl_khr_subgroups
-#pragma OPENCL EXTENSION cl_khr_subgroups : enable
-#endif
-#define REALV real
-#define MASKV int
-#include "composite.h"
-#include "power.h"
+#include "composite_tiles.h"
 
-#define PIXELS (TILE * TILE)
-#define OWNED  (PIXELS / ITEMS) // pixels of a work-item of the forward pass
-
-// Position of pixel p of the tile with origin (x0, y0).
-static inline int2 pixel_of(int x0, int y0, uint p) {
-    return (int2)(x0 + p % TILE, y0 + p / TILE);
-}
+#define OWNED (PIXELS / ITEMS) // pixels of a work-item of the forward pass
 
 __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void
 composite_fwd(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
@@ -121,17 +100,6 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
             image[CHANNELS * p + k] = sums[o][k] + fabs(transmittance[o]) * background[k];
         alpha_image[p] = 1 - fabs(transmittance[o]);
     }
-}
-
-// Ends a step of the backward pass.
-static inline void hand_on(void) {
-#if SUBGROUPS
-    if (get_num_sub_groups() == 1) {
-        sub_group_barrier(CLK_LOCAL_MEM_FENCE);
-        return;
-    }
-#endif
-    barrier(CLK_LOCAL_MEM_FENCE);
 }
 
 __kernel __attribute__((reqd_work_group_size(BATCH, 1, 1))) void

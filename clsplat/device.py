@@ -113,6 +113,8 @@ class Device:
     ----------
     memory_limit : int
         As above.
+    model : dict
+        Values of the constants of the rendering model.
     memory_peak : int
         Largest total size of all buffers so far, bytes.
     """
@@ -129,8 +131,8 @@ class Device:
         unknown = sorted(set(model) - set(MODEL_CONSTANTS))
         if unknown:
             raise InputError(f"model: expected names of {', '.join(MODEL_CONSTANTS)}, found {', '.join(unknown)}")
-        self._model = {name: getattr(constants, name) for name in MODEL_CONSTANTS} | dict(model)
-        self._model["LOG2_ALPHA_MIN"] = log2(self._model["ALPHA_MIN"])
+        self.model = {name: getattr(constants, name) for name in MODEL_CONSTANTS} | dict(model)
+        self.model["LOG2_ALPHA_MIN"] = log2(self.model["ALPHA_MIN"])
         self.cl_device = cl_device if cl_device is not None else select_device()
         self.real: np.dtype[Any] = np.dtype(real)
         if self.real == np.float64 and "cl_khr_fp64" not in self.cl_device.extensions:
@@ -333,10 +335,9 @@ class Device:
     def program(self, stage: str, defines: dict[str, Any]) -> cl.Program:
         """Build cl/`stage`.cl with `defines`, the model's constants and the device's real type.
 
-        If a build with subgroups fails, it is repeated without them, which changes no result. The device then uses
-        none, so that it warns once.
+        If a build with subgroups fails, a warning says so, and the device uses none. They change no result.
         """
-        source, values = inline_includes(f"{stage}.cl", kernel_folder()), self._model | defines
+        source, values = inline_includes(f"{stage}.cl", kernel_folder()), self.model | defines
         if values.get("SUBGROUPS") != 1:
             return build(self.context, source, build_options(self.real, values))
         try:

@@ -54,15 +54,26 @@ def packed(device: Device, splats: Splats, bins: Bins, stage: str) -> Any:
     return result
 
 
-def _launch(device: Device, stage: str, kernel: str, bins: Bins, channels: int, arguments: list[Any]) -> None:
+def _launch(
+    device: Device, stage: str, kernel: str, bins: Bins, channels: int, arguments: list[Any], **changes: Any
+) -> None:
     tiles = bins.tile_ranges.shape[0]
     group = 1
     if stage == "composite_gpu":
         group = device.group(bins.tile_size**2) if kernel == "composite_fwd" else gpu_batch(device)
     arguments = [bins.width, bins.height, arguments[0], bins.gauss_ids, bins.tile_ranges, *arguments[1:]]
-    device.launch(
-        stage, kernel, (tiles * group,), arguments, defines=_defines(device, bins, channels, stage), group=(group,)
-    )
+    defines = _defines(device, bins, channels, stage) | changes
+    device.launch(stage, kernel, (tiles * group,), arguments, defines=defines, group=(group,))
+
+
+def composite_until(device: Device, pack: Any, bins: Bins, background: Any, stop: float) -> Any:
+    """Image (H, W, C) by the GPU variant, whose pixels stop at another transmittance than TRANSMITTANCE_MIN."""
+    channels = len(background)
+    result = device.empty("image", (bins.height, bins.width, channels))
+    alpha = device.empty("alpha", (bins.height, bins.width))
+    arguments = [pack, device.constant("background", background), result, alpha]
+    _launch(device, "composite_gpu", "composite_fwd", bins, channels, arguments, TRANSMITTANCE_MIN=stop)
+    return result
 
 
 def composite_fwd(

@@ -60,7 +60,7 @@ def programs() -> list[tuple[str, dict[str, Any]]]:
     program = Device.program
 
     def recorded(self: Device, stage: str, defines: dict[str, Any]) -> Any:
-        values = self._model | defines
+        values = self.model | defines
         if "SUBGROUPS" in values:
             values |= {"SUBGROUPS": 0, "BATCH": GPU_BATCH}
         found[stage, tuple(sorted(values.items()))] = stage, values
