@@ -28,6 +28,9 @@
 // -DCAMERA_GRAD=0|1   1: the backward kernels also write v_camera; requires -DGROUP, the work-group size
 // -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  camera model (lens.h)
 // -DLANES=1|8         Gaussians of a work-item
+#ifndef LANES
+#error "-DLANES, the number of Gaussians of a work-item, must be given"
+#endif
 #include "common.h"
 #include "adam.h"
 #include "ellipse.h"
