@@ -26,6 +26,18 @@ loudness: Literal["quiet", "normal", "verbose"] = "normal"
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 """Type of the flag --out, -o."""
 
+OptionalOut = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
+"""Type of the flag --out, -o, where a run folder has a place for the result."""
+
+SceneOrRun = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE|RUN")]
+"""Type of the argument that names what was trained."""
+
+DeviceName = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
+"""Type of the flag --device."""
+
+Dataset = Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[DATASET]")]
+"""Type of the argument that names a dataset, which a run folder knows."""
+
 
 def say(text: str) -> None:
     """Print a message for the user, unless -q was given."""

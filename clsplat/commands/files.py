@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from clsplat.commands import console
-from clsplat.commands.console import Out, moved, say, say_cameras
-from clsplat.config import DataConfig, Mode, SfmConfig
+from clsplat.commands.console import OptionalOut, Out, SceneOrRun, moved, say, say_cameras
+from clsplat.commands.options import PageOptions
+from clsplat.commands.run_folders import scene_file, with_run
+from clsplat.config import Mode, SfmConfig
 from clsplat.errors import InputError
 from clsplat.ranges import within
 
@@ -41,9 +43,9 @@ class Devices:
 
 @dataclass(frozen=True)
 class Frames:
-    """Extract photos from a video: the sharpest frame of each interval; `train` and `sfm` match only neighbours."""
+    """Extract photos from a video: the sharpest frame of each interval."""
 
-    video: tyro.conf.Positional[Path]
+    video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
     """The video; needs the extra `video`."""
     out: Out
     """New folder for the photos."""
@@ -60,11 +62,11 @@ class Frames:
 
 @dataclass(frozen=True)
 class Sfm:
-    """Recover the cameras of a folder of photos (pycolmap); `train` does this itself if there are no cameras."""
+    """Recover the cameras of a folder of photos; `train` does this itself."""
 
-    photos: tyro.conf.Positional[Path]
+    photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")]
     """Folder of photos."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: OptionalOut = None
     """Folder for the model; default: the folder of the photos."""
     sfm: Annotated[SfmConfig, tyro.conf.arg(name="")] = field(default_factory=SfmConfig)
 
@@ -79,18 +81,22 @@ class Sfm:
 
 @dataclass(frozen=True)
 class Export:
-    """Convert a file of Gaussians to another format, or to a web page that shows the scene offline in any browser."""
+    """Convert a scene to another format, or to a web page that shows it in any browser."""
 
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
-    to: tyro.conf.Positional[Path | None] = None
+    scene: SceneOrRun
+    """File of Gaussians, or the folder of a run."""
+    to: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FILE]")] = None
     """File to write; its suffix determines the format; .html makes a web page."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: OptionalOut = None
     """Alternative to the second argument."""
-    data: Path | None = None
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DATASET")] = None
     """For a web page: dataset, as for `train`. Its first photo is the first view, and its cameras determine the
-    upward direction."""
-    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
+    upward direction. Default: the dataset of the run."""
+    data_config: Annotated[PageOptions, tyro.conf.arg(name="")] = field(default_factory=PageOptions)
+
+    def base(self) -> "Export | None":
+        """The command with the settings of its run, before flags override them; None if it has none."""
+        return with_run(self)
 
     def run(self) -> None:
         """Run the command."""
@@ -100,7 +106,7 @@ class Export:
             raise InputError("export: expected one file to write, as in: clsplat export scene.ply scene.spz")
         out = self.to or self.out
         assert out is not None
-        gaussians, mode, offset = load_gaussians(self.scene)
+        gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         if out.suffix.lower() == ".html":
             self._page(out, gaussians, mode, offset)
         else:

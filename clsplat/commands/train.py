@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +15,7 @@ import tyro
 from clsplat.commands import console
 from clsplat.commands.console import (
     STARTED,
+    DeviceName,
     Out,
     new_folder,
     say,
@@ -24,6 +25,7 @@ from clsplat.commands.console import (
     warn,
     write_json,
 )
+from clsplat.commands.run_folders import CONFIG, FRAMES
 from clsplat.config import BACKGROUNDS, UINT32_MAX, TrainConfig
 from clsplat.errors import InputError
 from clsplat.ranges import within
@@ -39,11 +41,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Train:
-    """Train Gaussians on photos: a folder of them, a video, a COLMAP model with its photos, or a transforms.json."""
+    """Train Gaussians on photos, a video, a COLMAP model with its photos, or a transforms.json."""
 
-    data: tyro.conf.Positional[Path]
-    """Folder of the dataset, or of photos alone; or a video, the two sharpest frames of each second of
-    which are written to the folder `frames` of OUT (`clsplat frames` takes more or fewer)."""
+    data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS|VIDEO|DATASET")]
+    """Folder of photos, with or without cameras, or a video. The two sharpest frames of each second of a video are
+    written to the folder `frames` of OUT (`clsplat frames` takes more or fewer)."""
     out: Out
     """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians, such as scene.spz, which is
     written as well; its name without the suffix becomes the folder."""
@@ -57,13 +59,13 @@ class Train:
     """The config.json of an earlier run, or a part of one, to start from; flags override it."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
-    def base(self) -> TrainConfig | None:
-        """The settings of the preset or the file, before flags override them; None if neither is given."""
+    def base(self) -> "Train | None":
+        """The command with the settings of the preset or the file, before flags override them; None without them."""
         if self.preset is not None and self.config is not None:
             raise InputError("--preset and --config: expected one of them, found both")
         if self.preset is not None:
-            return load_preset(self.preset)
-        return None if self.config is None else load_config(self.config)
+            return replace(self, settings=load_preset(self.preset))
+        return None if self.config is None else replace(self, settings=load_config(self.config))
 
     def run(self) -> None:
         """Run the command."""
@@ -120,7 +122,7 @@ class Train:
 
         data = self.data
         if is_video(data):
-            data = out / "frames"
+            data = out / FRAMES
             say(f"{data}: {extract_frames(self.data, data)} frames of {self.data.name}")
         scene, config = prepare(
             data,
@@ -132,7 +134,7 @@ class Train:
         )
         check(scene, config)
         if not self.resume:
-            write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
+            write_json(out / CONFIG, {DATA_PATH: str(self.data.resolve()), **asdict(config)})
             say_cameras(data, out / "cameras.png")
         return scene, config
 
@@ -266,7 +268,7 @@ class Demo:
     """Folder for everything that is made."""
     iterations: Annotated[int, within(least=1, most=UINT32_MAX)] = 1500
     """Optimisation steps."""
-    device: str | None = None
+    device: DeviceName = None
     """Part of the platform's or device's name."""
 
     def run(self) -> None:
@@ -287,7 +289,7 @@ class Demo:
         make_photos(photos)
         say("cameras: structure from motion on the photos alone")
         scene, config = prepare(photos, config, device, tell=say)
-        write_json(self.out / "config.json", asdict(config))
+        write_json(self.out / CONFIG, {DATA_PATH: photos.name, **asdict(config)})
         gaussians = train_and_report(scene, config, device, self.out, resume=False)
         renderings = render_views(gaussians, [view.camera for view in scene.test], config.render, device)
         pairs = [(view.image, rendering.rgb) for view, rendering in zip(scene.test, renderings, strict=True)]

@@ -7,27 +7,34 @@ from typing import Annotated
 
 import tyro
 
-from clsplat.commands.console import moved, open_device, say
-from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
+from clsplat.commands.console import DeviceName, SceneOrRun, moved, open_device, say
+from clsplat.commands.options import DrawOptions, ViewOptions
+from clsplat.commands.run_folders import scene_file, with_run
+from clsplat.config import BACKGROUNDS
 from clsplat.ranges import within
 
 
 @dataclass(frozen=True)
 class View:
-    """Show a scene in the browser, rendered on this machine; needs the extra `viewer`."""
+    """Show a scene in the browser; needs the extra `viewer`."""
 
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
-    data: Path | None = None
-    """Dataset, as for `train`: its cameras are shown, and a click on one moves the view there."""
+    scene: SceneOrRun
+    """File of Gaussians, or the folder of a run."""
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DATASET")] = None
+    """Dataset, as for `train`: its cameras are shown, and a click on one moves the view there. Default: the dataset
+    of the run."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 admits other machines, with the token in the printed address."""
     port: Annotated[int, within(least=0, most=65535)] = 8080
     """Port to listen on; if it is in use, the next free one."""
-    device: str | None = None
+    device: DeviceName = None
     """Part of the name of the platform or device."""
-    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
-    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+    data_config: Annotated[ViewOptions, tyro.conf.arg(name="")] = field(default_factory=ViewOptions)
+    render: Annotated[DrawOptions, tyro.conf.arg(name="")] = field(default_factory=DrawOptions)
+
+    def base(self) -> "View | None":
+        """The command with the settings of its run, before flags override them; None if it has none."""
+        return with_run(self)
 
     def run(self) -> None:
         """Run the command."""
@@ -37,7 +44,7 @@ class View:
         from clsplat.show.camera_paths import first_photo, overview
         from clsplat.show.viewer import Viewer
 
-        gaussians, mode, offset = load_gaussians(self.scene)
+        gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
         views = []
         if self.data is not None:

@@ -2,7 +2,7 @@
 
 ``{constants}``: table of clsplat/constants.py.
 ``{config} NAME``: table of a dataclass of clsplat/config.py.
-``{command} NAME``: output of ``clsplat NAME --help``.
+``{command} NAME``: output of ``clsplat NAME --help-all``.
 ``{presets}``: table of the settings of each preset.
 ``{bench_kernels} FILE [WORKLOAD]``: results of ``clsplat bench kernels -o FILE``, or the stages of one workload.
 ``{bench_knobs} FILE``: table of ``clsplat bench knobs -o FILE``.
@@ -145,13 +145,13 @@ def presets_table() -> str:
 
 
 def help_text(command: str) -> str:
-    """Output of ``clsplat COMMAND --help`` on a terminal with 100 columns, without colours."""
+    """Output of ``clsplat COMMAND --help-all`` on a terminal with 100 columns, without colours."""
     text = io.StringIO()
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "100"
     try:
         with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-            cli.main([*command.split(), "--help"])
+            cli.main([*command.split(), "--help-all"])
     finally:
         os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
     return re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue())
