@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from clsplat.commands import console
-from clsplat.commands.console import OptionalOut, Out, SceneOrRun, moved, say, say_cameras
+from clsplat.commands.console import OptionalOut, Out, SceneOrRun, moved, picture_cameras, say, say_cameras
 from clsplat.commands.options import PageOptions
 from clsplat.commands.run_folders import scene_file, with_run
 from clsplat.config import Mode, SfmConfig
@@ -75,7 +75,8 @@ class Sfm:
         from clsplat.dataset.sfm.reconstruction import reconstruct
 
         model = reconstruct(self.photos, self.sfm, self.out, verbose=console.loudness == "verbose")
-        say_cameras(self.out or self.photos, model.parent / "cameras.png")
+        say_cameras(self.out or self.photos)
+        picture_cameras(self.out or self.photos, model.parent / "cameras.png")
         print(model)
 
 

@@ -55,6 +55,20 @@ class Page:
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
+    def open_tab(self, name: str) -> None:
+        """Open a tab of the panel."""
+        find = f"[...document.querySelectorAll('[role=tab]')].find(t => t.innerText.trim() == {name!r})"
+        wait_for(lambda: self.evaluate(f"Boolean({find})"), f"the tab {name}")
+        box = f"(() => {{ const b = {find}.getBoundingClientRect(); return [b.x + b.width / 2, b.y + 9]; }})()"
+
+        def opened() -> bool:
+            if self.evaluate(f"{find}.ariaSelected") != "true":
+                self.click(*self.evaluate(box))  # again, in case the page was busy
+                time.sleep(1)
+            return self.evaluate(f"{find}.ariaSelected") == "true"
+
+        wait_for(opened, f"the open tab {name}")
+
     def click(self, x: float, y: float) -> None:
         """Press and release the left button."""
         where = {"x": x, "y": y, "button": "left", "clickCount": 1}
