@@ -12,7 +12,7 @@ from typing import Annotated, get_args
 
 import tyro
 
-from clsplat.bench.bench_commands import Captures, Chart, Kernels, Knobs, Quality, Stability
+from clsplat.bench.bench_commands import Captures, Chart, Kernels, Knobs, Quality, Stability, Viewer
 from clsplat.commands import console
 from clsplat.commands.arguments import parsed, unknown
 from clsplat.commands.compact import Compact
@@ -32,6 +32,7 @@ BENCHMARKS = (
     | Annotated[Captures, tyro.conf.subcommand("captures")]
     | Annotated[Chart, tyro.conf.subcommand("chart")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
+    | Annotated[Viewer, tyro.conf.subcommand("viewer")]
 )
 
 

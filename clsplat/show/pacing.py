@@ -13,8 +13,9 @@ screen, a browser shows more than 15 frames per second, from which on a movement
 STILL_AFTER = 0.25
 """Time without a movement after which frames are refined, up to the size of the window, s."""
 
-SMALLEST_SHARE = 1 / 8
-"""Smallest resolution of a frame while the camera moves, as a fraction of the window's edges."""
+SMALLEST_SHARE = 1 / 4
+"""Smallest resolution of a frame while the camera moves, as a fraction of the window's edges. Below it, projecting
+and sorting the Gaussians takes most of the time (docs/howto/viewer.md), and frames only become coarser."""
 
 TRAINING_SHARE = 0.1
 """Largest fraction of a training's time that frames take while the camera stands still, 0 to 1."""

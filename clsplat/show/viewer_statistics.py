@@ -11,8 +11,8 @@ EVERY = 1.0
 POINTS_MAX = 400
 """Largest number of points of a curve; beyond it every other one is dropped. The panel is as many pixels wide."""
 
-HEIGHT = 120
-"""Height of a curve, px."""
+HEIGHT, LABELS = 120, 60
+"""Height of a curve and width of the labels of its y axis, px; a label can be 1,000,000."""
 
 
 class Statistics:
@@ -32,9 +32,9 @@ class Statistics:
     @staticmethod
     def _plot(gui: Any, name: str) -> Any:
         series = ({"label": "iteration"}, {"label": name, "stroke": "#d55e00", "width": 2})
-        return gui.add_uplot(
-            (np.zeros(0), np.zeros(0)), series, title=name, height=HEIGHT, scales={"x": {"time": False}}
-        )
+        data = (np.zeros(0), np.zeros(0))
+        options = {"scales": {"x": {"time": False}}, "axes": ({}, {"size": LABELS}), "legend": {"show": False}}
+        return gui.add_uplot(data, series, title=name, height=HEIGHT, **options)
 
     def add(self, iteration: int, count: int, psnr: float | None) -> None:
         """Add the state after an iteration; PSNR is None where photos were not evaluated."""

@@ -6,6 +6,7 @@
 ``{presets}``: table of the settings of each preset.
 ``{bench_kernels} FILE [WORKLOAD]``: results of ``clsplat bench kernels -o FILE``, or the stages of one workload.
 ``{bench_knobs} FILE``: table of ``clsplat bench knobs -o FILE``.
+``{bench_viewer} FILE``: table of ``clsplat bench viewer -o FILE``.
 ``{bench_stability} FILE``: rows and charts that ``make bench-stability`` wrote to the folder of FILE.
 ``{bench_quality} FILE [COST]``: environment of the records of ``clsplat bench quality`` in FILE, or charts and table
 of one cost.
@@ -36,6 +37,7 @@ from sphinx.util.docutils import SphinxDirective
 from clsplat import cli, config, constants
 from clsplat.bench import captures_report, charts, quality_summary, results
 from clsplat.bench import kernel_report as report
+from clsplat.bench.frame_rates import frames_text
 from clsplat.bench.knob_report import knobs_text
 from clsplat.bench.stability import stability_report as stability
 from clsplat.ranges import rule_of
@@ -230,6 +232,17 @@ class BenchKnobs(SphinxDirective):
         return self.parse_text_to_nodes(knobs_text(json.loads(Path(path).read_text())))
 
 
+class BenchViewer(SphinxDirective):
+    """``{bench_viewer} FILE``. The path of the file is relative to the page."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        relative, path = self.env.relfn2path(self.arguments[0])
+        self.env.note_dependency(relative)
+        return self.parse_text_to_nodes(frames_text(json.loads(Path(path).read_text())))
+
+
 class BenchStability(SphinxDirective):
     """``{bench_stability} FILE``. The path is relative to the page; the charts are in the folder of the file."""
 
@@ -328,6 +341,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("command", Command)
     app.add_directive("bench_kernels", BenchKernels)
     app.add_directive("bench_knobs", BenchKnobs)
+    app.add_directive("bench_viewer", BenchViewer)
     app.add_directive("bench_stability", BenchStability)
     app.add_directive("bench_quality", BenchQuality)
     app.add_directive("bench_captures", BenchCaptures)

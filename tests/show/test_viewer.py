@@ -140,7 +140,7 @@ class TestResolution:
         gaussians, cams = cameras()
 
         def slow(device, gaussians, camera, *_):
-            clock.now += 2.5 * camera.width * camera.height / (SIZE[0] * SIZE[1])
+            clock.now += 0.5 * camera.width * camera.height / (SIZE[0] * SIZE[1])
             return np.zeros((camera.height, camera.width, 3), np.uint8), ""
 
         monkeypatch.setattr("clsplat.show.viewer.picture", slow)
@@ -395,6 +395,7 @@ class TestPanel:
         assert 0 < saved[0] < 300 and f"saved {saved[0]}" in viewer._editing._text.content
         look("Undo")
         look("Select none")
+        look("Half size", (0.5, 0.5, 0.5))
         look("Crop", "sphere")
         look("Save")
         look("Delete outside")
