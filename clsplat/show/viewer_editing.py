@@ -49,8 +49,8 @@ class Editing:
         self._outline: Any = None
         centre, radius = bounds(gaussians)
         limit = EXTENT_MAX * max(float(np.abs(gaussians.means).max()), radius)
-        reach, step = REGION_RADII * radius, radius / 100
-        x, y, z = (float(value) for value in centre)
+        reach, step = float(f"{REGION_RADII * radius:.3g}"), radius / 100
+        x, y, z = (float(f"{value:.3g}") for value in centre)
         gui = panel.gui
         self._crop = panel.dropdown("Crop", CROPS, lambda _: self._do(self._region))
         self._centre = panel.vector("Centre", (x, y, z), limit, step, lambda _: self._do(self._region))
