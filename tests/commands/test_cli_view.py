@@ -138,8 +138,10 @@ def test_what_a_training_waits_for_is_said_before_the_first_step(
     monkeypatch.setattr(Viewer, "wait", lambda self, reason: steps.append(reason.split(",")[0]))
     monkeypatch.setattr(Viewer, "show", lambda self, *_: steps.append("shown"))
     monkeypatch.setattr(Viewer, "follow", lambda self, *_: steps.append("step"))
+    monkeypatch.setattr("clsplat.commands.train.picture_cameras", lambda *_: steps.append("picture of the cameras"))
     run("train", dataset, "-o", tmp_path / "out", "--viewer", "--port", 18090, *TRAIN)
-    assert steps[0] == "reading the photos" and steps[-22:-20] == ["compiling kernels", "shown"]
+    before = ["compiling kernels", "shown", "picture of the cameras"]
+    assert steps[0] == "reading the photos" and steps[-23:-20] == before
     assert steps[-20:] == ["step"] * 20
     said = capsys.readouterr().err
     waits, first, bar = (said.index(text) for text in ("waiting for the first step", "first iteration: done", "1/20"))
