@@ -38,7 +38,7 @@ def test_a_rectangle_selects_at_any_depth_and_adds_to_the_selection():
 def test_nothing_behind_the_camera_is_selected():
     edits = Edits(grid())
     away = Camera.look_at((1.5, 1.5, -20), (1.5, 1.5, -40), (0, -1, 0), 400, 200, 200)
-    edits.select_rectangle(away, (0.0, 0.0), (1.0, 1.0))
+    edits.select_rectangle(away, (-9.0, -9.0), (9.0, 9.0))
     assert not edits.selected.any()
 
 
