@@ -223,6 +223,8 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     sizes: list[int] = []
     whole = train(scene, config, tmp_path / "whole", device, progress=lambda r: sizes.append(r["num_gaussians"]))
     report = json.loads((tmp_path / "whole" / "size.json").read_text())
+    # 8 dB less is an error of 0.16, as of a part of each of log2(N) doublings.
+    assert report["least_share"] == pytest.approx(np.log2(10 ** (config.size_price / 10)))
     trials = report["trials"]
     assert [found["n"] for found in trials] == [[40, 80], [20, 40], [10, 20]]
     for found in trials:
