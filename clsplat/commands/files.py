@@ -1,4 +1,4 @@
-"""The commands `devices`, `frames`, `sfm` and `export`."""
+"""The commands `frames`, `sfm` and `export`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,29 +14,6 @@ from clsplat.ranges import within
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
-
-
-@dataclass(frozen=True)
-class Devices:
-    """List the OpenCL devices, their capabilities, and the default device."""
-
-    def run(self) -> None:
-        """Run the command."""
-        from clsplat.device import device_label, list_devices, select_device
-
-        default = select_device()
-        for device in list_devices():
-            extensions = device.extensions
-            capabilities = [
-                f"{device.max_compute_units} compute units",
-                f"{device.global_mem_size / 2**30:.1f} GiB, {device.max_mem_alloc_size / 2**30:.1f} GiB per buffer",
-                f"{device.local_mem_size // 1024} KiB local",
-                device.version.strip(),
-                "double precision" if "cl_khr_fp64" in extensions else "no double precision",
-                "subgroups" if "subgroups" in extensions else "no subgroups",
-            ]
-            print(f"{'*' if device == default else ' '} {device_label(device)}\n    {'; '.join(capabilities)}")
-        print("* is the default; choose another device with --device and part of its name, or with PYOPENCL_CTX")
 
 
 @dataclass(frozen=True)
