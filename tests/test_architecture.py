@@ -30,7 +30,7 @@ LAYERS = """
     structs reference
     ops testing formats
     renderer
-    render dataset demo
+    render dataset demo raster_gradients
     rasterization pruning
     training show
     evaluate
