@@ -13,6 +13,25 @@
 #include "common.h"
 #include "adam.h"
 
+DEFINE_ADAM(16)
+
+// An update of `count` adjacent parameters, at most 16. Nothing beyond them is read or written.
+static inline void adam_update_some(const Adam *adam, real16 rates, int count, real16 g, __global real *parameters,
+                                    __global real *first, __global real *second) {
+    real16 p = 0, m = 0, v = 0;
+    for (int i = 0; i < count; ++i) {
+        ((real *)&p)[i] = parameters[i];
+        ((real *)&m)[i] = first[i];
+        ((real *)&v)[i] = second[i];
+    }
+    p = adam_update16(adam, rates, p, g, &m, &v);
+    for (int i = 0; i < count; ++i) {
+        parameters[i] = ((const real *)&p)[i];
+        first[i] = ((const real *)&m)[i];
+        second[i] = ((const real *)&v)[i];
+    }
+}
+
 __kernel void adam_step(const uint total, const uint stride, const uint width, const uint split,
                         const real split_rate, const real rate, const real opacity_penalty, const real scale_penalty,
                         const real erank_penalty, const Adam adam, __global real *parameters,

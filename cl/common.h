@@ -54,6 +54,7 @@ typedef int16 mask16;
 // which has AVX-512, as for a CPU without it, but calls functions that were built for AVX-512. With wider arguments
 // its compiler crashes, hangs or generates wrong code. vload16 and conversions are such functions, too.
 #define IN_HALVES(type, f, x) ((type)(f((x).lo), f((x).hi)))
+#define OF(f, x)              f(x)
 #define OF4(f, x)             f(x)
 #ifdef USE_DOUBLE
 #define OF8(f, x)  IN_HALVES(real8, f, x)
@@ -93,17 +94,18 @@ static inline void store4(__global real *x, size_t i, real4 value) {
     x[4 * i + 3] = value.w;
 }
 
-// 16 adjacent values at any address.
-typedef struct __attribute__((packed)) {
-    real16 v;
-} Packed16;
-
-static inline real16 load16(const __global real *x) {
-    return ((const __global Packed16 *)x)->v;
-}
-
-static inline void store16(__global real *x, real16 value) {
-    ((__global Packed16 *)x)->v = value;
-}
+// 8 or 16 adjacent values at any address.
+#define DEFINE_ACCESS(N)                                                                                             \
+    typedef struct __attribute__((packed)) {                                                                         \
+        real##N v;                                                                                                   \
+    } Packed##N;                                                                                                     \
+    static inline real##N load##N(const __global real *x) {                                                          \
+        return ((const __global Packed##N *)x)->v;                                                                   \
+    }                                                                                                                \
+    static inline void store##N(__global real *x, real##N value) {                                                   \
+        ((__global Packed##N *)x)->v = value;                                                                        \
+    }
+DEFINE_ACCESS(8)
+DEFINE_ACCESS(16)
 
 #endif

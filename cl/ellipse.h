@@ -3,23 +3,27 @@
 #ifndef CLSPLAT_ELLIPSE_H
 #define CLSPLAT_ELLIPSE_H
 
-#include "power.h"
+#include "lanes.h"
 
 #ifdef USE_DOUBLE
 #define REAL8_OF(x)   IN_HALVES(real8, convert_double4, x)
 #define INT8_OF(x)    IN_HALVES(int8, convert_int4, x)
+#define MASK8_OF(x)   IN_HALVES(mask8, convert_long4, x)
 #define FMA8(a, b, c) ((real8)(fma((a).lo, (b).lo, (c).lo), fma((a).hi, (b).hi, (c).hi)))
 #else
-#define REAL8_OF convert_float8
-#define INT8_OF  convert_int8
-#define FMA8     fma
+#define REAL8_OF    convert_float8
+#define INT8_OF     convert_int8
+#define MASK8_OF(x) (x)
+#define FMA8        fma
 #endif
 
 // r2 in the unit of 2 sigma, including EXTENT_SLACK (clsplat/constants.py). If it is not positive, the splat is
 // invisible.
-static inline real ellipse_r2(real opacity) {
-    return opacity > ALPHA_MIN ? (real)(2 / LOG2_E) * (logarithm(opacity) - (real)LOG2_ALPHA_MIN) + 2 * EXTENT_SLACK
-                               : 0;
+static inline reals ellipse_r2(reals opacity) {
+    const reals zero = 0;
+    return opacity > (reals)ALPHA_MIN
+               ? (real)(2 / LOG2_E) * (LOGARITHM(opacity) - (real)LOG2_ALPHA_MIN) + 2 * EXTENT_SLACK
+               : zero;
 }
 
 // r2 of eight splats. On CPUs a vector logarithm is faster than a scalar one.

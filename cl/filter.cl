@@ -17,9 +17,6 @@
 // -DFILTER_VARIANCE  variance of the filter, in squared sizes of a pixel
 // -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  camera model (lens.h)
 #include "common.h"
-#include "linalg.h"
-#include "power.h"
-#include "structs.h"
 #include "lens.h"
 
 #ifndef FILTER_VARIANCE
@@ -32,11 +29,11 @@ __kernel void pixel_sizes(const uint n, const Camera camera, const __global real
     const size_t i = get_global_id(0);
     if (i >= n)
         return;
-    const real *t = camera.translation;
-    const real3 p = mat3_mul(camera_rotation(&camera), load3(means, i)) + (real3)(t[0], t[1], t[2]);
+    const real3 mean = load3(means, i);
+    const reals3 p = camera_point(&camera, vector3(mean.x, mean.y, mean.z));
     if (!lens_sees(&camera, p))
         return;
-    const real2 centre = lens_centre(&camera, p);
+    const reals2 centre = lens_centre(&camera, p);
     const real margin_x = (real)(0.5 * FRUSTUM_MARGIN) * camera.width,
                margin_y = (real)(0.5 * FRUSTUM_MARGIN) * camera.height;
     if (centre.x >= -margin_x && centre.x <= camera.width + margin_x && centre.y >= -margin_y &&
@@ -45,7 +42,7 @@ __kernel void pixel_sizes(const uint n, const Camera camera, const __global real
 }
 
 // 2^t, clamped to finite positive values; NaN stays NaN.
-static inline real4 power(real4 t) {
+static inline real4 bounded_power(real4 t) {
     return t == t ? power4(CLAMP(t, (real4)POWER_MIN, (real4)(POWER_MAX - 1))) : t;
 }
 
@@ -60,13 +57,13 @@ static inline Filtered filtered(real3 log_scales, real logit, real pixel) {
     Filtered f;
     const real3 log2_scales = (real)LOG2_E * log_scales, log2_filter = logarithm(pixel * sqrt((real)FILTER_VARIANCE));
     const real3 excess = 2 * (log2_filter - log2_scales), zero = 0, most = POWER_MAX;
-    const real4 e = power((real4)(-ABSOLUTE(excess), -(real)LOG2_E * logit));
+    const real4 e = bounded_power((real4)(-ABSOLUTE(excess), -(real)LOG2_E * logit));
     const real3 rest = (real)0.5 * (real3)(logarithm(1 + e.x), logarithm(1 + e.y), logarithm(1 + e.z));
     f.log_scales = (GREATER(log2_scales, log2_filter) + (excess == excess ? rest : excess)) / (real)LOG2_E;
     f.kept = (excess > 0 ? e.xyz : (real3)1) / (1 + e.xyz);
     const real3 shrinkage = (real)0.5 * CLAMP(excess, zero, most) + rest;
     f.log2_factor = -(shrinkage.x + shrinkage.y + shrinkage.z);
-    f.loss = 1 - power((real4)f.log2_factor).x;
+    f.loss = 1 - bounded_power((real4)f.log2_factor).x;
     f.odds = e.w;
     return f;
 }

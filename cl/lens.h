@@ -9,9 +9,12 @@
 // v accordingly. The depth is z, except for FISHEYE, which sees beyond 90 degrees: there it is the distance |p|.
 // docs/stages/project.md derives the second derivatives of FISHEYE; clsplat/reference/lens.py is the twin.
 //
-// The file that includes this documents -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE.
+// The file that includes this documents -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE. FISHEYE takes one lane (lanes.h).
 #ifndef CLSPLAT_LENS_H
 #define CLSPLAT_LENS_H
+
+#include "linalg.h"
+#include "structs.h"
 
 #define PINHOLE      1
 #define ORTHOGRAPHIC 2
@@ -19,92 +22,104 @@
 #if !defined(LENS) || LENS < PINHOLE || LENS > FISHEYE
 #error "-DLENS must be PINHOLE, ORTHOGRAPHIC or FISHEYE"
 #endif
+#if LENS == FISHEYE && LANES != 1
+#error "-DLENS=FISHEYE needs -DLANES=1"
+#endif
 
-static inline mat3 camera_rotation(const Camera *camera) {
+static inline reals3 camera_rotate(const Camera *camera, reals3 v) {
     const real *r = camera->rotation;
-    mat3 m = {(real3)(r[0], r[1], r[2]), (real3)(r[3], r[4], r[5]), (real3)(r[6], r[7], r[8])};
-    return m;
+    return vector3(r[0] * v.x + r[1] * v.y + r[2] * v.z, r[3] * v.x + r[4] * v.y + r[5] * v.z,
+                   r[6] * v.x + r[7] * v.y + r[8] * v.z);
+}
+
+// By the inverse of the rotation.
+static inline reals3 camera_rotate_back(const Camera *camera, reals3 v) {
+    const real *r = camera->rotation;
+    return vector3(r[0] * v.x + r[3] * v.y + r[6] * v.z, r[1] * v.x + r[4] * v.y + r[7] * v.z,
+                   r[2] * v.x + r[5] * v.y + r[8] * v.z);
+}
+
+// A point of the world in the camera's frame.
+static inline reals3 camera_point(const Camera *camera, reals3 mean) {
+    const reals3 p = camera_rotate(camera, mean);
+    return vector3(p.x + camera->translation[0], p.y + camera->translation[1], p.z + camera->translation[2]);
 }
 
 typedef struct {
-    real2 slopes; // PINHOLE: clamped x/z, y/z
-    real3 j0, j1; // rows of the Jacobian, px per world unit
-    real depth;   // world units
-    real3 onward; // gradient of the depth
+    reals2 slopes; // PINHOLE: clamped x/z, y/z
+    reals3 j0, j1; // rows of the Jacobian, px per world unit
+    reals depth;   // world units
+    reals3 onward; // gradient of the depth
 } Lens;
 
 #if LENS == PINHOLE
 
-// Slopes x/z and y/z at which the Jacobian is evaluated: clamped to the image enlarged by FRUSTUM_MARGIN.
-static inline real2 clamped_slopes(const Camera *camera, real2 slopes) {
-    const real2 focal = (real2)(camera->fx, camera->fy), centre = (real2)(camera->cx, camera->cy);
-    const real2 size = (real2)(camera->width, camera->height);
-    const real2 margin = (real)(0.5 * FRUSTUM_MARGIN) * size / focal;
-    const real2 lo = -centre / focal - margin, hi = (size - centre) / focal + margin;
-    return CLAMP(slopes, lo, hi);
+// Slope x/z or y/z at which the Jacobian is evaluated: clamped to the image enlarged by FRUSTUM_MARGIN.
+static inline reals clamped_slope(reals slope, real focal, real centre, real size) {
+    const real margin = (real)(0.5 * FRUSTUM_MARGIN) * size / focal;
+    const reals lo = -centre / focal - margin, hi = (size - centre) / focal + margin;
+    return CLAMP(slope, lo, hi);
 }
 
-static inline real2 lens_centre(const Camera *camera, real3 p) {
-    return (real2)(camera->fx * p.x / p.z + camera->cx, camera->fy * p.y / p.z + camera->cy);
+static inline reals2 lens_centre(const Camera *camera, reals3 p) {
+    const reals2 centre = {camera->fx * p.x / p.z + camera->cx, camera->fy * p.y / p.z + camera->cy};
+    return centre;
 }
 
-static inline bool lens_sees(const Camera *camera, real3 p) {
+static inline masks lens_sees(const Camera *camera, reals3 p) {
     return p.z > camera->near;
 }
 
-static inline Lens lens(const Camera *camera, real3 p) {
+static inline Lens lens(const Camera *camera, reals3 p) {
     Lens l;
-    const real inv_z = 1 / p.z;
-    l.slopes = clamped_slopes(camera, p.xy * inv_z);
-    l.j0 = (real3)(camera->fx * inv_z, 0, -camera->fx * l.slopes.x * inv_z);
-    l.j1 = (real3)(0, camera->fy * inv_z, -camera->fy * l.slopes.y * inv_z);
+    const reals inv_z = 1 / p.z;
+    l.slopes.x = clamped_slope(p.x * inv_z, camera->fx, camera->cx, camera->width);
+    l.slopes.y = clamped_slope(p.y * inv_z, camera->fy, camera->cy, camera->height);
+    l.j0 = vector3(camera->fx * inv_z, 0, -camera->fx * l.slopes.x * inv_z);
+    l.j1 = vector3(0, camera->fy * inv_z, -camera->fy * l.slopes.y * inv_z);
     l.depth = p.z;
-    l.onward = (real3)(0, 0, 1);
+    l.onward = vector3(0, 0, 1);
     return l;
 }
 
 // Gradient with respect to p. v_intrinsics receives the gradients with respect to fx, fy, cx, cy. The derivative of a
 // clamped slope is 0. fx times the limit is affine in cx and does not depend on fx.
-static inline real3 lens_vjp(const Camera *camera, real3 p, const Lens *l, real2 v_centre, real3 v_j0, real3 v_j1,
-                             real v_depth, real4 *v_intrinsics) {
-    const real inv_z = 1 / p.z;
-    const real2 focal = (real2)(camera->fx, camera->fy), slopes = p.xy * inv_z;
-    const bool free_x = slopes.x == l->slopes.x, free_y = slopes.y == l->slopes.y;
-    real2 v_slopes = v_centre * focal;
-    if (free_x)
-        v_slopes.x -= focal.x * inv_z * v_j0.z;
-    if (free_y)
-        v_slopes.y -= focal.y * inv_z * v_j1.z;
-    real3 v_p;
-    v_p.xy = v_slopes * inv_z;
-    v_p.z = v_depth - (v_slopes.x * slopes.x + v_slopes.y * slopes.y) * inv_z -
-            inv_z * inv_z * (focal.x * (v_j0.x - l->slopes.x * v_j0.z) + focal.y * (v_j1.y - l->slopes.y * v_j1.z));
-
-    *v_intrinsics = (real4)(v_centre.x * slopes.x + (v_j0.x - (free_x ? slopes.x * v_j0.z : 0)) * inv_z,
-                            v_centre.y * slopes.y + (v_j1.y - (free_y ? slopes.y * v_j1.z : 0)) * inv_z,
-                            v_centre.x + (free_x ? 0 : v_j0.z * inv_z), v_centre.y + (free_y ? 0 : v_j1.z * inv_z));
-    return v_p;
+static inline reals3 lens_vjp(const Camera *camera, reals3 p, const Lens *l, reals2 v_centre, reals3 v_j0,
+                              reals3 v_j1, reals v_depth, reals4 *v_intrinsics) {
+    const reals inv_z = 1 / p.z, zero = 0;
+    const real fx = camera->fx, fy = camera->fy;
+    const reals slope_x = p.x * inv_z, slope_y = p.y * inv_z;
+    // The gradients of the slopes in the Jacobian.
+    const reals free_x = slope_x == l->slopes.x ? v_j0.z : zero, free_y = slope_y == l->slopes.y ? v_j1.z : zero;
+    const reals v_x = v_centre.x * fx - fx * inv_z * free_x, v_y = v_centre.y * fy - fy * inv_z * free_y;
+    *v_intrinsics = vector4(v_centre.x * slope_x + (v_j0.x - slope_x * free_x) * inv_z,
+                            v_centre.y * slope_y + (v_j1.y - slope_y * free_y) * inv_z,
+                            v_centre.x + (v_j0.z - free_x) * inv_z, v_centre.y + (v_j1.z - free_y) * inv_z);
+    return vector3(v_x * inv_z, v_y * inv_z,
+                   v_depth - (v_x * slope_x + v_y * slope_y) * inv_z -
+                       inv_z * inv_z * (fx * (v_j0.x - l->slopes.x * v_j0.z) + fy * (v_j1.y - l->slopes.y * v_j1.z)));
 }
 
 #elif LENS == ORTHOGRAPHIC
 
-static inline real2 lens_centre(const Camera *camera, real3 p) {
-    return (real2)(camera->fx * p.x + camera->cx, camera->fy * p.y + camera->cy);
+static inline reals2 lens_centre(const Camera *camera, reals3 p) {
+    const reals2 centre = {camera->fx * p.x + camera->cx, camera->fy * p.y + camera->cy};
+    return centre;
 }
 
-static inline bool lens_sees(const Camera *camera, real3 p) {
+static inline masks lens_sees(const Camera *camera, reals3 p) {
     return p.z > camera->near;
 }
 
-static inline Lens lens(const Camera *camera, real3 p) {
-    const Lens l = {(real2)0, (real3)(camera->fx, 0, 0), (real3)(0, camera->fy, 0), p.z, (real3)(0, 0, 1)};
+static inline Lens lens(const Camera *camera, reals3 p) {
+    const Lens l = {{0, 0}, vector3(camera->fx, 0, 0), vector3(0, camera->fy, 0), p.z, vector3(0, 0, 1)};
     return l;
 }
 
-static inline real3 lens_vjp(const Camera *camera, real3 p, const Lens *l, real2 v_centre, real3 v_j0, real3 v_j1,
-                             real v_depth, real4 *v_intrinsics) {
-    *v_intrinsics = (real4)(v_centre.x * p.x + v_j0.x, v_centre.y * p.y + v_j1.y, v_centre);
-    return (real3)(camera->fx * v_centre.x, camera->fy * v_centre.y, v_depth);
+static inline reals3 lens_vjp(const Camera *camera, reals3 p, const Lens *l, reals2 v_centre, reals3 v_j0,
+                              reals3 v_j1, reals v_depth, reals4 *v_intrinsics) {
+    *v_intrinsics = vector4(v_centre.x * p.x + v_j0.x, v_centre.y * p.y + v_j1.y, v_centre.x, v_centre.y);
+    return vector3(camera->fx * v_centre.x, camera->fy * v_centre.y, v_depth);
 }
 
 #else
@@ -115,7 +130,7 @@ typedef struct {
     real s, q, h, w, m, n;
 } Radial;
 
-static inline Radial radial(const Camera *camera, real3 p) {
+static inline Radial radial(const Camera *camera, reals3 p) {
     Radial f;
     const real k1 = camera->k1, k2 = camera->k2, k3 = camera->k3, k4 = camera->k4;
     const real rho2 = p.x * p.x + p.y * p.y, z = p.z, inv_z = 1 / z, t = rho2 * inv_z * inv_z;
@@ -150,49 +165,49 @@ static inline Radial radial(const Camera *camera, real3 p) {
     return f;
 }
 
-static inline real2 lens_centre(const Camera *camera, real3 p) {
+static inline reals2 lens_centre(const Camera *camera, reals3 p) {
     const real s = radial(camera, p).s;
-    return (real2)(camera->fx * p.x * s + camera->cx, camera->fy * p.y * s + camera->cy);
+    const reals2 centre = {camera->fx * p.x * s + camera->cx, camera->fy * p.y * s + camera->cy};
+    return centre;
 }
 
-static inline bool lens_sees(const Camera *camera, real3 p) {
+static inline masks lens_sees(const Camera *camera, reals3 p) {
     const real r = sqrt(dot3(p, p));
     return r > camera->near && p.z > r * camera->cos_max;
 }
 
-static inline Lens lens(const Camera *camera, real3 p) {
+static inline Lens lens(const Camera *camera, reals3 p) {
     Lens l;
     const Radial f = radial(camera, p);
     const real xyq = p.x * p.y * f.q;
-    l.slopes = 0;
-    l.j0 = camera->fx * (real3)(f.s + p.x * p.x * f.q, xyq, p.x * f.h);
-    l.j1 = camera->fy * (real3)(xyq, f.s + p.y * p.y * f.q, p.y * f.h);
+    l.slopes.x = l.slopes.y = 0;
+    l.j0 = scaled3(camera->fx, vector3(f.s + p.x * p.x * f.q, xyq, p.x * f.h));
+    l.j1 = scaled3(camera->fy, vector3(xyq, f.s + p.y * p.y * f.q, p.y * f.h));
     l.depth = sqrt(dot3(p, p));
-    l.onward = p / l.depth;
+    l.onward = vector3(p.x / l.depth, p.y / l.depth, p.z / l.depth);
     return l;
 }
 
-static inline real3 lens_vjp(const Camera *camera, real3 p, const Lens *l, real2 v_centre, real3 v_j0, real3 v_j1,
-                             real v_depth, real4 *v_intrinsics) {
+static inline reals3 lens_vjp(const Camera *camera, reals3 p, const Lens *l, reals2 v_centre, reals3 v_j0,
+                              reals3 v_j1, reals v_depth, reals4 *v_intrinsics) {
     const Radial f = radial(camera, p);
-    const real2 v = (real2)(camera->fx, camera->fy) * v_centre;
-    const real3 a = camera->fx * v_j0, b = camera->fy * v_j1;
+    const real v_x = camera->fx * v_centre.x, v_y = camera->fy * v_centre.y;
+    const reals3 a = scaled3(camera->fx, v_j0), b = scaled3(camera->fy, v_j1);
     const real ab = a.y + b.x;
-    const real v_s = v.x * p.x + v.y * p.y + a.x + b.y;
+    const real v_s = v_x * p.x + v_y * p.y + a.x + b.y;
     const real v_q = a.x * p.x * p.x + ab * p.x * p.y + b.y * p.y * p.y, v_h = a.z * p.x + b.z * p.y;
     const real across = v_s * f.q + v_q * f.w + v_h * f.m;
-    *v_intrinsics = (real4)(v_centre.x * p.x * f.s + dot3(v_j0, l->j0) / camera->fx,
-                            v_centre.y * p.y * f.s + dot3(v_j1, l->j1) / camera->fy, v_centre);
-    return (real3)(v.x * f.s + (2 * a.x * p.x + ab * p.y) * f.q + a.z * f.h + across * p.x,
-                   v.y * f.s + (2 * b.y * p.y + ab * p.x) * f.q + b.z * f.h + across * p.y,
-                   v_s * f.h + v_q * f.m + v_h * f.n) +
-           v_depth * l->onward;
+    *v_intrinsics = vector4(v_centre.x * p.x * f.s + dot3(v_j0, l->j0) / camera->fx,
+                            v_centre.y * p.y * f.s + dot3(v_j1, l->j1) / camera->fy, v_centre.x, v_centre.y);
+    return vector3(v_x * f.s + (2 * a.x * p.x + ab * p.y) * f.q + a.z * f.h + across * p.x + v_depth * l->onward.x,
+                   v_y * f.s + (2 * b.y * p.y + ab * p.x) * f.q + b.z * f.h + across * p.y + v_depth * l->onward.y,
+                   v_s * f.h + v_q * f.m + v_h * f.n + v_depth * l->onward.z);
 }
 
 #endif
 
 // Size at p, in world units, of one unit in an image with a focal length of one unit; for FISHEYE, on the axis.
-static inline real lens_reach(const Camera *camera, real3 p) {
+static inline reals lens_reach(const Camera *camera, reals3 p) {
 #if LENS == ORTHOGRAPHIC
     return 1;
 #else
@@ -202,11 +217,11 @@ static inline real lens_reach(const Camera *camera, real3 p) {
 
 // Direction from which a Gaussian is seen, not normalised: from the camera's centre, or for ORTHOGRAPHIC along the
 // axis.
-static inline real3 lens_offset(const Camera *camera, real3 mean) {
+static inline reals3 lens_offset(const Camera *camera, reals3 mean) {
 #if LENS == ORTHOGRAPHIC
-    return camera_rotation(camera).row2;
+    return vector3(camera->rotation[6], camera->rotation[7], camera->rotation[8]);
 #else
-    return mean - (real3)(camera->position[0], camera->position[1], camera->position[2]);
+    return vector3(mean.x - camera->position[0], mean.y - camera->position[1], mean.z - camera->position[2]);
 #endif
 }
 

@@ -15,7 +15,6 @@
 #include "common.h"
 #include "linalg.h"
 #include "philox.h"
-#include "power.h"
 
 #if !defined(GATE_SLOPE) || !defined(GATE_OPACITY)
 #error "-DGATE_SLOPE and -DGATE_OPACITY, slope and middle of the gate, must be given"
@@ -37,7 +36,8 @@ __kernel void add_noise(const uint n, const uint2 key, const uint iteration, con
     const size_t i = get_global_id(0);
     if (i >= n)
         return;
-    const real4 quat = load4(quats, i);
+    const real4 q = load4(quats, i);
+    const reals4 quat = {q.x, q.y, q.z, q.w};
     const real norm2 = dot4(quat, quat);
     if (!(norm2 >= QUAT_NORM2_MIN))
         return;
@@ -46,8 +46,9 @@ __kernel void add_noise(const uint n, const uint2 key, const uint iteration, con
     const real4 e = power4(CLAMP(t, (real4)POWER_MIN, (real4)POWER_MAX));
     const real slope = (real)(GATE_SLOPE * LOG2_E) * (1 / (1 + e.w) - (real)GATE_OPACITY);
     const real gate = 1 / (1 + power4((real4)LESSER(slope, (real)POWER_MAX)).x);
-    const mat3 rotation = rotation_from_quat(quat / sqrt(norm2));
+    const mat3 rotation = rotation_from_quat(normalized4(quat));
     const real3 eta = normals(philox((uint4)((uint)i, iteration, 0, 0), key));
-    const real3 step = mat3_mul(rotation, e.xyz * mat3_tmul(rotation, eta));
-    store3(means, i, load3(means, i) + size * gate * step);
+    const reals3 along = mat3_tmul(&rotation, vector3(eta.x, eta.y, eta.z));
+    const reals3 step = mat3_mul(&rotation, times3(vector3(e.x, e.y, e.z), along));
+    store3(means, i, load3(means, i) + size * gate * (real3)(step.x, step.y, step.z));
 }

@@ -5,7 +5,7 @@
 
 #define LOG2_E 1.4426950408889634
 
-// DEFINE_POWER(N) defines powerN on vectors of N: 2^t for POWER_MIN <= t <= POWER_MAX. The result at POWER_MAX is
+// DEFINE_POWER(N) defines powerN on vectors of N, and without N power on reals: 2^t for POWER_MIN <= t <= POWER_MAX. The result at POWER_MAX is
 // infinity; beyond these limits it is undefined. In single precision, 2^(t - round(t)) is the polynomial of degree 5
 // with the smallest maximal relative error, 7.5e-8, and round(t) is added to the exponent. Adding 1.5 * 2^23 to t
 // leaves round(t) in the last bits.
@@ -33,18 +33,27 @@
     }
 #endif
 
-// log2(x) for normal x > 0; otherwise undefined. In single precision, x = 2^e m with m from sqrt(1/2) to sqrt(2), and
-// ln m = 2 (s + s^3/3 + s^5/5 + ...) with s = (m - 1)/(m + 1). The first omitted term is below 2e-9.
-static inline real logarithm(real x) {
+// DEFINE_LOGARITHM(N) defines logarithmN on vectors of N: log2(x) for normal x > 0; otherwise undefined. In single
+// precision, x = 2^e m with m from sqrt(1/2) to sqrt(2), and ln m = 2 (s + s^3/3 + s^5/5 + ...) with s = (m - 1)/(m + 1).
+// The first omitted term is below 2e-9. Adding e to the bits of 1.5 * 2^23 converts it to a real.
 #ifdef USE_DOUBLE
-    return log2(x);
+#define DEFINE_LOGARITHM(N)                                                                                          \
+    static inline real##N logarithm##N(real##N x) {                                                                  \
+        return OF##N(log2, x);                                                                                       \
+    }
 #else
-    const int bits = as_int(x), e = (bits - 0x3f3504f3) >> 23; // the bits of sqrt(1/2)
-    const real m = as_float(bits - (e << 23)), s = (m - 1) / (m + 1), s2 = s * s;
-    return e +
-           (real)(2 * LOG2_E) * s *
-               (1 + s2 * ((real)(1.0 / 3) + s2 * ((real)(1.0 / 5) + s2 * ((real)(1.0 / 7) + s2 * (real)(1.0 / 9)))));
+#define DEFINE_LOGARITHM(N)                                                                                          \
+    static inline real##N logarithm##N(real##N x) {                                                                  \
+        const int##N bits = as_int##N(x), e = (bits - 0x3f3504f3) >> 23; /* the bits of sqrt(1/2) */                 \
+        const real##N m = as_float##N(bits - (e << 23)), s = (m - 1) / (m + 1), s2 = s * s;                          \
+        real##N p = (real##N)(1.0 / 9);                                                                              \
+        p = p * s2 + (real##N)(1.0 / 7);                                                                             \
+        p = p * s2 + (real##N)(1.0 / 5);                                                                             \
+        p = p * s2 + (real##N)(1.0 / 3);                                                                             \
+        p = p * s2 + 1;                                                                                              \
+        return (as_float##N(e + 0x4b400000) - (real##N)12582912) + (real##N)(2 * LOG2_E) * s * p;                    \
+    }
 #endif
-}
+DEFINE_LOGARITHM()
 
 #endif

@@ -9,7 +9,7 @@
 // If each pixel is sorted, also the disparity 1/z at which the ray of a pixel meets it (project_disparities).
 // docs/stages/project.md derives the gradients; clsplat/reference/project.py is the float64 twin.
 //
-// Mapping: one work-item per Gaussian, no local memory except for CAMERA_GRAD.
+// Mapping: a work-item takes the next LANES Gaussians (lanes.h); no local memory except for CAMERA_GRAD.
 //
 // Buffers, N Gaussians with K = (degree + 1)^2 coefficients stored, C = CHANNELS:
 //   in   means[N,3] world, log_scales[N,3] ln(world), quats[N,4] wxyz of any norm, logit_opacities[N], sh[N,K,3]
@@ -27,14 +27,15 @@
 // -DANTIALIASED=0|1   1: opacity compensation
 // -DCAMERA_GRAD=0|1   1: the backward kernels also write v_camera; requires -DGROUP, the work-group size
 // -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  camera model (lens.h)
+// -DLANES=1|8         Gaussians of a work-item
+#ifndef LANES
+#error "-DLANES, the number of Gaussians of a work-item, must be given"
+#endif
 #include "common.h"
 #include "adam.h"
 #include "ellipse.h"
-#include "linalg.h"
-#include "power.h"
-#include "sh.h"
-#include "structs.h"
 #include "lens.h"
+#include "sh.h"
 
 #if !defined(CHANNELS) || (CHANNELS != 3 && CHANNELS != 4)
 #error "-DCHANNELS must be 3 (RGB) or 4 (RGB and depth)"
@@ -46,33 +47,42 @@
 #error "-DCAMERA_GRAD=1 needs -DGROUP, the work-group size of the backward kernels"
 #endif
 
-// Intermediate values of one Gaussian for the forward and the backward pass.
+// Number of spherical harmonics' coefficients that are rearranged together, and of their chunks.
+#define COEFFICIENTS 8
+#define CHUNKS       (3 * COEFFICIENTS / LANES)
+
+// Scales and opacities after their activations.
 typedef struct {
-    real3 p;         // centre, camera frame
-    Lens lens;       // J and the depth at the centre
-    mat3 rotation;   // of the Gaussian
-    real3 scales;    // standard deviations, world units
-    real3 t0, t1;    // rows of J W
-    real3 b0, b1;    // rows of J W R S: cov2d = B B^T + BLUR I
-    real xx, xy, yy; // cov2d
-    real det0, det;  // determinants of cov2d without and with the blur
+    reals3 scales; // world units
+    reals opacity;
+} Activated;
+
+// Intermediate values for the forward and the backward pass.
+typedef struct {
+    reals3 p;         // centre, camera frame
+    Lens lens;        // J and the depth at the centre
+    mat3 rotation;    // of the Gaussian
+    reals3 scales;    // standard deviations, world units
+    reals3 t0, t1;    // rows of J W
+    reals3 b0, b1;    // rows of J W R S: cov2d = B B^T + BLUR I
+    reals xx, xy, yy; // cov2d
+    reals det0, det;  // determinants of cov2d without and with the blur
 } Footprint;
 
-static inline Footprint footprint(const Camera *camera, real3 mean, real3 scales, real4 unit_quat) {
+static inline Footprint footprint(const Camera *camera, reals3 mean, reals3 scales, reals4 unit_quat) {
     Footprint f;
-    const mat3 view = camera_rotation(camera);
-    f.p = mat3_mul(view, mean) + (real3)(camera->translation[0], camera->translation[1], camera->translation[2]);
+    f.p = camera_point(camera, mean);
     f.lens = lens(camera, f.p);
-    f.t0 = mat3_tmul(view, f.lens.j0);
-    f.t1 = mat3_tmul(view, f.lens.j1);
+    f.t0 = camera_rotate_back(camera, f.lens.j0);
+    f.t1 = camera_rotate_back(camera, f.lens.j1);
     f.rotation = rotation_from_quat(unit_quat);
     f.scales = scales;
-    f.b0 = mat3_tmul(f.rotation, f.t0) * f.scales;
-    f.b1 = mat3_tmul(f.rotation, f.t1) * f.scales;
-    const real xx = dot3(f.b0, f.b0), yy = dot3(f.b1, f.b1);
+    f.b0 = times3(mat3_tmul(&f.rotation, f.t0), f.scales);
+    f.b1 = times3(mat3_tmul(&f.rotation, f.t1), f.scales);
+    const reals xx = dot3(f.b0, f.b0), yy = dot3(f.b1, f.b1);
     // |b0 x b1|^2 = xx yy - xy^2 (Lagrange), without the cancellation that makes a needle's determinant
     // negative.
-    const real3 normal = cross3(f.b0, f.b1);
+    const reals3 normal = cross3(f.b0, f.b1);
     f.det0 = dot3(normal, normal);
     f.det = f.det0 + BLUR * (xx + yy) + BLUR * BLUR;
     f.xx = xx + BLUR;
@@ -81,76 +91,118 @@ static inline Footprint footprint(const Camera *camera, real3 mean, real3 scales
     return f;
 }
 
+// Gradients with respect to the parameters and the camera.
 typedef struct {
-    real3 p, log_scales, mean;
-    real4 quat; // of the unit quaternion
+    reals3 mean, log_scales;
+    reals4 quat;
+    reals logit_opacity;
+    reals3 color; // that of coefficient k is basis[k] color
+#if CAMERA_GRAD
     mat3 view;
-    real4 intrinsics;
-} FootprintGrad;
+    reals3 translation;
+    reals4 intrinsics;
+#endif
+} GaussianGrad;
 
-// v_xx, v_xy, v_yy: gradients of cov2d, where xy stands for both off-diagonal entries.
-static inline FootprintGrad footprint_vjp(const Camera *camera, const Footprint *f, real3 mean, real4 unit_quat,
-                                          real3 v_cov, real2 v_mean2d, real v_depth) {
-    FootprintGrad v;
-    const mat3 view = camera_rotation(camera);
-    const real3 v_b0 = 2 * v_cov.x * f->b0 + v_cov.y * f->b1;
-    const real3 v_b1 = 2 * v_cov.z * f->b1 + v_cov.y * f->b0;
+#define NUMBERS ((int)(sizeof(GaussianGrad) / sizeof(reals)))
+
+// v_cov = (v_xx, v_xy, v_yy): gradients of cov2d, where xy stands for both off-diagonal entries. v->quat receives the
+// gradient of the unit quaternion.
+static inline void footprint_vjp(const Camera *camera, const Footprint *f, reals3 mean, reals4 unit_quat,
+                                 reals3 v_cov, reals2 v_mean2d, reals v_depth, GaussianGrad *v) {
+    const reals3 v_b0 = combined3(2 * v_cov.x, f->b0, v_cov.y, f->b1);
+    const reals3 v_b1 = combined3(2 * v_cov.z, f->b1, v_cov.y, f->b0);
 
     // b = S R^T t
-    const real3 scaled0 = f->scales * v_b0, scaled1 = f->scales * v_b1;
-    v.log_scales = f->b0 * v_b0 + f->b1 * v_b1;
-    v.quat = rotation_from_quat_vjp(unit_quat, mat3_outer2(f->t0, scaled0, f->t1, scaled1));
-    const real3 v_t0 = mat3_mul(f->rotation, scaled0), v_t1 = mat3_mul(f->rotation, scaled1);
+    const reals3 scaled0 = times3(f->scales, v_b0), scaled1 = times3(f->scales, v_b1);
+    v->log_scales = plus3(times3(f->b0, v_b0), times3(f->b1, v_b1));
+    const mat3 v_rotation = mat3_outer2(f->t0, scaled0, f->t1, scaled1);
+    v->quat = rotation_from_quat_vjp(unit_quat, &v_rotation);
+    const reals3 v_t0 = mat3_mul(&f->rotation, scaled0), v_t1 = mat3_mul(&f->rotation, scaled1);
 
     // t = W^T j
-    const real3 v_j0 = mat3_mul(view, v_t0), v_j1 = mat3_mul(view, v_t1);
-    v.view = mat3_outer2(f->lens.j0, v_t0, f->lens.j1, v_t1);
-    v.p = lens_vjp(camera, f->p, &f->lens, v_mean2d, v_j0, v_j1, v_depth, &v.intrinsics);
+    const reals3 v_j0 = camera_rotate(camera, v_t0), v_j1 = camera_rotate(camera, v_t1);
+    reals4 v_intrinsics;
+    const reals3 v_p = lens_vjp(camera, f->p, &f->lens, v_mean2d, v_j0, v_j1, v_depth, &v_intrinsics);
 
     // p = W mean + translation
-    v.mean = mat3_tmul(view, v.p);
-    v.view.row0 += v.p.x * mean;
-    v.view.row1 += v.p.y * mean;
-    v.view.row2 += v.p.z * mean;
-    return v;
+    v->mean = camera_rotate_back(camera, v_p);
+#if CAMERA_GRAD
+    v->intrinsics = v_intrinsics;
+    v->translation = v_p;
+    v->view = mat3_outer2(f->lens.j0, v_t0, f->lens.j1, v_t1);
+    add_outer(v_p, mean, &v->view);
+#endif
 }
 
 // Factor on the opacity, and the gradients of the determinants with respect to it.
-static inline real compensation(real det0, real det) {
+static inline reals compensation(reals det0, reals det) {
 #if ANTIALIASED
-    return sqrt(GREATER(det0 / det, (real)(COMPENSATION_MIN * COMPENSATION_MIN)));
+    const reals ratio = det0 / det, least = COMPENSATION_MIN * COMPENSATION_MIN;
+    return OF_LANES(sqrt, GREATER(ratio, least));
 #else
     return 1;
 #endif
 }
 
-static inline real2 compensation_vjp(real det0, real det, real v_factor) {
+static inline reals2 compensation_vjp(reals det0, reals det, reals v_factor) {
+    reals2 v = {0, 0};
 #if ANTIALIASED
-    const real ratio = det0 / det;
-    if (ratio <= (real)(COMPENSATION_MIN * COMPENSATION_MIN))
-        return 0;
-    const real v_ratio = v_factor * (real)0.5 / sqrt(ratio);
-    return (real2)(v_ratio / det, -v_ratio * ratio / det);
-#else
-    return 0;
+    const reals ratio = det0 / det, least = COMPENSATION_MIN * COMPENSATION_MIN, zero = 0;
+    const reals v_ratio = ratio > least ? v_factor * (real)0.5 / OF_LANES(sqrt, ratio) : zero;
+    v.x = v_ratio / det;
+    v.y = -v_ratio * ratio / det;
 #endif
+    return v;
 }
 
-DEFINE_POWER(4)
+// exp(x). Overflow gives infinity, underflow the smallest normal number; NaN stays NaN.
+static inline reals exponential(reals x) {
+    const reals t = (real)LOG2_E * x, least = POWER_MIN, most = POWER_MAX;
+    return t == t ? POWER(CLAMP(t, least, most)) : t;
+}
 
-// Scales in x, y, z and the opacity in w. Overflow gives infinity, underflow the smallest normal number; NaN stays NaN.
-static inline real4 activate(real3 log_scales, real logit_opacity) {
-    const real4 t = (real)LOG2_E * (real4)(log_scales, -logit_opacity);
-    real4 e = t == t ? power4(CLAMP(t, (real4)POWER_MIN, (real4)POWER_MAX)) : t;
-    e.w = 1 / (1 + e.w);
-    return e;
+static inline Activated activate(reals3 log_scales, reals logit_opacity) {
+    const Activated a = {
+        vector3(exponential(log_scales.x), exponential(log_scales.y), exponential(log_scales.z)),
+        1 / (1 + exponential(-logit_opacity)),
+    };
+    return a;
 }
 
 // conic (xx, xy, yy) = inverse of cov2d: v_cov = -Q V Q with the symmetric matrix V of (v_xx, v_xy/2, v_yy).
-static inline real3 conic_vjp(real3 q, real3 v) {
-    return -(real3)(q.x * q.x * v.x + q.x * q.y * v.y + q.y * q.y * v.z,
-                    2 * q.x * q.y * v.x + (q.y * q.y + q.x * q.z) * v.y + 2 * q.y * q.z * v.z,
-                    q.y * q.y * v.x + q.y * q.z * v.y + q.z * q.z * v.z);
+static inline reals3 conic_vjp(reals3 q, reals3 v) {
+    return vector3(-(q.x * q.x * v.x + q.x * q.y * v.y + q.y * q.y * v.z),
+                   -(2 * q.x * q.y * v.x + (q.y * q.y + q.x * q.z) * v.y + 2 * q.y * q.z * v.z),
+                   -(q.y * q.y * v.x + q.y * q.z * v.y + q.z * q.z * v.z));
+}
+
+// Whether the centre of one of `size` pixels lies in [lo, hi].
+static inline masks shows_pixel(reals lo, reals hi, int size) {
+#if LANES == 8
+    int8 first, last;
+    pixels_between8(lo, hi, size, &first, &last);
+    return MASK8_OF(first <= last);
+#else
+    const int2 pixels = pixels_between(lo, hi, size);
+    return pixels.x <= pixels.y;
+#endif
+}
+
+// The coefficients k with first <= k < last of the Gaussians from i on: values[3 (k - first) + c] for channel c.
+static inline void load_coefficients(const __global real *sh, size_t i, size_t n, int stride, int first, int last,
+                                     reals *values) {
+    for (int lane = 0; lane < LANES; ++lane) {
+        const size_t row = min(i + lane, n - 1) * stride;
+        for (int k = 0; k < CHUNKS; ++k)
+            load_chunks(sh, 3 * (row + first) + LANES * k, 3 * (row + last), 1, values + LANES * k + lane);
+    }
+    for (int k = 0; k < CHUNKS; ++k)
+        transpose(values + LANES * k);
+}
+
+static inline int coefficients_of(int sh_degree) {
+    return (sh_degree + 1) * (sh_degree + 1);
 }
 
 __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
@@ -158,44 +210,55 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
                           const __global real *logit_opacities, const __global real *sh, __global real *means2d,
                           __global real *conics, __global real *depths, __global real *extents,
                           __global real *opacities, __global real *colors) {
-    const size_t i = get_global_id(0);
+    const size_t i = LANES * get_global_id(0);
     if (i >= n)
         return;
 
-    const real3 mean = load3(means, i);
-    const real4 quat = load4(quats, i);
-    const real norm2 = dot4(quat, quat);
-    const real4 activated = activate(load3(log_scales, i), logit_opacities[i]);
-    const Footprint f = footprint(&camera, mean, activated.xyz, quat / sqrt(norm2));
-    const real opacity = activated.w * compensation(f.det0, f.det);
-    const real r2 = ellipse_r2(opacity);
-    const real2 centre = lens_centre(&camera, f.p);
-    const real2 extent = sqrt(r2 * (real2)(f.xx, f.yy));
-    const real3 offset = lens_offset(&camera, mean), direction = offset / sqrt(dot3(offset, offset));
-    real basis[16];
-    sh_basis(direction, sh_degree, basis);
-    real3 color = (real)0.5;
-    for (int k = 0; k < (sh_degree + 1) * (sh_degree + 1); ++k)
-        color += basis[k] * load3(sh, i * sh_stride + k);
+    const reals3 mean = load_vectors3(means, i, n);
+    const reals4 quat = load_vectors4(quats, i, n);
+    const reals norm2 = dot4(quat, quat), zero = 0;
+    const Activated activated = activate(load_vectors3(log_scales, i, n), load_numbers(logit_opacities, i, n));
+    const Footprint f = footprint(&camera, mean, activated.scales, normalized4(quat));
+    const reals opacity = activated.opacity * compensation(f.det0, f.det);
+    const reals r2 = ellipse_r2(opacity);
+    const reals2 centre = lens_centre(&camera, f.p);
+    const reals2 extent = {OF_LANES(sqrt, r2 * f.xx), OF_LANES(sqrt, r2 * f.yy)};
+    reals basis[16];
+    sh_basis(normalized3(lens_offset(&camera, mean)), sh_degree, basis);
+    reals3 color = {(real)0.5, (real)0.5, (real)0.5};
+    const int active = coefficients_of(sh_degree);
+    for (int first = 0; first < active; first += COEFFICIENTS) {
+        reals values[3 * COEFFICIENTS];
+        const int last = min(first + COEFFICIENTS, active);
+        load_coefficients(sh, i, n, sh_stride, first, last, values);
+        for (int k = first; k < last; ++k) {
+            const reals *c = values + 3 * (k - first);
+            color = plus3(color, scaled3(basis[k], vector3(c[0], c[1], c[2])));
+        }
+    }
 
     // 0 times infinity is NaN, so that one test detects values that are not finite in any term.
-    const real any =
+    const reals any =
         norm2 + f.det + f.lens.depth + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
-    bool visible = 0 * any == 0 && lens_sees(&camera, f.p) && norm2 >= QUAT_NORM2_MIN && r2 > 0;
-    if (visible) {
-        const int2 columns = pixels_between(centre.x - extent.x, centre.x + extent.x, camera.width);
-        const int2 rows = pixels_between(centre.y - extent.y, centre.y + extent.y, camera.height);
-        visible = columns.x <= columns.y && rows.x <= rows.y;
-    }
-    store2(means2d, i, visible ? centre : (real2)0);
-    store3(conics, i, visible ? (real3)(f.yy, -f.xy, f.xx) / f.det : (real3)0);
-    depths[i] = visible ? f.lens.depth : 0;
-    store2(extents, i, visible ? extent : (real2)0);
-    opacities[i] = visible ? opacity : 0;
-    for (int k = 0; k < 3; ++k)
-        colors[CHANNELS * i + k] = visible ? GREATER(((const real *)&color)[k], (real)0) : 0;
-#if CHANNELS == 4
-    colors[CHANNELS * i + 3] = visible ? f.lens.depth : 0;
+    const masks visible = (0 * any == zero) & lens_sees(&camera, f.p) & (norm2 >= (reals)QUAT_NORM2_MIN) &
+                          (r2 > zero) & shows_pixel(centre.x - extent.x, centre.x + extent.x, camera.width) &
+                          shows_pixel(centre.y - extent.y, centre.y + extent.y, camera.height);
+#define IF_VISIBLE(x) (visible ? (x) : zero)
+    const reals2 shown_centre = {IF_VISIBLE(centre.x), IF_VISIBLE(centre.y)};
+    const reals2 shown_extent = {IF_VISIBLE(extent.x), IF_VISIBLE(extent.y)};
+    const reals3 shown_color = {IF_VISIBLE(GREATER(color.x, zero)), IF_VISIBLE(GREATER(color.y, zero)),
+                                IF_VISIBLE(GREATER(color.z, zero))};
+    const reals depth = IF_VISIBLE(f.lens.depth);
+    store_vectors2(means2d, i, n, shown_centre);
+    store_vectors3(conics, i, n,
+                   vector3(IF_VISIBLE(f.yy / f.det), IF_VISIBLE(-f.xy / f.det), IF_VISIBLE(f.xx / f.det)));
+    store_numbers(depths, i, n, depth);
+    store_vectors2(extents, i, n, shown_extent);
+    store_numbers(opacities, i, n, IF_VISIBLE(opacity));
+#if CHANNELS == 3
+    store_vectors3(colors, i, n, shown_color);
+#else
+    store_vectors4(colors, i, n, vector4(shown_color.x, shown_color.y, shown_color.z, depth));
 #endif
 }
 
@@ -208,111 +271,122 @@ __kernel void project_disparities(const uint n, const Camera camera, const __glo
                                   const __global real *log_scales, const __global real *quats,
                                   const __global real *conics, const __global real *extents,
                                   __global real *disparities) {
-    const size_t i = get_global_id(0);
+    const size_t i = LANES * get_global_id(0);
     if (i >= n)
         return;
-    real3 disparity = 0;
-    if (extents[2 * i] > 0) {
-        const real4 quat = load4(quats, i);
-        const Footprint f =
-            footprint(&camera, load3(means, i), activate(load3(log_scales, i), 0).xyz, quat / sqrt(dot4(quat, quat)));
-        const real3 b2 = mat3_tmul(f.rotation, mat3_tmul(camera_rotation(&camera), f.lens.onward)) * f.scales,
-                    conic = load3(conics, i);
-        const real xz = dot3(f.b0, b2), yz = dot3(f.b1, b2), inv_z = 1 / f.lens.depth;
-        const real2 slope = -inv_z * inv_z * (real2)(conic.x * xz + conic.y * yz, conic.y * xz + conic.z * yz);
-        // Disparities that are not finite at some pixel have no order.
-        const bool finite = 0 * (slope.x * extents[2 * i] + slope.y * extents[2 * i + 1]) == 0;
-        disparity = (real3)(inv_z, finite ? slope : (real2)0);
-    }
-    store3(disparities, i, disparity);
+    const reals zero = 0;
+    const reals2 extent = load_vectors2(extents, i, n);
+    const masks visible = extent.x > zero;
+    const reals4 quat = load_vectors4(quats, i, n);
+    const Footprint f = footprint(&camera, load_vectors3(means, i, n),
+                                  activate(load_vectors3(log_scales, i, n), zero).scales, normalized4(quat));
+    const reals3 b2 = times3(mat3_tmul(&f.rotation, camera_rotate_back(&camera, f.lens.onward)), f.scales);
+    const reals3 conic = load_vectors3(conics, i, n);
+    const reals xz = dot3(f.b0, b2), yz = dot3(f.b1, b2), inv_z = 1 / f.lens.depth;
+    const reals slope_x = -inv_z * inv_z * (conic.x * xz + conic.y * yz);
+    const reals slope_y = -inv_z * inv_z * (conic.y * xz + conic.z * yz);
+    // Disparities that are not finite at some pixel have no order.
+    const masks finite = visible & (0 * (slope_x * extent.x + slope_y * extent.y) == zero);
+    store_vectors3(disparities, i, n, vector3(IF_VISIBLE(inv_z), finite ? slope_x : zero, finite ? slope_y : zero));
 }
-
-// Gradients of one visible Gaussian. Those with respect to its spherical harmonics are given by factors: the gradient
-// of coefficient k is basis[k] color.
-typedef struct {
-    FootprintGrad geometry;
-    real logit_opacity;
-    real3 color;
-    real basis[16];
-} GaussianGrad;
 
 typedef struct {
     const __global real *means, *log_scales, *quats, *logit_opacities, *sh;
 } GaussianArrays;
 
 typedef struct {
-    const __global real *conics, *colors, *v_means2d, *v_conics, *v_opacities, *v_colors;
+    const __global real *conics, *extents, *colors, *v_means2d, *v_conics, *v_opacities, *v_colors;
 } SplatArrays;
 
-static inline GaussianGrad gaussian_vjp(size_t i, const Camera *camera, int sh_stride, int sh_degree,
-                                        GaussianArrays gaussians, SplatArrays splats) {
-    GaussianGrad v;
-    const real3 mean = load3(gaussians.means, i);
-    const real4 quat = load4(gaussians.quats, i);
-    const real4 unit_quat = quat / sqrt(dot4(quat, quat));
-    const real4 activated = activate(load3(gaussians.log_scales, i), gaussians.logit_opacities[i]);
-    const Footprint f = footprint(camera, mean, activated.xyz, unit_quat);
+// Gradients of the Gaussians from i on, and the basis of their spherical harmonics; 0 for those that are not visible.
+static inline GaussianGrad gaussian_vjp(size_t i, size_t n, const Camera *camera, int sh_stride, int sh_degree,
+                                        GaussianArrays gaussians, SplatArrays splats, reals *basis) {
+    GaussianGrad v = {0};
+    for (int k = 0; k < 16; ++k)
+        basis[k] = 0;
+    const reals zero = 0;
+    const masks visible = i < n ? load_vectors2(splats.extents, i, n).x > zero : (masks)0;
+    if (!any_lane(visible))
+        return v;
 
-    const real opacity = activated.w, factor = compensation(f.det0, f.det), v_opacity = splats.v_opacities[i];
+    const reals3 mean = load_vectors3(gaussians.means, i, n);
+    const reals4 quat = load_vectors4(gaussians.quats, i, n);
+    const reals4 unit_quat = normalized4(quat);
+    const Activated activated =
+        activate(load_vectors3(gaussians.log_scales, i, n), load_numbers(gaussians.logit_opacities, i, n));
+    const Footprint f = footprint(camera, mean, activated.scales, unit_quat);
+
+    const reals opacity = activated.opacity, factor = compensation(f.det0, f.det);
+    const reals v_opacity = load_numbers(splats.v_opacities, i, n);
     v.logit_opacity = v_opacity * factor * opacity * (1 - opacity);
-    const real2 v_det = compensation_vjp(f.det0, f.det, v_opacity * opacity);
-    real3 v_cov = conic_vjp(load3(splats.conics, i), load3(splats.v_conics, i));
-    v_cov += v_det.x * (real3)(f.yy - BLUR, -2 * f.xy, f.xx - BLUR) + v_det.y * (real3)(f.yy, -2 * f.xy, f.xx);
+    const reals2 v_det = compensation_vjp(f.det0, f.det, v_opacity * opacity);
+    reals3 v_cov = conic_vjp(load_vectors3(splats.conics, i, n), load_vectors3(splats.v_conics, i, n));
+    v_cov.x += v_det.x * (f.yy - BLUR) + v_det.y * f.yy;
+    v_cov.y += -2 * f.xy * (v_det.x + v_det.y);
+    v_cov.z += v_det.x * (f.xx - BLUR) + v_det.y * f.xx;
 
-    real v_depth = 0;
-#if CHANNELS == 4
-    v_depth = splats.v_colors[CHANNELS * i + 3];
-#endif
-    v.geometry = footprint_vjp(camera, &f, mean, unit_quat, v_cov, load2(splats.v_means2d, i), v_depth);
-    v.geometry.quat = normalize_quat_vjp(quat, v.geometry.quat);
-
-    // Colour. If it is clamped at 0, its gradient is 0.
-    const __global real *color = splats.colors + CHANNELS * i, *v_color = splats.v_colors + CHANNELS * i;
-    v.color.x = color[0] > 0 ? v_color[0] : 0;
-    v.color.y = color[1] > 0 ? v_color[1] : 0;
-    v.color.z = color[2] > 0 ? v_color[2] : 0;
-    const real3 offset = lens_offset(camera, mean), direction = offset / sqrt(dot3(offset, offset));
-    real v_basis[16];
-    sh_basis(direction, sh_degree, v.basis);
-    for (int k = 0; k < (sh_degree + 1) * (sh_degree + 1); ++k)
-        v_basis[k] = dot3(load3(gaussians.sh, i * sh_stride + k), v.color);
-    const real3 v_offset = normalize_vjp(offset, sh_basis_vjp(direction, sh_degree, v_basis));
-#if LENS == ORTHOGRAPHIC
-    v.geometry.view.row2 += v_offset;
+    // A colour that is clamped at 0 has the gradient 0.
+#if CHANNELS == 3
+    const reals3 color = load_vectors3(splats.colors, i, n), v_color = load_vectors3(splats.v_colors, i, n);
+    const reals v_depth = 0;
 #else
-    v.geometry.mean += v_offset;
+    const reals4 color = load_vectors4(splats.colors, i, n), v_color = load_vectors4(splats.v_colors, i, n);
+    const reals v_depth = v_color.w;
+#endif
+    v.color = vector3(color.x > zero ? v_color.x : zero, color.y > zero ? v_color.y : zero,
+                      color.z > zero ? v_color.z : zero);
+    footprint_vjp(camera, &f, mean, unit_quat, v_cov, load_vectors2(splats.v_means2d, i, n), v_depth, &v);
+    v.quat = normalize_quat_vjp(quat, v.quat);
 
+    const reals3 offset = lens_offset(camera, mean), direction = normalized3(offset);
+    reals v_basis[16];
+    sh_basis(direction, sh_degree, basis);
+    const int active = coefficients_of(sh_degree);
+    for (int first = 0; first < active; first += COEFFICIENTS) {
+        reals values[3 * COEFFICIENTS];
+        const int last = min(first + COEFFICIENTS, active);
+        load_coefficients(gaussians.sh, i, n, sh_stride, first, last, values);
+        for (int k = first; k < last; ++k) {
+            const reals *c = values + 3 * (k - first);
+            v_basis[k] = dot3(vector3(c[0], c[1], c[2]), v.color);
+        }
+    }
+    const reals3 v_offset = normalize_vjp(offset, sh_basis_vjp(direction, sh_degree, v_basis));
+#if LENS == ORTHOGRAPHIC
+#if CAMERA_GRAD
+    v.view.row2 = plus3(v.view.row2, v_offset);
+#endif
+#else
+    v.mean = plus3(v.mean, v_offset);
+#if CAMERA_GRAD
     // position = -W^-1 translation: v_translation = W v_offset, v_W = (W v_offset) position^T
-    const real3 v_translation = mat3_mul(camera_rotation(camera), v_offset);
-    const real3 position = (real3)(camera->position[0], camera->position[1], camera->position[2]);
-    v.geometry.p += v_translation;
-    v.geometry.view.row0 += v_translation.x * position;
-    v.geometry.view.row1 += v_translation.y * position;
-    v.geometry.view.row2 += v_translation.z * position;
+    const reals3 v_translation = camera_rotate(camera, v_offset);
+    v.translation = plus3(v.translation, v_translation);
+    add_outer(v_translation, vector3(camera->position[0], camera->position[1], camera->position[2]), &v.view);
+#endif
 #endif
 
     // Gradients that overflow would make Adam's moments NaN permanently: they are set to 0 for this view.
-    const real3 sum = v.geometry.mean + v.geometry.log_scales + v.geometry.p + v.geometry.quat.xyz + v.color +
-                      v.geometry.view.row0 + v.geometry.view.row1 + v.geometry.view.row2;
-    real any = sum.x + sum.y + sum.z + v.geometry.quat.w + v.logit_opacity;
-#if CAMERA_GRAD
-    any += dot4(v.geometry.intrinsics, (real4)1);
-#endif
-    const GaussianGrad none = {0};
-    return 0 * any == 0 ? v : none;
+    reals *numbers = (reals *)&v, any = 0;
+    for (int k = 0; k < NUMBERS; ++k)
+        any += numbers[k];
+    const masks kept = visible & (0 * any == zero);
+    for (int k = 0; k < NUMBERS; ++k)
+        numbers[k] = kept ? numbers[k] : zero;
+    for (int k = 0; k < 16; ++k)
+        basis[k] = kept ? basis[k] : zero;
+    return v;
 }
 
 #if CAMERA_GRAD
 // Adds up the camera's gradient over the work-group, in the order of its work-items.
-static inline void sum_camera(const FootprintGrad *v, __local real *partial, __global real *v_camera) {
-    const uint lane = get_local_id(0);
-    vstore3(v->view.row0, 0, partial + 16 * lane);
-    vstore3(v->view.row1, 1, partial + 16 * lane);
-    vstore3(v->view.row2, 2, partial + 16 * lane);
-    vstore3(v->p, 3, partial + 16 * lane);
-    vstore4(v->intrinsics, 3, partial + 16 * lane);
+static inline void sum_camera(const GaussianGrad *v, __local real *partial, __global real *v_camera) {
+    const uint item = get_local_id(0);
+    const reals *of_camera = (const reals *)&v->view; // followed by translation and intrinsics
+    for (int k = 0; k < 16; ++k)
+        partial[16 * item + k] = lane_sum(of_camera[k]);
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint k = lane; k < 16; k += GROUP) {
+    for (uint k = item; k < 16; k += GROUP) {
         real sum = 0;
         for (uint j = 0; j < GROUP; ++j)
             sum += partial[16 * j + k];
@@ -320,6 +394,18 @@ static inline void sum_camera(const FootprintGrad *v, __local real *partial, __g
     }
 }
 #endif
+
+// Gradients of the coefficients from `first` on, in chunks: values[LANES k + lane] is the k-th chunk of a Gaussian.
+static inline void coefficients_grad(const reals *basis, reals3 v_color, int first, reals *values) {
+    for (int k = 0; k < COEFFICIENTS; ++k) {
+        const reals3 v = scaled3(basis[first + k], v_color);
+        values[3 * k] = v.x;
+        values[3 * k + 1] = v.y;
+        values[3 * k + 2] = v.z;
+    }
+    for (int k = 0; k < CHUNKS; ++k)
+        transpose(values + LANES * k);
+}
 
 __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
                           const __global real *means, const __global real *log_scales, const __global real *quats,
@@ -333,28 +419,66 @@ __kernel void project_bwd(const uint n, const Camera camera, const int sh_stride
                           __global real *v_camera
 #endif
 ) {
-    const size_t i = get_global_id(0);
-    GaussianGrad v = {0};
-    if (i < n) {
-        const bool visible = extents[2 * i] > 0;
-        const int active = visible ? (sh_degree + 1) * (sh_degree + 1) : 0;
-        if (visible) {
-            const GaussianArrays gaussians = {means, log_scales, quats, logit_opacities, sh};
-            const SplatArrays splats = {conics, colors, v_means2d, v_conics, v_opacities, v_colors};
-            v = gaussian_vjp(i, &camera, sh_stride, sh_degree, gaussians, splats);
-        }
-        for (int k = 0; k < sh_stride; ++k)
-            store3(v_sh, i * sh_stride + k, k < active ? v.basis[k] * v.color : (real3)0);
-        store3(v_means, i, v.geometry.mean);
-        store3(v_log_scales, i, v.geometry.log_scales);
-        store4(v_quats, i, v.geometry.quat);
-        v_logit_opacities[i] = v.logit_opacity;
-    }
-
+    const size_t i = LANES * get_global_id(0);
+    const GaussianArrays gaussians = {means, log_scales, quats, logit_opacities, sh};
+    const SplatArrays splats = {conics, extents, colors, v_means2d, v_conics, v_opacities, v_colors};
+    reals basis[16];
+    const GaussianGrad v = gaussian_vjp(i, n, &camera, sh_stride, sh_degree, gaussians, splats, basis);
 #if CAMERA_GRAD
     __local real partial[16 * GROUP];
-    sum_camera(&v.geometry, partial, v_camera);
+    sum_camera(&v, partial, v_camera);
 #endif
+    if (i >= n)
+        return;
+    store_vectors3(v_means, i, n, v.mean);
+    store_vectors3(v_log_scales, i, n, v.log_scales);
+    store_vectors4(v_quats, i, n, v.quat);
+    store_numbers(v_logit_opacities, i, n, v.logit_opacity);
+    for (int first = 0; first < sh_stride; first += COEFFICIENTS) {
+        reals values[3 * COEFFICIENTS];
+        coefficients_grad(basis, v.color, first, values);
+        for (int lane = 0; lane < LANES && i + lane < n; ++lane) {
+            const size_t row = (i + lane) * sh_stride;
+            for (int k = 0; k < CHUNKS; ++k)
+                store_chunks(v_sh, 3 * (row + first) + LANES * k, 3 * (row + sh_stride), 1,
+                             values + LANES * k + lane);
+        }
+    }
+}
+
+DEFINE_ADAM()
+#if LANES == 8
+DEFINE_ADAM(8)
+#endif
+
+typedef struct {
+    __global real *parameters, *first, *second;
+} AdamArrays;
+
+// Updates a chunk of adjacent parameters from `begin` on. Those from `end` on are left as they are.
+static inline void update_chunk(const Adam *adam, reals rates, reals g, size_t begin, size_t end, AdamArrays a) {
+#if LANES == 8
+    if (begin + LANES <= end) {
+        reals m = load8(a.first + begin), v = load8(a.second + begin);
+        store8(a.parameters + begin, adam_update8(adam, rates, load8(a.parameters + begin), g, &m, &v));
+        store8(a.first + begin, m);
+        store8(a.second + begin, v);
+        return;
+    }
+#endif
+    for (size_t i = begin; i < min(begin + LANES, end); ++i) {
+        real m = a.first[i], v = a.second[i];
+        a.parameters[i] = adam_update(adam, LANE(rates, i - begin), a.parameters[i], LANE(g, i - begin), &m, &v);
+        a.first[i] = m;
+        a.second[i] = v;
+    }
+}
+
+static inline void update_vectors3(const Adam *adam, real rate, reals3 g, size_t i, size_t n, AdamArrays a) {
+    reals c[3];
+    scattered3(g, c);
+    for (int k = 0; k < 3; ++k)
+        update_chunk(adam, rate, c[k], 3 * i + LANES * k, 3 * n, a);
 }
 
 // project_bwd and the step of Adam (adam.cl) in one pass, with the gradients in registers.
@@ -372,65 +496,54 @@ __kernel void project_bwd_adam(const uint n, const Camera camera, const int sh_s
                                __global real *v_camera
 #endif
 ) {
-    const size_t i = get_global_id(0);
-    GaussianGrad v = {0};
-    if (i < n && extents[2 * i] > 0) {
-        const GaussianArrays gaussians = {means, log_scales, quats, logit_opacities, sh};
-        const SplatArrays splats = {conics, colors, v_means2d, v_conics, v_opacities, v_colors};
-        v = gaussian_vjp(i, &camera, sh_stride, sh_degree, gaussians, splats);
-    }
+    const size_t i = LANES * get_global_id(0);
+    const GaussianArrays gaussians = {means, log_scales, quats, logit_opacities, sh};
+    const SplatArrays splats = {conics, extents, colors, v_means2d, v_conics, v_opacities, v_colors};
+    reals basis[16];
+    GaussianGrad v = gaussian_vjp(i, n, &camera, sh_stride, sh_degree, gaussians, splats, basis);
 #if CAMERA_GRAD
     __local real partial[16 * GROUP];
-    sum_camera(&v.geometry, partial, v_camera);
+    sum_camera(&v, partial, v_camera);
 #endif
     if (i >= n)
         return;
     if (adam.opacity_penalty != 0 || adam.scale_penalty != 0) {
-        const real4 activated = activate(load3(log_scales, i), logit_opacities[i]);
-        v.logit_opacity += adam.opacity_penalty * activated.w * (1 - activated.w);
-        v.geometry.log_scales += adam.scale_penalty * activated.xyz;
+        const Activated activated = activate(load_vectors3(log_scales, i, n), load_numbers(logit_opacities, i, n));
+        v.logit_opacity += adam.opacity_penalty * activated.opacity * (1 - activated.opacity);
+        v.log_scales = plus3(v.log_scales, scaled3(adam.scale_penalty, activated.scales));
     }
-    if (adam.erank_penalty != 0)
-        v.geometry.log_scales += adam.erank_penalty * erank_vjp(load3(log_scales, i), adam.erank_slack);
-
-    const real16 rates =
-        (real16)((real3)adam.means, (real3)adam.log_scales, (real4)adam.quats, adam.logit_opacities, (real4)0, 0);
-    const real16 g = (real16)(v.geometry.mean, v.geometry.log_scales, v.geometry.quat, v.logit_opacity, (real4)0, 0);
-    real16 p = (real16)(load3(means, i), load3(log_scales, i), load4(quats, i), logit_opacities[i], (real4)0, 0);
-    real16 m =
-        (real16)(load3(means_1, i), load3(log_scales_1, i), load4(quats_1, i), logit_opacities_1[i], (real4)0, 0);
-    real16 w =
-        (real16)(load3(means_2, i), load3(log_scales_2, i), load4(quats_2, i), logit_opacities_2[i], (real4)0, 0);
-    p = adam_update(&adam, rates, p, g, &m, &w);
-    store3(means, i, p.s012);
-    store3(means_1, i, m.s012);
-    store3(means_2, i, w.s012);
-    store3(log_scales, i, p.s345);
-    store3(log_scales_1, i, m.s345);
-    store3(log_scales_2, i, w.s345);
-    store4(quats, i, p.s6789);
-    store4(quats_1, i, m.s6789);
-    store4(quats_2, i, w.s6789);
-    logit_opacities[i] = p.sa;
-    logit_opacities_1[i] = m.sa;
-    logit_opacities_2[i] = w.sa;
-
-    const int width = 3 * (sh_degree + 1) * (sh_degree + 1);
-    real16 v_sh[3];
-    for (int k = 0; k < width; ++k)
-        ((real *)v_sh)[k] = v.basis[k / 3] * ((const real *)&v.color)[k % 3];
-    real16 sh_rates = adam.sh_rest;
-    sh_rates.s012 = adam.sh0;
-    const size_t first = i * 3 * sh_stride;
-    for (int k = 0; k < width; k += 16, sh_rates = adam.sh_rest) {
-        __global real *q = sh + first + k, *q_1 = sh_1 + first + k, *q_2 = sh_2 + first + k;
-        if (k + 16 > width) {
-            adam_update_some(&adam, sh_rates, width - k, v_sh[k / 16], q, q_1, q_2);
-            break;
+    if (adam.erank_penalty != 0) {
+        for (int lane = 0; lane < LANES && i + lane < n; ++lane) {
+            const real3 penalty = adam.erank_penalty * erank_vjp(load3(log_scales, i + lane), adam.erank_slack);
+            ((real *)&v.log_scales.x)[lane] += penalty.x;
+            ((real *)&v.log_scales.y)[lane] += penalty.y;
+            ((real *)&v.log_scales.z)[lane] += penalty.z;
         }
-        real16 q_m = load16(q_1), q_v = load16(q_2);
-        store16(q, adam_update(&adam, sh_rates, load16(q), v_sh[k / 16], &q_m, &q_v));
-        store16(q_1, q_m);
-        store16(q_2, q_v);
+    }
+
+    const AdamArrays of_means = {means, means_1, means_2}, of_scales = {log_scales, log_scales_1, log_scales_2};
+    const AdamArrays of_quats = {quats, quats_1, quats_2}, of_sh = {sh, sh_1, sh_2};
+    const AdamArrays of_opacities = {logit_opacities, logit_opacities_1, logit_opacities_2};
+    update_vectors3(&adam, adam.means, v.mean, i, n, of_means);
+    update_vectors3(&adam, adam.log_scales, v.log_scales, i, n, of_scales);
+    reals quat[4];
+    scattered4(v.quat, quat);
+    for (int k = 0; k < 4; ++k)
+        update_chunk(&adam, adam.quats, quat[k], 4 * i + LANES * k, 4 * n, of_quats);
+    update_chunk(&adam, adam.logit_opacities, v.logit_opacity, i, n, of_opacities);
+
+    const int active = coefficients_of(sh_degree);
+    const reals sh0 = adam.sh0, sh_rest = adam.sh_rest;
+    for (int first = 0; first < active; first += COEFFICIENTS) {
+        reals values[3 * COEFFICIENTS];
+        coefficients_grad(basis, v.color, first, values);
+        for (int lane = 0; lane < LANES && i + lane < n; ++lane) {
+            const size_t row = (i + lane) * sh_stride;
+            for (int k = 0; k < CHUNKS; ++k) {
+                const reals number = LANE_NUMBERS + (3 * first + LANES * k);
+                update_chunk(&adam, number < 3 ? sh0 : sh_rest, values[LANES * k + lane],
+                             3 * (row + first) + LANES * k, 3 * (row + active), of_sh);
+            }
+        }
     }
 }

@@ -3,6 +3,8 @@
 #ifndef CLSPLAT_SH_H
 #define CLSPLAT_SH_H
 
+#include "linalg.h"
+
 #define SH_C0  0.28209479177387814 // 1/(2 sqrt(pi))
 #define SH_C1  0.4886025119029199  // sqrt(3/(4 pi))
 #define SH_C2A 1.0925484305920792  // sqrt(15/(4 pi))
@@ -15,8 +17,8 @@
 #define SH_C3E 1.445305721320277   // sqrt(105/(16 pi))
 
 // The (degree + 1)^2 basis functions at the unit vector d.
-static inline void sh_basis(real3 d, int degree, real *basis) {
-    const real x = d.x, y = d.y, z = d.z;
+static inline void sh_basis(reals3 d, int degree, reals *basis) {
+    const reals x = d.x, y = d.y, z = d.z;
     basis[0] = SH_C0;
     if (degree > 0) {
         basis[1] = -SH_C1 * y;
@@ -42,25 +44,27 @@ static inline void sh_basis(real3 d, int degree, real *basis) {
 }
 
 // Gradient with respect to the three components of d as independent variables. v holds the gradients of the basis.
-static inline real3 sh_basis_vjp(real3 d, int degree, const real *v) {
-    const real x = d.x, y = d.y, z = d.z;
-    real3 v_d = 0;
+static inline reals3 sh_basis_vjp(reals3 d, int degree, const reals *v) {
+    const reals x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z, xy = x * y, yz = y * z, xz = x * z;
+    reals3 v_d = {0, 0, 0};
     if (degree > 0) {
-        v_d += SH_C1 * (real3)(-v[3], -v[1], v[2]);
+        v_d.x += -SH_C1 * v[3];
+        v_d.y += -SH_C1 * v[1];
+        v_d.z += SH_C1 * v[2];
     }
     if (degree > 1) {
-        v_d += SH_C2A * (real3)(y * v[4] - z * v[7], x * v[4] - z * v[5], -y * v[5] - x * v[7]);
-        v_d += 2 * SH_C2B * v[6] * (real3)(-x, -y, 2 * z);
-        v_d += 2 * SH_C2C * v[8] * (real3)(x, -y, 0);
+        v_d.x += SH_C2A * (y * v[4] - z * v[7]) - 2 * SH_C2B * x * v[6] + 2 * SH_C2C * x * v[8];
+        v_d.y += SH_C2A * (x * v[4] - z * v[5]) - 2 * SH_C2B * y * v[6] - 2 * SH_C2C * y * v[8];
+        v_d.z += -SH_C2A * (y * v[5] + x * v[7]) + 4 * SH_C2B * z * v[6];
     }
     if (degree > 2) {
-        v_d += 3 * SH_C3A * v[9] * (real3)(-2 * x * y, y * y - x * x, 0);
-        v_d += SH_C3B * v[10] * (real3)(y * z, x * z, x * y);
-        v_d += SH_C3C * v[11] * (real3)(2 * x * y, x * x + 3 * y * y - 4 * z * z, -8 * y * z);
-        v_d += 3 * SH_C3D * v[12] * (real3)(-2 * x * z, -2 * y * z, 2 * z * z - x * x - y * y);
-        v_d += SH_C3C * v[13] * (real3)(3 * x * x + y * y - 4 * z * z, 2 * x * y, -8 * x * z);
-        v_d += SH_C3E * v[14] * (real3)(2 * x * z, -2 * y * z, x * x - y * y);
-        v_d += 3 * SH_C3A * v[15] * (real3)(y * y - x * x, 2 * x * y, 0);
+        const reals a = 3 * SH_C3A * v[9], b = SH_C3B * v[10], c = SH_C3C * v[11], e = 3 * SH_C3D * v[12];
+        const reals f = SH_C3C * v[13], g = SH_C3E * v[14], h = 3 * SH_C3A * v[15];
+        v_d.x +=
+            -2 * xy * a + yz * b + 2 * xy * c - 2 * xz * e + (3 * xx + yy - 4 * zz) * f + 2 * xz * g + (yy - xx) * h;
+        v_d.y +=
+            (yy - xx) * a + xz * b + (xx + 3 * yy - 4 * zz) * c - 2 * yz * e + 2 * xy * f - 2 * yz * g + 2 * xy * h;
+        v_d.z += xy * b - 8 * yz * c + (2 * zz - xx - yy) * e - 8 * xz * f + (xx - yy) * g;
     }
     return v_d;
 }

@@ -10,6 +10,7 @@ from clsplat import ops, reference
 from clsplat.camera import Camera
 from clsplat.config import OptimConfig
 from clsplat.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN
+from clsplat.device import Device
 from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations as reference_rotations
 from clsplat.renderer import Renderer, download
@@ -141,6 +142,48 @@ def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degr
             if any_device.real == np.float64:
                 assert_matches(quantity, found, twin[i].arrays()[name], DOUBLE)
             assert (found != before).reshape(len(before), -1)[:, 0].mean() > 0.9, name
+
+
+@pytest.fixture(scope="module", params=["as it is", "as a GPU"])
+def configured_device64(request):
+    """The float64 device, and one that the launches configure like a GPU."""
+    device = Device(real=np.float64)
+    if request.param == "as a GPU":
+        device.is_cpu = False  # shadows the cached property
+    return device
+
+
+@pytest.mark.parametrize("n", [1, 7, 8, 100])
+@pytest.mark.parametrize("stored", [0, 1, 2, 3])
+def test_any_number_of_gaussians(configured_device64, n, stored):
+    """Vectors of Gaussians that are cut off by the end, and work-items that take one."""
+    device = configured_device64
+    gaussians, camera = wide_scene(1000)
+    shown = reference.project_fwd(gaussians, camera, stored).extents[:, 0] > 0
+    gaussians = gaussians.take(np.flatnonzero(shown)[:n])
+    gaussians.sh = gaussians.sh[:, : (stored + 1) ** 2]
+    parts = (gaussians, *random_moments(gaussians, np.random.default_rng(stored)))
+    splats, expected = forward(device, gaussians, camera, stored), reference.project_fwd(gaussians, camera, stored)
+    for name in Splats._fields:
+        assert_matches(name, getattr(splats, name), getattr(expected, name), DOUBLE)
+
+    v_splats = random_grads(expected)
+    v, v_camera = backward(device, gaussians, camera, expected, v_splats, stored, camera_grad=True)
+    v_expected, v_camera_expected = reference.project_bwd(
+        gaussians, camera, stored, expected, v_splats, camera_grad=True
+    )
+    for name, array in v_expected.arrays().items():
+        assert_matches(f"v_{name}", v.arrays()[name], array, DOUBLE)
+    assert_cameras_match(v_camera, v_camera_expected, DOUBLE)
+
+    step = adam_settings(20, 0.2, 2.0, OptimConfig(), stored)._replace(penalties=(0.3, 0.2, 0.4))
+    found, twin = [Renderer(device).place(part) for part in parts], [part.astype(np.float64) for part in parts]
+    uploaded = [type(a)(*(device.upload("splats", x) for x in a)) for a in (expected, v_splats)]
+    ops.project_bwd_adam(device, found[0], tuple(found[1:]), camera, *uploaded, step)
+    reference.project_bwd_adam(twin[0], tuple(twin[1:]), camera, expected, v_splats, step)
+    for i, quantity in enumerate(("parameters", "first moments", "second moments")):
+        for name, array in twin[i].arrays().items():
+            assert_matches(quantity, host(found[i]).arrays()[name], array, DOUBLE)
 
 
 @MODES

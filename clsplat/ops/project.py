@@ -10,8 +10,11 @@ from clsplat.gaussians import Gaussians
 from clsplat.stages import AdamStep, CameraGrads, SplatGrads, Splats
 from clsplat.structs import adam_struct, camera_struct, lens_define
 
-# Work-group size of the backward kernel if it adds up the camera's gradient. It takes 4 KiB of local memory.
 CAMERA_GROUP = 64
+"""Gaussians per work-group of a backward kernel that adds up the gradient of the camera, in 4 KiB of local memory."""
+
+LANES = 8
+"""Gaussians per work-item on a CPU, in the vectors of cl/lanes.h."""
 
 
 def project_fwd(
@@ -50,18 +53,9 @@ def project_fwd(
         device.empty("colors", (n, channels)),
     )
     g = gaussians
-    device.launch(
-        "project",
-        "project_fwd",
-        (n,),
-        [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree, *g.arrays().values(), *splats],
-        defines={
-            "CHANNELS": channels,
-            "ANTIALIASED": int(antialiased),
-            "CAMERA_GRAD": 0,
-            "LENS": lens_define(camera),
-        },
-    )
+    arguments = [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree, *g.arrays().values(), *splats]
+    defines = _defines(device, camera, channels, antialiased)
+    _launch(device, "project_fwd", n, arguments, defines)
     return splats
 
 
@@ -84,8 +78,8 @@ def project_disparities(device: Device, gaussians: Gaussians, camera: Camera, sp
     n, g = len(gaussians), gaussians
     result = device.empty("disparities", (n, 3))
     arguments = [n, camera_struct(camera, device.real), g.means, g.log_scales, g.quats, splats.conics, splats.extents]
-    defines = {"CHANNELS": splats.colors.shape[1], "ANTIALIASED": 0, "CAMERA_GRAD": 0, "LENS": lens_define(camera)}
-    device.launch("project", "project_disparities", (n,), [*arguments, result], defines=defines)
+    defines = _defines(device, camera, splats.colors.shape[1], antialiased=False)
+    _launch(device, "project_disparities", n, [*arguments, result], defines)
     return result
 
 
@@ -122,13 +116,27 @@ def project_bwd(
     v = Gaussians(**empty)
     arguments = [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree, *g.arrays().values()]
     arguments += [splats.conics, splats.extents, splats.colors, *v_splats, *v.arrays().values()]
-    defines = {
-        "CHANNELS": splats.colors.shape[1],
+    defines = _defines(device, camera, splats.colors.shape[1], antialiased, camera_grad)
+    return v, _backward(device, "project_bwd", n, arguments, defines)
+
+
+def _defines(
+    device: Device, camera: Camera, channels: int, antialiased: bool, camera_grad: bool = False
+) -> dict[str, Any]:
+    """Defines of the kernels for a camera. With those of a fisheye, a work-item takes one Gaussian (cl/lens.h)."""
+    return {
+        "CHANNELS": channels,
         "ANTIALIASED": int(antialiased),
         "CAMERA_GRAD": int(camera_grad),
         "LENS": lens_define(camera),
+        "LANES": LANES if device.is_cpu and camera.model != "fisheye" else 1,
     }
-    return v, _backward(device, "project_bwd", n, arguments, defines)
+
+
+def _launch(device: Device, kernel: str, n: int, arguments: list[Any], defines: dict[str, Any]) -> None:
+    # Groups of several work-items would make PoCL keep the intermediate values of all of them in memory.
+    lanes, group = defines["LANES"], (1,) if device.is_cpu else None
+    device.launch("project", kernel, (-(-n // lanes),), arguments, defines=defines, group=group)
 
 
 def _backward(
@@ -136,17 +144,17 @@ def _backward(
 ) -> CameraGrads | None:
     """Launch a backward kernel. Returns the gradients with respect to the camera if `defines` request them."""
     if not defines["CAMERA_GRAD"]:
-        device.launch("project", kernel, (n,), arguments, defines=defines)
+        _launch(device, kernel, n, arguments, defines)
         return None
-    groups = -(-n // CAMERA_GROUP)
+    groups, group = -(-n // CAMERA_GROUP), CAMERA_GROUP // defines["LANES"]
     partial = device.empty("v_camera", (groups, 16))
     device.launch(
         "project",
         kernel,
-        (groups * CAMERA_GROUP,),
+        (groups * group,),
         [*arguments, partial],
-        defines=defines | {"GROUP": CAMERA_GROUP},
-        group=(CAMERA_GROUP,),
+        defines=defines | {"GROUP": group},
+        group=(group,),
     )
     total = partial.get().astype(np.float64).sum(axis=0)
     v_viewmat = np.zeros((4, 4))
@@ -193,10 +201,5 @@ def project_bwd_adam(
         *arrays,
         *fields,
     ]
-    defines = {
-        "CHANNELS": splats.colors.shape[1],
-        "ANTIALIASED": int(antialiased),
-        "CAMERA_GRAD": int(camera_grad),
-        "LENS": lens_define(camera),
-    }
+    defines = _defines(device, camera, splats.colors.shape[1], antialiased, camera_grad)
     return _backward(device, "project_bwd_adam", len(gaussians), arguments, defines)

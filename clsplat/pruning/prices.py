@@ -18,7 +18,6 @@ from clsplat.camera import Camera
 from clsplat.constants import ALPHA_MIN
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.reference.sh import sh_basis
 from clsplat.renderer import Pass, Renderer, download
 from clsplat.scene import View
 from clsplat.stages import Removal
@@ -130,7 +129,7 @@ def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands:
     total = Prices(
         np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros((n, degree))
     )
-    for view, _, residuals, part in measure_removals(renderer, gaussians, views, clamped=True):
+    for view, run, residuals, part in measure_removals(renderer, gaussians, views, clamped=True):
         pixels = residuals[:, :, 0].size if view.mask is None else max(1, int(view.mask.sum()))
         total.errors[:] += part.errors / pixels
         total.differences[:] += part.differences / pixels
@@ -142,7 +141,7 @@ def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands:
         total.grains[:] += squares * size**2
         if degree and bands:
             seen = np.flatnonzero(part.weights > 0)
-            change = _color_changes(gaussians.take(seen), view.camera.position)
+            change = _color_changes(renderer, run)[seen]
             squares, pulls = part.squares[seen, None], part.pulls[seen]
             error = squares * (change**2).sum(axis=2) + 2 * np.einsum("ndc,nc->nd", change, pulls)
             total.bands[seen] += error / pixels
@@ -157,14 +156,15 @@ def sight(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
     return offsets / distances[:, None], size / camera.fx
 
 
-def _color_changes(gaussians: Gaussians, position: Array) -> Array:
-    """Changes (N, D, 3) of the colours seen from `position` if the bands above d = 0 to D - 1 are dropped."""
-    directions = gaussians.means - position
-    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
-    terms = sh_basis(directions, gaussians.sh_degree)[:, :, None] * gaussians.sh
-    sums = np.cumsum(terms, axis=1)[:, [(d + 1) ** 2 - 1 for d in range(gaussians.sh_degree + 1)]]
-    colors = np.maximum(0.5 + sums, 0)
-    return np.asarray(colors[:, :-1] - colors[:, -1:], dtype=np.float64)
+def _color_changes(renderer: Renderer, run: Pass) -> Array:
+    """Changes (N, D, 3) of the colours in a view if the bands above d = 0 to D - 1 are dropped."""
+    antialiased = renderer.config.mode == "antialiased"
+    colors = download(run.splats.colors)
+    fewer = [
+        renderer.stages.project_fwd(run.gaussians, run.camera, degree, antialiased=antialiased).colors
+        for degree in range(run.sh_degree)
+    ]
+    return np.stack([download(other) - colors for other in fewer], axis=1)
 
 
 def removal_order(

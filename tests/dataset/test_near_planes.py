@@ -13,6 +13,7 @@ from clsplat.dataset import load_scene
 from clsplat.dataset.near_planes import NEAR_SHARE, near_plane, with_near_planes
 from clsplat.errors import InputError
 from clsplat.render import render
+from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
 
 
@@ -88,6 +89,18 @@ def test_default_near_planes():
     assert default_near(poisoned) == default_near(means) and default_near(poisoned[5:]) == NEAR
     assert default_near(1e-30 * means) > np.finfo(np.float32).tiny
     assert default_near(means[:1]) == NEAR == Camera(np.eye(4), 1, 1, 1, 1, 2, 2).near_depth
+
+
+def test_a_photo_without_points_has_the_nearest_plane_of_the_others():
+    """Photos from 3 and 6 units away, and one that looks away."""
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (200, 3))
+    photo = np.zeros((20, 20, 3), np.uint8)
+    poses = [((0, 0, -3), (0, 0, 0)), ((0, 0, -6), (0, 0, 0)), ((0, 0, -3), (0, 0, -9))]
+    cameras = [Camera.look_at(position, target, (0, -1, 0), 60, 20, 20) for position, target in poses]
+    views = [View(f"{k}.png", camera, photo) for k, camera in enumerate(cameras)]
+    scene = Scene(views, [], points, np.zeros((200, 3), np.uint8))
+    nearest, farther, away = (view.camera.near for view in with_near_planes(scene).train)
+    assert nearest == away < farther
 
 
 @pytest.mark.parametrize("near", [0.0, -1.0, np.nan, np.inf, 1e-50])

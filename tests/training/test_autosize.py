@@ -37,8 +37,11 @@ from clsplat.training.autosize.rule import (
     validation_times,
     window_bounds,
 )
+from clsplat.training.autosize.search import _compared
 from clsplat.training.autosize.validation import PERFECT, can_validate, split, validate
 from clsplat.training.loop import train
+from clsplat.training.session import Training
+from clsplat.training.state import initial_state
 
 NOISE = 0.03
 """Standard deviation of the photos' noise: without any, every Gaussian more would pay."""
@@ -154,6 +157,22 @@ def test_growth_ends_where_it_has_not_paid_for_a_doubling() -> None:
     assert growth_ends(search, 600, 900, replace(CONFIG, max_gaussians=600)), "the user's limit is reached"
 
 
+@pytest.mark.parametrize(("gain", "paid"), [(1.0, 1800), (0.0, 500)])
+def test_what_has_paid_is_what_later_growth_is_compared_with(device: Device, gain: float, paid: int) -> None:
+    scene = known_scene(20, device, copies=90, views=10)
+    training = Training(scene, CONFIG, device, initial_state(scene, CONFIG))
+    assert len(training.state.gaussians) == 1800
+    search = _compared(training, Search(1800, small_side=side(500), validated=[[30 + gain] * 2]), 900)
+    assert search.small_side and search.small_side.candidate.n == paid
+    assert [trial.takes_smaller for trial in search.trials] == [paid == 500]
+
+
+def test_photos_are_held_back_in_the_iteration_that_settles() -> None:
+    search = Search(1000, settled=5)
+    assert [search.holds_back(iteration) for iteration in (4, 5, 6)] == [True, True, False]
+    assert Search(1000).holds_back(6)
+
+
 def test_growth_has_a_pace(device: Device) -> None:
     """To four times the first Gaussians within half of the run, or to one Gaussian per pixel."""
     scene = known_scene(20, device, copies=1, views=10)
@@ -204,6 +223,8 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     sizes: list[int] = []
     whole = train(scene, config, tmp_path / "whole", device, progress=lambda r: sizes.append(r["num_gaussians"]))
     report = json.loads((tmp_path / "whole" / "size.json").read_text())
+    # 8 dB less is an error of 0.16, as of a part of each of log2(N) doublings.
+    assert report["least_share"] == pytest.approx(np.log2(10 ** (config.size_price / 10)))
     trials = report["trials"]
     assert [found["n"] for found in trials] == [[40, 80], [20, 40], [10, 20]]
     for found in trials:

@@ -1,6 +1,5 @@
 """Checkpoints: what they hold, and what is left when writing one fails."""
 
-# ruff: noqa: F811 (a fixture is imported and then named as an argument)
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_loop import CONFIG, same, scene  # noqa: F401  (a fixture)
+from small_run import CONFIG, same
 
 from clsplat.device import Device
 from clsplat.errors import InputError

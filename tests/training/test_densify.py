@@ -131,6 +131,14 @@ def test_the_cap_takes_the_largest_gradients_first() -> None:
     assert sorted(edit.rows[edit.fresh].tolist()) == [7, 11]
 
 
+def test_a_gradient_at_the_threshold_counts() -> None:
+    strategy, gaussians = observed(rows=slice(0, 0))
+    strategy.statistics["grad_sum"][5] = np.float32(CONFIG.adc.grad_threshold)
+    config = replace(CONFIG.adc, grad_threshold=float(np.float32(CONFIG.adc.grad_threshold)))
+    strategy.config = config  # type: ignore[attr-defined]
+    assert strategy.edit(100, gaussians, MOST_GAUSSIANS, survey).rows[-1] == 5
+
+
 def test_reset_lowers_opacities_and_clears_their_moments() -> None:
     config = replace(CONFIG, adc=replace(CONFIG.adc, reset_every=150))
     strategy, gaussians = observed(config)
@@ -191,6 +199,8 @@ def test_growth_reaches_the_cap_in_time(settings: McmcConfig | ErrorConfig, iter
     assert max(size for _, size in sizes) == cap
     first = next(iteration for iteration, size in sizes if size == cap)
     assert first <= max(settings.full_fraction * iterations, sizes[0][0])
+    if cap == 1_000_000:  # no earlier than needed, which would split Gaussians that have hardly trained
+        assert first == max([sizes[0][0], *(i for i, _ in sizes if i <= schedule.full)])
 
 
 def test_growth_takes_nothing_away() -> None:

@@ -1,13 +1,12 @@
 """Divergence: what stops being finite ends the training, is named, and never replaces a finite checkpoint."""
 
-# ruff: noqa: F811 (a fixture is imported and then named as an argument)
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pytest
-from test_loop import CONFIG, scene  # noqa: F401  (a fixture)
+from small_run import CONFIG
 
 from clsplat import reference
 from clsplat.device import Device

@@ -92,7 +92,9 @@ def test_at_the_cap_those_of_least_price_make_room(harmful: int, gone: int) -> N
     weights[order[50]] = prices[order[50]] = errors[order[50]] = 0
     gaussians = scene()
     gaussians.logit_opacities[order[70]] = logit(0.004)
-    strategy = ErrorGuided(replace(CONFIG, error=ErrorConfig(replaced=0.05, replaced_most=0.2)), 1.0, N)
+    faint = float(gaussians.opacities[order[70]])  # as much as the least opacity
+    error = ErrorConfig(replaced=0.05, replaced_most=0.2, opacity_min=faint)
+    strategy = ErrorGuided(replace(CONFIG, error=error), 1.0, N)
     edit = strategy.edit(600, gaussians, N, seeing(weights, errors, prices))
     assert len(edit.rows) == N
     assert np.setdiff1d(np.arange(N), edit.rows).tolist() == sorted([*order[:gone], order[70]])

@@ -1,6 +1,5 @@
 """The inputs of a run: a checkpoint goes on with the photos, cameras and points it was made from, or not at all."""
 
-# ruff: noqa: F811 (a fixture is imported and then named as an argument)
 import json
 import re
 import warnings
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_loop import CONFIG, SIZE, same, scene  # noqa: F401  (a fixture)
+from small_run import CONFIG, SIZE, same
 
 from clsplat.device import Device
 from clsplat.errors import InputError

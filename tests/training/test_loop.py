@@ -2,7 +2,6 @@
 
 import json
 import sys
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,76 +9,23 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from every_strategy import with_rounds
+from small_run import CONFIG, EACH_STRATEGY, SIZE, same, with_strategy
 
-from clsplat.camera import Camera
-from clsplat.config import AdcConfig, CoarseConfig, ErrorConfig, InitConfig, McmcConfig, OptimConfig, TrainConfig
+from clsplat.config import CoarseConfig, ErrorConfig, McmcConfig
 from clsplat.device import Device
-from clsplat.errors import InputError
 from clsplat.formats import save_gaussians
 from clsplat.gaussians import Gaussians
-from clsplat.metrics import psnr, to_uint8
+from clsplat.metrics import psnr
 from clsplat.render import render
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
-from clsplat.testing import synthetic_scene
 from clsplat.training.autosize.validation import split
-from clsplat.training.checkpoint import load_state, save_state
 from clsplat.training.contributions import contributions
-from clsplat.training.densify import STRATEGIES, Contributions, Edit, Survey
+from clsplat.training.densify import Contributions, Edit, Survey
 from clsplat.training.densify.error_guided import ErrorGuided
 from clsplat.training.loop import train
 from clsplat.training.session import Training, step, view_at
 from clsplat.training.state import initial_state, start_config
-
-SIZE = (40, 32)
-EACH_STRATEGY = pytest.mark.parametrize("strategy", STRATEGIES)
-CONFIG = with_rounds(
-    TrainConfig(
-        strategy="adc",
-        size="fixed",
-        iterations=60,
-        checkpoint_every=25,
-        init=InitConfig(sh_degree=1),
-        optim=OptimConfig(sh_degree_every=2333),
-        # Small enough to see a clone, a split and a reset within 60 iterations.
-        adc=AdcConfig(reset_every=30, grad_threshold=1e-5),
-    ),
-    every=10,
-    stop_fraction=0.8,
-)
-
-
-def with_strategy(strategy: str) -> TrainConfig:
-    """40 Gaussians at the start, and a cap that each strategy reaches."""
-    return replace(CONFIG, strategy=strategy, max_gaussians=61)
-
-
-def cameras(count: int) -> list[Camera]:
-    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    return [
-        Camera.look_at([3 * np.sin(a), -1 + 0.3 * np.sin(3 * a), 3 * np.cos(a)], [0, 0, 0], [0, -1, 0], 45, *SIZE)
-        for a in angles
-    ]
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    """Photos of known Gaussians, rendered by the twins."""
-    rng = np.random.default_rng(0)
-    truth = synthetic_scene(40, seed=4)[0]
-    truth.means[:] = rng.uniform(-0.6, 0.6, truth.means.shape)
-    truth.log_scales[:] = np.log(0.15)
-    truth.logit_opacities[:] = 1.5
-    truth.sh[:, 0] = rng.uniform(-1, 1.5, (40, 3))
-    views = [
-        View(f"{i}.png", c, to_uint8(render(truth, c, device="reference").rgb)) for i, c in enumerate(cameras(13))
-    ]
-    points = truth.means + rng.normal(0, 0.05, truth.means.shape)
-    return Scene(views[:12], views[12:], points.astype(np.float64), np.full(points.shape, 128, np.uint8))
-
-
-def same(a: Gaussians, b: Gaussians) -> bool:
-    return all(x.tobytes() == y.tobytes() for x, y in zip(a.arrays().values(), b.arrays().values(), strict=True))
 
 
 def held_out(gaussians: Gaussians, scene: Scene, device: Device) -> float:
@@ -111,49 +57,6 @@ def test_two_runs_are_the_same_file(scene: Scene, device: Device, tmp_path: Path
     assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "c.ply").read_bytes()
 
 
-@EACH_STRATEGY
-@pytest.mark.parametrize("killed_at", [26, 49, 51])
-def test_a_killed_run_resumes_to_the_same_bits(
-    scene: Scene, device: Device, tmp_path: Path, killed_at: int, strategy: str
-) -> None:
-    config = with_strategy(strategy)
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    expected = train(scene, config, whole, device)
-
-    class Killed(Exception):
-        pass
-
-    def kill(record: dict[str, object]) -> None:
-        if record["iteration"] == killed_at:
-            raise Killed
-
-    with pytest.raises(Killed):
-        train(scene, config, broken, device, progress=kill)
-    first: list[object] = []
-    resumed = train(scene, config, broken, device, resume=True, progress=lambda r: first.append(r["iteration"]))
-    assert first[0] == 25 * (killed_at // 25) + 1
-    assert same(resumed, expected)
-
-    def lines(folder: Path) -> list[str]:
-        records = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-        return [json.dumps({k: v for k, v in record.items() if k != "seconds"}) for record in records]
-
-    assert lines(broken) == lines(whole), "the mean losses too, although checkpoints lie between two lines"
-
-
-def test_an_interrupted_run_loses_nothing(scene: Scene, device: Device, tmp_path: Path) -> None:
-    expected = train(scene, CONFIG, tmp_path, device)
-
-    def interrupt(record: dict[str, object]) -> None:
-        if record["iteration"] == 33:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(scene, CONFIG, tmp_path, device, progress=interrupt)
-    assert load_state(tmp_path / "checkpoint.npz", scene.extent, CONFIG).iteration == 33
-    assert same(train(scene, CONFIG, tmp_path, device, resume=True), expected)
-
-
 @pytest.mark.parametrize(("after", "expected"), [(None, [20, 40, 60]), ({7, 60}, [7, 60]), ((), [])])
 def test_it_is_evaluated_when_asked(
     scene: Scene, device: Device, tmp_path: Path, after: set[int] | None, expected: list[int]
@@ -170,36 +73,6 @@ def test_it_is_evaluated_when_asked(
     log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [record["iteration"] for record in log if "psnr" in record] == expected
     assert len(seen) == len(expected)
-
-
-def test_resume_refuses_what_would_not_continue(scene: Scene, device: Device, tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=f"^{tmp_path}: expected a checkpoint to resume from, found none; start the run without"
-    ):
-        train(scene, CONFIG, tmp_path, device, resume=True)
-    train(scene, CONFIG, tmp_path, device)
-    with pytest.raises(InputError, match="found other optim"):
-        train(scene, replace(CONFIG, optim=OptimConfig(means_lr=1.0)), tmp_path, device, resume=True)
-    data = (tmp_path / "checkpoint.npz").read_bytes()
-    (tmp_path / "checkpoint.npz").write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match=r"checkpoint\.npz: .* found a damaged file"):
-        train(scene, CONFIG, tmp_path, device, resume=True)
-
-
-@pytest.mark.parametrize("shape", ["(1000000000000, 3)", "(3, 3", "(40, 3), 'x': [" + "(" * 3000])
-def test_arrays_that_lie_take_no_memory(scene: Scene, tmp_path: Path, shape: str) -> None:
-    """NumPy's reader allocates what an array's header says; this one is refused before."""
-    state, path = initial_state(scene, CONFIG), tmp_path / "checkpoint.npz"
-    save_state(path, state, CONFIG)
-    with zipfile.ZipFile(path) as archive:
-        parts = {name: archive.read(name) for name in archive.namelist()}
-    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
-    content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, part in parts.items():
-            archive.writestr(name, content if name == "gaussians.means.npy" else part)
-    with pytest.raises(InputError, match=r"checkpoint\.npz: .* found a damaged file: an array"):
-        load_state(path, scene.extent, CONFIG)
 
 
 @EACH_STRATEGY
@@ -333,8 +206,8 @@ def test_a_search_starts_from_few_random_gaussians() -> None:
 
 
 def test_the_strategy_says_how_opaque_the_start_is(scene: Scene) -> None:
-    for given, expected in ((None, 0.5), (0.2, 0.2)):
-        config = replace(with_strategy("mcmc"), init=replace(CONFIG.init, opacity=given))
+    for strategy, given, expected in (("mcmc", None, 0.5), ("error", None, 0.5), ("mcmc", 0.2, 0.2)):
+        config = replace(with_strategy(strategy), init=replace(CONFIG.init, opacity=given))
         np.testing.assert_allclose(initial_state(scene, config).gaussians.opacities, expected, rtol=1e-5)
     np.testing.assert_allclose(initial_state(scene, CONFIG).gaussians.opacities, 0.1, rtol=1e-5)
 

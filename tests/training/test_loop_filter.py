@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_loop import CONFIG, same, scene  # noqa: F401  (a fixture)
+from small_run import CONFIG, same
 
 from clsplat import reference
 from clsplat.constants import FILTER_VARIANCE
@@ -26,7 +26,7 @@ def thinnest(gaussians, cameras):
 
 
 @pytest.fixture
-def needles(scene):  # noqa: F811
+def needles(scene):
     """So many points that Gaussians start far smaller than a pixel."""
     points = np.random.default_rng(0).normal(0, 0.02, (80, 3))
     return replace(scene, points=points, colors=np.full(points.shape, 128, np.uint8))

@@ -7,6 +7,8 @@ import pytest
 
 from clsplat.bench.stability.small import CONFIG, small_scene
 from clsplat.config import InitConfig
+from clsplat.metrics import to_uint8
+from clsplat.render import renderings
 from clsplat.renderer import Renderer
 from clsplat.training.initialize import initialize
 from clsplat.training.loop import train
@@ -44,3 +46,20 @@ def test_only_the_pixels_of_the_mask_count(scene, device):
     masked = [replace(view, mask=np.zeros(view.image.shape[:2], bool)) for view in scene.train]
     gaussians.sh[:] = -10
     assert "no pixel that counts" in failure(gaussians, masked, Renderer(device))
+
+
+def test_colours_beyond_white_are_white(scene, device):
+    gaussians, renderer = initialize(scene, InitConfig(opacity=0.9), seed=0), Renderer(device)
+    gaussians.sh[:] = 10
+    cameras = [view.camera for view in scene.train]
+    images = [to_uint8(rendering.rgb) for rendering in renderings(renderer, gaussians, cameras)]
+    photos = [replace(view, image=image) for view, image in zip(scene.train, images, strict=True)]
+    assert failure(gaussians, photos, renderer) is None
+
+
+def test_noise_of_one_level_shows_nothing(scene, device):
+    """By hand: values of 100 and 101 differ from their mean by half a level."""
+    rng = np.random.default_rng(0)
+    grey = [replace(v, image=rng.integers(100, 102, v.image.shape, dtype=np.uint8)) for v in scene.train]
+    gaussians = initialize(scene, InitConfig(opacity=0.9), seed=0)
+    assert "single colour" in failure(gaussians, grey, Renderer(device))

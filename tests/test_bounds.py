@@ -1,0 +1,84 @@
+"""No kernel writes beyond the end of an array: numbers of rows that leave work-items over, and what follows them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from clsplat.bench.stability.small import CONFIG, small_scene
+from clsplat.device import Device
+from clsplat.renderer import Renderer
+from clsplat.testing import synthetic_scene
+from clsplat.training.densify import STRATEGIES
+from clsplat.training.loop import train
+
+GUARD = 256
+"""Bytes behind each array that nothing may change."""
+
+PATTERN = 0xA5
+
+
+class GuardedDevice(Device):
+    """A device whose arrays are each followed by guard bytes."""
+
+    def __init__(self, *, is_cpu: bool) -> None:
+        super().__init__()
+        self.is_cpu = is_cpu  # shadows the cached property
+        self.guarded = []
+
+    def _allocate(self, what, nbytes):
+        block = super()._allocate(what, nbytes + GUARD)
+        cl.enqueue_fill_buffer(self.queue, block, np.uint8(PATTERN), nbytes, GUARD)
+        self.guarded.append((what, nbytes, block))  # also keeps the memory from being used again
+        return block
+
+    def overwritten(self):
+        """Names of the arrays behind which something was written."""
+        found = set()
+        for what, nbytes, block in self.guarded:
+            guard = np.empty(GUARD, np.uint8)
+            cl.enqueue_copy(self.queue, guard, block, src_offset=nbytes)
+            if (guard != PATTERN).any():
+                found.add(what)
+        return found
+
+
+@pytest.fixture(params=["as it is", "as a GPU"])
+def guarded(request):
+    return GuardedDevice(is_cpu=request.param == "as it is" and Device().is_cpu)
+
+
+def test_the_guard_sees_a_write_beyond_the_end():
+    device = GuardedDevice(is_cpu=Device().is_cpu)
+    array = device.upload("x", np.zeros(3))
+    assert device.overwritten() == set()
+    cl.enqueue_fill_buffer(device.queue, array.data, np.float32(1), 0, array.nbytes + 4)
+    assert device.overwritten() == {"x"}
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_training_stays_within_its_arrays(guarded, tmp_path, strategy):
+    """With everything that has a stage of its own; the sizes are no multiples of anything."""
+    scene = small_scene(Device())
+    options = {"exposure": True, "poses": True, "filter_3d": strategy == "adc", "dropout": 0.2}
+    render = replace(CONFIG.render, mode="antialiased" if strategy == "adc" else "classic")
+    config = replace(CONFIG, strategy=strategy, iterations=24, max_gaussians=331, render=render, **options)
+    edits = {name: replace(getattr(config, name), start=1, every=10) for name in STRATEGIES}
+    train(scene, replace(config, **edits), tmp_path, guarded)
+    assert len(guarded.guarded) > 100 and guarded.overwritten() == set()
+
+
+@pytest.mark.parametrize("n", [1, 7, 63, 65])
+@pytest.mark.parametrize("model", ["pinhole", "orthographic", "fisheye"])
+def test_rendering_stays_within_its_arrays(guarded, n, model):
+    gaussians, camera = synthetic_scene(n, seed=1, width=37, height=21)
+    renderer = Renderer(guarded)
+    for degree in (0, 1, 3):
+        fewer = replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])
+        run = renderer.forward(fewer, replace(camera, model=model), depth=degree == 1)
+        v_image = run.image._replace(rgb=guarded.upload("v", np.ones(run.image.rgb.shape)))
+        renderer.backward(run, v_image, camera_grad=degree == 3)
+        renderer.stages.count_pairs(run.splats, run.bins)
+    renderer.stages.removal(run.splats, run.bins, np.zeros(3))
+    assert guarded.overwritten() == set()
