@@ -31,7 +31,7 @@ LAYERS = """
     structs reference device
     ops testing formats
     renderer selftest
-    render dataset demo
+    render dataset demo raster_gradients
     rasterization pruning
     training show
     evaluate

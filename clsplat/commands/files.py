@@ -10,6 +10,7 @@ from clsplat.commands import console
 from clsplat.commands.console import Out, moved, say, say_cameras
 from clsplat.config import DataConfig, Mode, SfmConfig
 from clsplat.errors import InputError
+from clsplat.formats.spz_container import Axes, Version
 from clsplat.ranges import within
 
 if TYPE_CHECKING:
@@ -64,6 +65,11 @@ class Export:
     """File to write; its suffix determines the format; .html makes a web page."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Alternative to the second argument."""
+    spz_version: Version = 3
+    """Version of an .spz that is written: 3, which all programs read, or 4, which is compressed by Zstandard."""
+    spz_axes: Axes | None = None
+    """Axes of the .spz that is written, or of the one that is read if none is written: right, up, back as specified,
+    or right, down, forward as in a PLY, which splat-transform writes. Default: as specified, or as the file says."""
     data: Path | None = None
     """For a web page: dataset, as for `train`. Its first photo is the first view, and its cameras determine the
     upward direction."""
@@ -71,15 +77,25 @@ class Export:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.formats import load_gaussians, save_gaussians
+        from clsplat.formats import load_gaussians, save_gaussians, suffix_of
+        from clsplat.formats.spz import load_spz, save_spz
 
         if (self.to is None) == (self.out is None):
             raise InputError("export: expected one file to write, as in: clsplat export scene.ply scene.spz")
         out = self.to or self.out
         assert out is not None
-        gaussians, mode, offset = load_gaussians(self.scene)
+        to_spz, from_spz = (suffix_of(path) == ".spz" for path in (out, self.scene))
+        if self.spz_axes is not None and not (to_spz or from_spz):
+            raise InputError(f"--spz-axes: expected an .spz to read or to write, found {self.scene} and {out}")
+        if from_spz and not to_spz:
+            gaussians, mode, offset = load_spz(self.scene, self.spz_axes)
+        else:
+            gaussians, mode, offset = load_gaussians(self.scene)
         if out.suffix.lower() == ".html":
             self._page(out, gaussians, mode, offset)
+        elif to_spz:
+            axes = self.spz_axes or "rub"
+            save_spz(out, gaussians, mode, offset, version=self.spz_version, axes=axes)
         else:
             save_gaussians(out, gaussians, mode, offset)
         say(f"{out}: {len(gaussians)} Gaussians, {out.stat().st_size / 1e6:.3g} MB")
