@@ -17,8 +17,9 @@ from clsplat.commands import console
 from clsplat.commands.arguments import parsed, unknown
 from clsplat.commands.compact import Compact
 from clsplat.commands.console import warn
-from clsplat.commands.files import Devices, Export, Frames, Sfm
+from clsplat.commands.files import Export, Frames, Sfm
 from clsplat.commands.info import Info
+from clsplat.commands.listing import Devices
 from clsplat.commands.rendering import Eval, Render
 from clsplat.commands.train import Demo, Train
 from clsplat.commands.viewing import View

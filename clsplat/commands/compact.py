@@ -60,14 +60,14 @@ class Compact:
     def run(self) -> None:
         """Run the command."""
         from clsplat.dataset import load_scene
-        from clsplat.formats import load_gaussians, save_gaussians, suffix_of
+        from clsplat.formats import FORMATS, load_gaussians, save_gaussians, suffix_of
         from clsplat.pruning.compaction import ASSUMED_PSNR, LossMeter, compact
         from clsplat.renderer import Renderer
         from clsplat.training.memory import bytes_text
 
         limits = self._limits()
         suffix = suffix_of(self.out)
-        if not suffix or not self.out.absolute().parent.is_dir():  # checked now, not after minutes
+        if suffix not in FORMATS or not self.out.absolute().parent.is_dir():  # checked now, not after minutes
             raise InputError(f"{self.out}: expected a file of Gaussians in a folder that exists; see docs/formats.md")
         if self.cameras is not None and self.photos is not None:
             raise InputError("--cameras, --photos: expected one of them, found both; --photos has cameras as well")

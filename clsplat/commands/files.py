@@ -1,4 +1,4 @@
-"""The commands `devices`, `frames`, `sfm` and `export`."""
+"""The commands `frames`, `sfm` and `export`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,33 +12,11 @@ from clsplat.commands.options import PageOptions
 from clsplat.commands.run_folders import scene_file, with_run
 from clsplat.config import Mode, SfmConfig
 from clsplat.errors import InputError
+from clsplat.formats.spz_container import Axes, Version
 from clsplat.ranges import within
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
-
-
-@dataclass(frozen=True)
-class Devices:
-    """List the OpenCL devices, their capabilities, and the default device."""
-
-    def run(self) -> None:
-        """Run the command."""
-        from clsplat.device import device_label, list_devices, select_device
-
-        default = select_device()
-        for device in list_devices():
-            extensions = device.extensions
-            capabilities = [
-                f"{device.max_compute_units} compute units",
-                f"{device.global_mem_size / 2**30:.1f} GiB, {device.max_mem_alloc_size / 2**30:.1f} GiB per buffer",
-                f"{device.local_mem_size // 1024} KiB local",
-                device.version.strip(),
-                "double precision" if "cl_khr_fp64" in extensions else "no double precision",
-                "subgroups" if "subgroups" in extensions else "no subgroups",
-            ]
-            print(f"{'*' if device == default else ' '} {device_label(device)}\n    {'; '.join(capabilities)}")
-        print("* is the default; choose another device with --device and part of its name, or with PYOPENCL_CTX")
 
 
 @dataclass(frozen=True)
@@ -90,6 +68,11 @@ class Export:
     """File to write; its suffix determines the format; .html makes a web page."""
     out: OptionalOut = None
     """Alternative to the second argument."""
+    spz_version: Version = 3
+    """Version of an .spz that is written: 3, which all programs read, or 4, which is compressed by Zstandard."""
+    spz_axes: Axes | None = None
+    """Axes of the .spz that is written, or of the one that is read if none is written: right, up, back as specified,
+    or right, down, forward as in a PLY, which splat-transform writes. Default: as specified, or as the file says."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DATASET")] = None
     """For a web page: dataset, as for `train`. Its first photo is the first view, and its cameras determine the
     upward direction. Default: the dataset of the run."""
@@ -101,15 +84,26 @@ class Export:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.formats import load_gaussians, save_gaussians
+        from clsplat.formats import load_gaussians, save_gaussians, suffix_of
+        from clsplat.formats.spz import load_spz, save_spz
 
         if (self.to is None) == (self.out is None):
             raise InputError("export: expected one file to write, as in: clsplat export scene.ply scene.spz")
         out = self.to or self.out
         assert out is not None
-        gaussians, mode, offset = load_gaussians(scene_file(self.scene))
+        scene = scene_file(self.scene)
+        to_spz, from_spz = (suffix_of(path) == ".spz" for path in (out, scene))
+        if self.spz_axes is not None and not (to_spz or from_spz):
+            raise InputError(f"--spz-axes: expected an .spz to read or to write, found {scene} and {out}")
+        if from_spz and not to_spz:
+            gaussians, mode, offset = load_spz(scene, self.spz_axes)
+        else:
+            gaussians, mode, offset = load_gaussians(scene)
         if out.suffix.lower() == ".html":
             self._page(out, gaussians, mode, offset)
+        elif to_spz:
+            axes = self.spz_axes or "rub"
+            save_spz(out, gaussians, mode, offset, version=self.spz_version, axes=axes)
         else:
             save_gaussians(out, gaussians, mode, offset)
         say(f"{out}: {len(gaussians)} Gaussians, {out.stat().st_size / 1e6:.3g} MB")

@@ -40,11 +40,11 @@ class Info:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.formats.sog import META
+        from clsplat.formats import described_by
 
         if not self.path.exists():
             raise InputError(f"{self.path}: expected a file of Gaussians, a run or a dataset, found nothing")
-        if self.path.is_dir() and not (self.path / META).is_file():
+        if self.path.is_dir() and described_by(self.path) is None:
             lines = run_lines(self.path) if (self.path / "log.jsonl").is_file() else dataset_lines(self.path)
         else:
             lines = scene_lines(self.path)
@@ -53,11 +53,11 @@ class Info:
 
 def scene_lines(path: Path) -> list[str]:
     """Describe a file of Gaussians."""
-    from clsplat.formats import FORMATS, load_gaussians, suffix_of
+    from clsplat.formats import anatomy_of, load_gaussians, suffix_of
 
     gaussians, mode, offset = load_gaussians(path)
-    anatomy = FORMATS[suffix_of(path) or ".sog"].anatomy(path)
-    size = path.stat().st_size if suffix_of(path) else sum(anatomy.parts.values())
+    anatomy = anatomy_of(path)
+    size = path.stat().st_size if suffix_of(path) and path.is_file() else sum(anatomy.parts.values())
     low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
     first, middle, last = np.percentile(gaussians.means, [1, 50, 99], axis=0)
     rows = {

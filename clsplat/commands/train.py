@@ -72,12 +72,14 @@ class Train:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.formats import suffix_of
+        from clsplat.formats import check_writable, suffix_of
         from clsplat.training.checkpoint import CHECKPOINT, no_checkpoint
         from clsplat.training.run_folder import held
 
         suffix = "" if self.out.is_dir() else suffix_of(self.out)
         out = self.out.with_name(self.out.name[: -len(suffix)]) if suffix else self.out
+        if suffix:
+            check_writable(self.out)
         if self.resume and not (out / CHECKPOINT).exists():
             raise no_checkpoint(out)
         with held(out):
