@@ -124,13 +124,12 @@ class Viewer:
         views : list of View
             Photos, whose cameras are shown as outlines. A click on an outline moves the view to that camera.
         """
-        tabs = self._server.gui.add_tab_group()
+        tabs = self._tabs = self._server.gui.add_tab_group()
         with tabs.add_tab("View"):
             self._look = LookInputs(self._panel, renderer.background, self._touch)
         if views:
             with tabs.add_tab("Photos"):
                 self._photos = Photos(self._panel, views, start.focus, self._look.background, self._touch)
-        self._tabs = tabs
         with tabs.add_tab("Record"):
             self._recording = Recording(self._panel, start, self._pose_of, self._later, self._frame_of)
         first, initial = start.camera, self._server.initial_camera
@@ -182,7 +181,7 @@ class Viewer:
         self._asked.set()
 
     async def _connect(self, handle: Any) -> None:
-        client = self._clients[handle.client_id] = Client(handle)
+        client = Client(handle)
 
         async def update(camera: Any) -> None:
             client.camera = client_camera(
@@ -197,6 +196,7 @@ class Viewer:
         if self._photos:
             client.outlines = self._photos.outlines(handle)
         await update(handle.camera)
+        self._clients[handle.client_id] = client  # complete, for the thread that draws
 
     async def _disconnect(self, handle: Any) -> None:
         self._clients.pop(handle.client_id, None)

@@ -23,8 +23,9 @@ size do not hide the scene."""
 OUTLINE_COLOR = (255, 140, 0)
 """Colour of the nearest outlines, RGB. It is rare in photos."""
 
-FADES = (1.0, 0.6, 0.35, 0.2)
-"""Opacities of outlines, from near to far. viser's lines have none: their colour is mixed with the background's."""
+FADES = (1.0, 0.8, 0.6, 0.45)
+"""Opacities of outlines, from near to far. viser's lines have none: their colour is mixed with the background's.
+Below these, lines are no longer orange in front of a scene that covers the background."""
 
 FADE_REACH = 2.0
 """Distance at which outlines are faintest, in mean distances of the cameras from the focus."""
