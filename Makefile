@@ -1,7 +1,8 @@
 PYTHON = python
 
-.PHONY: test test-slow stability fuzz fuzz-cases faults mutants soak lint docs check-races bench bench-knobs bench-quality \
-  bench-captures bench-stability formats foreign foreign-packages
+.PHONY: test test-slow stability fuzz fuzz-cases faults mutants soak lint docs check-races check-variants \
+  check-runtimes check-builds bench bench-knobs bench-quality bench-captures bench-stability formats foreign \
+  foreign-packages
 
 # Run the default tests: a few minutes on two cores.
 test:
@@ -62,6 +63,22 @@ docs:
 # Run the kernels in the simulator Oclgrind, which finds data races, divergent barriers and accesses out of bounds.
 check-races:
 	$(PYTHON) -m pytest tests/check_races.py
+
+# Run the tests of the stages, of rendering and of training with the kernels for GPUs, on any device.
+check-variants:
+	CLSPLAT_VARIANTS=gpu $(PYTHON) -m pytest $(shell ls tests/test_*.py) tests/training/test_loop.py
+
+# Run the tests of the stages on every OpenCL implementation that is there: the drivers in /etc/OpenCL/vendors, Intel's
+# runtime for CPUs beside PYTHON, and those of DRIVERS, libraries. TESTS selects others.
+check-runtimes:
+	$(PYTHON) tests/offline/run_runtimes.py $(addprefix --driver ,$(DRIVERS)) $(TESTS)
+
+# Compile every kernel for GPUs of AMD and NVIDIA, without a GPU, and check its registers and memory against limits:
+# build/kernels.json. Needs Clang 19 and libclc; for NVIDIA, also ptxas.
+CLANG = clang-19
+CLC = /usr/lib/clc
+check-builds:
+	$(PYTHON) tests/offline/compile_kernels.py --clang $(CLANG) --library $(CLC) -o build/kernels.json
 
 # Measure the figures of docs/benchmarks.md: some minutes, on a machine without other work.
 bench:

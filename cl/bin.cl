@@ -14,13 +14,14 @@
 //   bin_totals     totals[T], entries per tile; the counters become the numbers of entries of the preceding runs
 //   (scan)         tile_begins[T + 1] with their total M, and first_slots[N + 1] (GRADIENTS)
 //   bin_scatter    gauss_ids[M] and slots[M] (GRADIENTS), at the positions given by the counters
+//   bin_ranges     tile_ranges[T,2], begin and end of each tile's list
 // On a GPU, a radix sort by tile, with one work-item per splat:
 //   bin_count    counts[N]
 //   (scan)       first_slots[N + 1]
 //   bin_emit     for each slot the tile, tiles[M], and the index of the splat, slot_gauss[M]
 //   (sort)       the slots by tile, stable, and with GRADIENTS bin_gather
-//   bin_bisect   tile_begins[T + 1], from the sorted tiles
-// Then bin_ranges writes tile_ranges[T,2], begin and end of each tile's list. Scheme "per_tile" continues with
+//   bin_bisect   tile_ranges[T,2], begin and end of each tile's list, from the sorted tiles
+// Scheme "per_tile" continues with
 //   bin_list_keys  the depth key of each entry
 //   (sort)         the entries of each tile by this key, stable, and bin_gather
 //
@@ -221,12 +222,8 @@ __kernel void bin_emit(const uint n, const int width, const int height, const __
         walk_tiles(LIST, order[i], ellipses[order[i]], width, height, first_slots[i], 0, tiles, slot_gauss);
 }
 
-// tile_begins[t]: index of the first of the m sorted tiles that is not below t, for t = 0 to tile_count.
-__kernel void bin_bisect(const uint m, const uint tile_count, const __global uint *sorted_tiles,
-                         __global uint *tile_begins) {
-    const uint t = get_global_id(0);
-    if (t > tile_count)
-        return;
+// Index of the first of the m sorted tiles that is not below t.
+static inline uint first_from(uint m, uint t, const __global uint *sorted_tiles) {
     uint begin = 0, end = m;
     while (begin < end) {
         const uint middle = begin + (end - begin) / 2;
@@ -235,7 +232,14 @@ __kernel void bin_bisect(const uint m, const uint tile_count, const __global uin
         else
             end = middle;
     }
-    tile_begins[t] = begin;
+    return begin;
+}
+
+__kernel void bin_bisect(const uint m, const uint tile_count, const __global uint *sorted_tiles,
+                         __global uint *tile_ranges) {
+    const uint t = get_global_id(0);
+    if (t < tile_count)
+        vstore2((uint2)(first_from(m, t, sorted_tiles), first_from(m, t + 1, sorted_tiles)), t, tile_ranges);
 }
 
 __kernel void bin_ranges(const uint tile_count, const __global uint *tile_begins, __global uint *tile_ranges) {

@@ -3,9 +3,10 @@
 // The equations, the recurrence of the backward pass and the results are those of composite_cpu.cl. composite.h
 // contains the mathematics of both. Only the mapping differs.
 //
-// Forward mapping: one work-group per tile, one work-item per pixel. The group loads BATCH splats at a time into
-// local memory, and each work-item composites them onto its pixel. A work-item whose pixel is finished or outside the
-// image continues to load. The group stops when live_pixels, the number of unfinished pixels, is 0.
+// Forward mapping: one work-group per tile, one work-item per pixel, or for several pixels ITEMS apart if the device
+// has no groups of TILE*TILE work-items. The group loads BATCH splats at a time into local memory, and each work-item
+// composites them onto its pixels. A work-item whose pixels are finished or outside the image continues to load. The
+// group stops when live_pixels, the number of unfinished pixels, is 0.
 //
 // Backward mapping: one work-group of BATCH work-items per tile, one work-item per splat of a batch. The pixels of
 // the tile pass from work-item to work-item.
@@ -29,37 +30,21 @@
 // Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (11 + CHANNELS), backward TILE^2
 // (2 + CHANNELS). With TILE 16, BATCH 64 and CHANNELS 4 this is 4 KiB and 6 KiB (double: 8 KiB and 12 KiB) of the 32
 // KiB that OpenCL 1.2 guarantees.
-// -DTILE=8|16   edge of a tile, px; the forward work-group has TILE*TILE work-items
+// -DTILE=8|16   edge of a tile, px
 // -DCHANNELS    number of colour channels, 1 or more
+// -DITEMS       number of work-items of the forward work-group, a divisor of TILE*TILE
 // -DBATCH       number of splats per batch, 1 or more; the backward work-group has BATCH work-items
 // -DSUBGROUPS=0|1   1: the device has the functions of subgroups, by cl_khr_subgroups or OpenCL 2.1 and later
 #include "common.h"
 
-#if TILE != 8 && TILE != 16
-#error "-DTILE must be 8 or 16: TILE*TILE work-items must fit the work-groups of every GPU"
+#if !defined(ITEMS) || ITEMS < 1 || TILE * TILE % ITEMS
+#error "-DITEMS must divide TILE*TILE, the number of pixels of a tile"
 #endif
-#if !defined(BATCH) || BATCH < 1
-#error "-DBATCH must give the number of splats per batch, 1 or more"
-#endif
-#if !defined(SUBGROUPS) || SUBGROUPS & ~1
-#error "-DSUBGROUPS must be 0 or 1"
-#endif
-#ifdef cl_khr_subgroups
-#pragma OPENCL EXTENSION cl_khr_subgroups : enable
-#endif
-#define REALV real
-#define MASKV int
-#include "composite.h"
-#include "power.h"
+#include "composite_tiles.h"
 
-#define PIXELS (TILE * TILE)
+#define OWNED (PIXELS / ITEMS) // pixels of a work-item of the forward pass
 
-// Position of pixel p of the tile with origin (x0, y0).
-static inline int2 pixel_of(int x0, int y0, uint p) {
-    return (int2)(x0 + p % TILE, y0 + p / TILE);
-}
-
-__kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1))) void
+__kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void
 composite_fwd(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
               const __global uint *tile_ranges, const __global real *background, __global real *image,
               __global real *alpha_image) {
@@ -68,14 +53,16 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
     const uint tile = get_group_id(0), lane = get_local_id(0);
     const int tiles_x = (width + TILE - 1) / TILE;
     const int x0 = tile % tiles_x * TILE, y0 = tile / tiles_x * TILE;
-    const int2 pixel = pixel_of(x0, y0, lane);
-    const int inside = pixel.x < width && pixel.y < height;
 
     if (lane == 0)
         live_pixels = min(TILE, width - x0) * min(TILE, height - y0);
-    real transmittance = inside ? 1 : -1, sums[CHANNELS];
-    for (int k = 0; k < CHANNELS; ++k)
-        sums[k] = 0;
+    real transmittance[OWNED], sums[OWNED][CHANNELS];
+    for (int o = 0; o < OWNED; ++o) {
+        const int2 pixel = pixel_of(x0, y0, lane + o * ITEMS);
+        transmittance[o] = pixel.x < width && pixel.y < height ? 1 : -1;
+        for (int k = 0; k < CHANNELS; ++k)
+            sums[o][k] = 0;
+    }
 
     const uint begin = tile_ranges[2 * tile], length = tile_ranges[2 * tile + 1] - begin;
     for (uint first = 0; first < length; first += BATCH) {
@@ -83,40 +70,36 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
         if (live_pixels == 0)
             break;
         const uint count = min((uint)BATCH, length - first);
-        for (uint j = lane; j < count; j += PIXELS)
+        for (uint j = lane; j < count; j += ITEMS)
             staged[j] = splats[gauss_ids[begin + first + j]];
         barrier(CLK_LOCAL_MEM_FENCE);
-        const int was_live = transmittance > 0;
-        for (uint j = 0; j < count && transmittance > 0; ++j) {
-            const Splat s = staged[j];
-            const real t = splat_exponent(&s, pixel.x + (real)0.5 - s.x, pixel.y + (real)0.5 - s.y);
-            real alpha = exp2(t);
-            int live;
-            const real weight = splat_over(splat_seen(&s, t), TRANSMITTANCE_MIN, &alpha, &live, &transmittance);
-            for (int k = 0; k < CHANNELS; ++k)
-                sums[k] += weight * s.color[k];
+        for (int o = 0; o < OWNED; ++o) {
+            const int was_live = transmittance[o] > 0;
+            const int2 pixel = pixel_of(x0, y0, lane + o * ITEMS);
+            for (uint j = 0; j < count && transmittance[o] > 0; ++j) {
+                const Splat s = staged[j];
+                const real t = splat_exponent(&s, pixel.x + (real)0.5 - s.x, pixel.y + (real)0.5 - s.y);
+                real alpha = exp2(t);
+                int live;
+                const real weight =
+                    splat_over(splat_seen(&s, t), TRANSMITTANCE_MIN, &alpha, &live, &transmittance[o]);
+                for (int k = 0; k < CHANNELS; ++k)
+                    sums[o][k] += weight * s.color[k];
+            }
+            if (was_live && transmittance[o] < 0)
+                atomic_dec(&live_pixels);
         }
-        if (was_live && transmittance < 0)
-            atomic_dec(&live_pixels);
     }
 
-    if (inside) {
+    for (int o = 0; o < OWNED; ++o) {
+        const int2 pixel = pixel_of(x0, y0, lane + o * ITEMS);
+        if (pixel.x >= width || pixel.y >= height)
+            continue;
         const size_t p = (size_t)pixel.y * width + pixel.x;
         for (int k = 0; k < CHANNELS; ++k)
-            image[CHANNELS * p + k] = sums[k] + fabs(transmittance) * background[k];
-        alpha_image[p] = 1 - fabs(transmittance);
+            image[CHANNELS * p + k] = sums[o][k] + fabs(transmittance[o]) * background[k];
+        alpha_image[p] = 1 - fabs(transmittance[o]);
     }
-}
-
-// Ends a step of the backward pass.
-static inline void hand_on(void) {
-#if SUBGROUPS
-    if (get_num_sub_groups() == 1) {
-        sub_group_barrier(CLK_LOCAL_MEM_FENCE);
-        return;
-    }
-#endif
-    barrier(CLK_LOCAL_MEM_FENCE);
 }
 
 __kernel __attribute__((reqd_work_group_size(BATCH, 1, 1))) void

@@ -1,13 +1,12 @@
-"""OpenCL context, program cache and buffers. Only this module and `clsplat.ops` import pyopencl."""
+"""OpenCL devices: context, kernels and buffers. Only this module, programs and ops import pyopencl."""
 
 import os
-import re
 import warnings
 from collections.abc import Mapping
 from functools import cached_property
 from math import log2
-from pathlib import Path
 from typing import Any
+from weakref import ref
 
 import numpy as np
 import pyopencl as cl
@@ -16,6 +15,7 @@ from numpy.typing import DTypeLike
 
 from clsplat import constants
 from clsplat.errors import DeviceError, InputError
+from clsplat.programs import Subgroups, ask, build, build_options, inline_includes, kernel_folder, probe_subgroups
 
 POCL_HINT = "install one, for example the embedded CPU driver: pip install 'clsplat[pocl]'"
 
@@ -41,32 +41,9 @@ GROUP = 64
 # Largest ratio of the sizes of two buffers of one name that are allocated with the same size.
 SAME_ORDER = 4
 
-# Options that are safe with every tested driver. -cl-fast-relaxed-math is not: it degrades or breaks exp on some.
-BUILD_OPTIONS = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros"]
-
-
-def kernel_folder() -> Path:
-    """Folder of the OpenCL sources: inside the package when installed, next to it in a checkout."""
-    here = Path(__file__).resolve().parent
-    for folder in (here / "cl", here.parent / "cl"):
-        if (folder / "common.h").is_file():
-            return folder
-    raise DeviceError(f"cl/common.h: expected the kernel sources in {here / 'cl'}, found none; reinstall clsplat")
-
-
-def inline_includes(name: str, folder: Path) -> str:
-    """Source of cl/`name` in which each ``#include "..."`` is replaced by the file, with #line directives.
-
-    Compilers then report errors as cl/FILE:LINE, and the program cache of a driver cannot overlook an edited header.
-    """
-    lines = [f'#line 1 "cl/{name}"']
-    for number, line in enumerate((folder / name).read_text().splitlines(), start=1):
-        include = re.match(r'\s*#include\s+"(.+)"', line)
-        if include:
-            lines += [inline_includes(include[1], folder), f'#line {number + 1} "cl/{name}"']
-        else:
-            lines.append(line)
-    return "\n".join(lines)
+# Variable that selects the variants of all stages, as --compositor does for one: auto (those for the device's type),
+# cpu or gpu. Both compute the same on every device.
+VARIANTS = "CLSPLAT_VARIANTS"
 
 
 def list_devices() -> list[cl.Device]:
@@ -136,6 +113,8 @@ class Device:
     ----------
     memory_limit : int
         As above.
+    model : dict
+        Values of the constants of the rendering model.
     memory_peak : int
         Largest total size of all buffers so far, bytes.
     """
@@ -152,8 +131,8 @@ class Device:
         unknown = sorted(set(model) - set(MODEL_CONSTANTS))
         if unknown:
             raise InputError(f"model: expected names of {', '.join(MODEL_CONSTANTS)}, found {', '.join(unknown)}")
-        self._model = {name: getattr(constants, name) for name in MODEL_CONSTANTS} | dict(model)
-        self._model["LOG2_ALPHA_MIN"] = log2(self._model["ALPHA_MIN"])
+        self.model = {name: getattr(constants, name) for name in MODEL_CONSTANTS} | dict(model)
+        self.model["LOG2_ALPHA_MIN"] = log2(self.model["ALPHA_MIN"])
         self.cl_device = cl_device if cl_device is not None else select_device()
         self.real: np.dtype[Any] = np.dtype(real)
         if self.real == np.float64 and "cl_khr_fp64" not in self.cl_device.extensions:
@@ -167,6 +146,7 @@ class Device:
         self._constants: dict[str, tuple[bytes, cl.array.Array]] = {}
         self._kernels: dict[tuple[str, tuple[Any, ...]], cl.Kernel] = {}
         self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}
+        self._kept: dict[str, tuple[Any, ...]] = {}
 
     @property
     def label(self) -> str:
@@ -180,23 +160,35 @@ class Device:
 
     @cached_property
     def is_cpu(self) -> bool:
-        """Whether work-items run on CPU cores. Launches then use few work-items with large pieces of work."""
-        return bool(self.cl_device.type & cl.device_type.CPU)
+        """Whether work-items run on CPU cores. Launches then use few work-items with large pieces of work.
+
+        The variable CLSPLAT_VARIANTS overrides the type of the device.
+        """
+        variants = os.environ.get(VARIANTS) or "auto"
+        if variants not in ("auto", "cpu", "gpu"):
+            raise InputError(f"{VARIANTS}: expected auto, cpu or gpu, found {variants!r}")
+        return variants == "cpu" if variants != "auto" else bool(self.cl_device.type & cl.device_type.CPU)
+
+    @cached_property
+    def _subgroups(self) -> Subgroups:
+        return probe_subgroups(self.context, self.cl_device)
 
     @cached_property
     def subgroup_size(self) -> int:
-        """Number of work-items in a subgroup, as the driver forms them in most kernels; 0 without subgroups.
+        """Number of work-items in a subgroup; 0 without subgroups, or if the compiler cannot use them."""
+        return self._subgroups.size
 
-        Subgroups are an extension, or a feature of OpenCL 2.1 and later.
-        """
-        major, minor = self.cl_device.version.split()[1].split(".")  # "OpenCL 3.0 ..."
-        feature = (int(major), int(minor)) >= (2, 1) and self.cl_device.max_num_sub_groups > 0
-        if not feature and "cl_khr_subgroups" not in self.cl_device.extensions.split():
-            return 0
-        kernel = cl.Program(self.context, "__kernel void nothing(void) {}").build().all_kernels()[0]
-        group = (min(256, self.cl_device.max_work_group_size),)
-        question = cl.kernel_sub_group_info.MAX_SUB_GROUP_SIZE_FOR_NDRANGE
-        return int(kernel.get_sub_group_info(self.cl_device, question, group))
+    @cached_property
+    def largest_group(self) -> int:
+        """Largest work-group of one dimension that the device runs."""
+        sizes = ask(self.cl_device, "max_work_item_sizes", ())
+        return max(1, min([ask(self.cl_device, "max_work_group_size", 1), *sizes[:1]]))
+
+    def group(self, wanted: int) -> int:
+        """Size of a work-group: `wanted`, halved until the device runs it."""
+        while wanted > self.largest_group:
+            wanted = (wanted + 1) // 2
+        return wanted
 
     @cached_property
     def vector_width(self) -> int:
@@ -205,8 +197,8 @@ class Device:
         PoCL 3.0 (LLVM 14) compiles for AMD's Zen 4, which has AVX-512, as for a Zen 3, which has not. No Zen that
         LLVM knows under an earlier name has vectors of 16.
         """
-        mismatched = "znver" in self.cl_device.version
-        return 16 if self.cl_device.native_vector_width_float >= 16 and not mismatched else 8
+        mismatched = "znver" in ask(self.cl_device, "version", "")
+        return 16 if ask(self.cl_device, "native_vector_width_float", 1) >= 16 and not mismatched else 8
 
     def _check_size(self, what: str, nbytes: int) -> None:
         limit = self.cl_device.max_mem_alloc_size
@@ -294,6 +286,17 @@ class Device:
             self._constants[what] = host.tobytes(), self.upload(what, host)
         return self._constants[what][1]
 
+    def keep(self, what: str, owner: tuple[cl.array.Array, ...], result: cl.array.Array) -> None:
+        """Keep what was computed from the arrays of `owner`, for `kept`, until the first of them is freed."""
+        whole = tuple(map(ref, owner[1:]))
+        self._kept[what] = ref(owner[0], lambda _: self._kept.pop(what, None)), *whole, result
+
+    def kept(self, what: str, owner: tuple[cl.array.Array, ...]) -> cl.array.Array | None:
+        """The last array named `what` that was kept, if it was computed from these arrays."""
+        *owners, result = self._kept.get(what, (None,))
+        same = len(owners) == len(owner) and all(o() is array for o, array in zip(owners, owner, strict=True))
+        return result if same else None
+
     def launch(
         self,
         stage: str,
@@ -311,8 +314,8 @@ class Device:
         ignore surplus work-items.
         """
         if group is None and len(global_size) == 1:
-            group = (GROUP,)
-            global_size = (-(-global_size[0] // GROUP) * GROUP,)
+            group = (self.group(GROUP),)
+            global_size = (-(-global_size[0] // group[0]) * group[0],)
         program = (stage, *sorted((defines or {}).items()))
         if (kernel, program) not in self._kernels:
             for built in self.program(stage, defines or {}).all_kernels():
@@ -330,18 +333,18 @@ class Device:
         return value
 
     def program(self, stage: str, defines: dict[str, Any]) -> cl.Program:
-        """Build cl/`stage`.cl with `defines`, the model's constants and the device's real type."""
-        options = [*BUILD_OPTIONS, "-DUSE_DOUBLE" if self.real == np.float64 else "-cl-single-precision-constant"]
-        values = self._model | defines
-        options += [
-            f"-D{name}={value!r}" if isinstance(value, float) else f"-D{name}={value}"
-            for name, value in values.items()
-        ]
-        shown = bool(os.environ.get("PYOPENCL_COMPILER_OUTPUT"))
-        with warnings.catch_warnings():
-            # Drivers report on successful builds, for example which kernels they vectorised, and PoCL's compiler
-            # prints the number of its warnings to stderr.
-            if not shown:
-                warnings.simplefilter("ignore", cl.CompilerWarning)
-                options.append("-w")
-            return cl.Program(self.context, inline_includes(f"{stage}.cl", kernel_folder())).build(options)
+        """Build cl/`stage`.cl with `defines`, the model's constants and the device's real type.
+
+        If a build with subgroups fails, a warning says so, and the device uses none. They change no result.
+        """
+        source, values = inline_includes(f"{stage}.cl", kernel_folder()), self.model | defines
+        if values.get("SUBGROUPS") != 1:
+            return build(self.context, source, build_options(self.real, values))
+        try:
+            return build(self.context, source, build_options(self.real, values, self._subgroups.language))
+        except cl.Error as error:
+            result = build(self.context, source, build_options(self.real, values | {"SUBGROUPS": 0}))
+            reason = str(error).strip().splitlines()[0]
+            warnings.warn(f"{self.label}: cl/{stage}.cl is built without subgroups: {reason}", stacklevel=2)
+            self.subgroup_size = 0
+            return result

@@ -13,7 +13,8 @@ import pyopencl as cl
 import pytest
 
 from clsplat import ops, reference
-from clsplat.device import MODEL_CONSTANTS, inline_includes, kernel_folder
+from clsplat.device import MODEL_CONSTANTS
+from clsplat.programs import inline_includes, kernel_folder
 from clsplat.stages import FUNCTIONS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -26,10 +27,10 @@ LAYERS = """
     ranges json_lines
     config atomic
     camera gaussians
-    scene stages metrics panorama device
-    structs reference
+    scene stages metrics panorama programs
+    structs reference device
     ops testing formats
-    renderer
+    renderer selftest
     render dataset demo raster_gradients
     rasterization pruning
     training show
@@ -55,10 +56,10 @@ BENCH_KERNELS = {"roof"}
 
 # The only units that may import certain third-party packages, which are optional or slow to import.
 ONLY_IN = {
-    "pyopencl": {"device", "ops"},
+    "pyopencl": {"device", "programs", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
-    "av": {"dataset"},
+    "av": {"dataset", "show"},
     "pillow_heif": {"dataset"},
     "sqlite3": set(),  # with pycolmap in the same process it causes a bus error, see COUNT_ROWS in matching.py
 }
@@ -210,7 +211,7 @@ DEFINES = {
     "noise": {"GATE_SLOPE": 100.0, "GATE_OPACITY": 0.005},
     "bin": {"TILE": 16, "GRADIENTS": 1},
     "composite_cpu": {"TILE": 8, "CHANNELS": 1, "LANES": 8},
-    "composite_gpu": {"TILE": 8, "CHANNELS": 1, "BATCH": 16, "SUBGROUPS": 0},
+    "composite_gpu": {"TILE": 8, "CHANNELS": 1, "ITEMS": 32, "BATCH": 16, "SUBGROUPS": 0},
     "composite_sorted": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "WINDOW": 2},
     "count": {"TILE": 16},
     "filter": {"FILTER_VARIANCE": 0.2, "LENS": "FISHEYE"},
@@ -219,10 +220,14 @@ DEFINES = {
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
     },
     "project": {"CHANNELS": 4, "ANTIALIASED": 1, "CAMERA_GRAD": 1, "GROUP": 32, "LENS": "FISHEYE", "LANES": 1},
-    "removal": {"TILE": 8, "CHANNELS": 1, "LANES": 16},
+    "removal_cpu": {"TILE": 8, "CHANNELS": 1, "LANES": 16},
+    "removal_gpu": {"TILE": 8, "CHANNELS": 1, "STOP": 1e-6, "BATCH": 16, "SUBGROUPS": 0},
     "roof": {"WIDTH": 16, "HALVES": 1},
     "scan": {"GROUP": 32},
-    "sort": {"KEY_BITS": 64, "DIGIT_BITS": 4, "GROUP": 32, "BITONIC": 64, "BITONIC_GROUP": 32},
+    "sort": {
+        **{"KEY_BITS": 64, "DIGIT_BITS": 8, "GROUP": 32, "SEGMENT_BITS": 4, "SEGMENT_GROUP": 16},
+        **{"BITONIC": 64, "BITONIC_GROUP": 32},
+    },
 }
 FORBIDDEN = [
     ("bin", "TILE", 0),
@@ -232,6 +237,7 @@ FORBIDDEN = [
     ("composite_cpu", "LANES", 4),
     ("composite_gpu", "TILE", 32),
     ("composite_gpu", "CHANNELS", 0),
+    ("composite_gpu", "ITEMS", 48),
     ("composite_gpu", "BATCH", 0),
     ("composite_gpu", "SUBGROUPS", 2),
     ("composite_sorted", "TILE", 12),
@@ -248,9 +254,13 @@ FORBIDDEN = [
     ("project", "CAMERA_GRAD", 2),
     ("project", "LENS", "MIRROR"),
     ("project", "GROUP", 0),
-    ("removal", "TILE", 12),
-    ("removal", "CHANNELS", 0),
-    ("removal", "LANES", 32),
+    ("removal_cpu", "TILE", 12),
+    ("removal_cpu", "CHANNELS", 0),
+    ("removal_cpu", "LANES", 32),
+    ("removal_gpu", "TILE", 32),
+    ("removal_gpu", "CHANNELS", 0),
+    ("removal_gpu", "BATCH", 0),
+    ("removal_gpu", "SUBGROUPS", 2),
     ("roof", "WIDTH", 3),
     ("project", "LANES", 4),
     ("project", "LANES", 8),
@@ -258,7 +268,10 @@ FORBIDDEN = [
     ("scan", "GROUP", 0),
     ("sort", "KEY_BITS", 16),
     ("sort", "DIGIT_BITS", 17),
+    ("sort", "DIGIT_BITS", 11),
     ("sort", "GROUP", 0),
+    ("sort", "SEGMENT_BITS", 12),
+    ("sort", "SEGMENT_GROUP", 0),
     ("sort", "BITONIC", 100),
     ("sort", "BITONIC_GROUP", 64),
 ]

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from conftest import open_device
 from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, EXTENT_SLACK, TRANSMITTANCE_MIN
-from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.stages import Bins, Image, SplatGrads, Splats
 from clsplat.testing import ambiguous_pixels, assert_matches, gradcheck, synthetic_scene
@@ -134,7 +134,7 @@ def test_double_matches_twin(device64, compositor, tile_size, channels):
 @pytest.mark.parametrize("lanes", [8, 16])
 def test_blocks_of_both_widths_match_twin(lanes, tile_size):
     """The device's registers choose one; each must be right on all."""
-    device = Device(real=np.float64)
+    device = open_device(np.float64)
     device.vector_width = lanes  # shadows the cached property
     splats, width, height = make_splats(300, 2, channels=3)
     bins = reference.bin_splats(splats, width, height, tile_size)

@@ -5,11 +5,11 @@ What both variants share is tested in test_composite.py.
 
 import numpy as np
 import pytest
+from conftest import open_device
 from tolerances import DOUBLE
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MIN, EXTENT_SLACK
-from clsplat.device import Device
 from clsplat.ops import composite
 from clsplat.stages import Image, SplatGrads, Splats
 from clsplat.testing import assert_matches
@@ -141,13 +141,13 @@ def test_the_batch_changes_no_bit(device64, monkeypatch, batch):
 @TILE_SIZES
 def test_subgroups_change_no_bit(real, tile_size):
     """With them and without; also where a batch is more than one subgroup, whose barrier is then the group's."""
-    device = Device(real=real)
+    device = open_device(real)
     if not device.subgroup_size:
         pytest.skip(f"{device.label} has no subgroups")
     splats, bins = listed_scene(tile_size, 3)
     found = composite_gpu(device, splats, bins)
     for size in (0, 4 * device.subgroup_size):
-        other = Device(real=real)
+        other = open_device(real)
         other.subgroup_size = size  # shadows the cached property
         expected = composite_gpu(other, splats, bins)
         for name in expected:

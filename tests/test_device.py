@@ -9,8 +9,10 @@ import pyopencl as cl
 import pytest
 
 import clsplat.device
-from clsplat.device import Device, device_label, inline_includes, kernel_folder, list_devices, select_device
-from clsplat.errors import DeviceError
+import clsplat.programs
+from clsplat.device import Device, device_label, list_devices, select_device
+from clsplat.errors import DeviceError, InputError
+from clsplat.programs import BASE_LANGUAGE, Subgroups, ask, inline_includes, kernel_folder, probe_subgroups
 
 
 @pytest.fixture
@@ -256,7 +258,7 @@ class TestPrograms:
         ]
 
     def test_sources_are_missing(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(clsplat.device, "__file__", str(tmp_path / "clsplat" / "device.py"))
+        monkeypatch.setattr(clsplat.programs, "__file__", str(tmp_path / "clsplat" / "programs.py"))
         with pytest.raises(DeviceError, match=r"cl/common\.h: expected the kernel sources in .*; reinstall clsplat"):
             kernel_folder()
 
@@ -270,3 +272,81 @@ class TestPrograms:
         any_device.launch("constants", "read", (1,), [out])
         expected = [getattr(clsplat.constants, name) for name in names]
         np.testing.assert_array_equal(out.get(), np.array(expected, any_device.real))
+
+    def test_a_build_that_fails_with_subgroups_is_repeated_without(self, monkeypatch):
+        """OpenCL C 1.2 does not declare their functions. The warning comes once, and the device runs without them."""
+        device = Device()
+        device.subgroup_size, device._subgroups = 16, Subgroups(16, BASE_LANGUAGE)
+        defines = {"TILE": 8, "CHANNELS": 3, "ITEMS": 64, "BATCH": 16, "SUBGROUPS": 1}
+        with pytest.warns(UserWarning, match=r"cl/composite_gpu\.cl is built without subgroups: "):
+            program = device.program("composite_gpu", defines)
+        assert program.all_kernels() and device.subgroup_size == 0
+
+    def test_an_error_in_a_source_is_not_one_of_subgroups(self, kernels, recwarn):
+        (kernels / "broken.cl").write_text("#error on purpose\n")
+        with pytest.raises(cl.RuntimeError, match="on purpose"):
+            Device().program("broken", {"SUBGROUPS": 1})
+        assert not [w for w in recwarn if w.category is UserWarning]
+
+
+class TestSubgroups:
+    def probe(self, monkeypatch, languages, version="OpenCL 3.0 x", count=8, extensions="cl_khr_subgroups"):
+        """What is found of a device whose compiler has the functions in some languages; and what was tried."""
+        tried = []
+
+        def build(context, source, options):
+            tried.append(options[0])
+            if options[0] not in languages:
+                raise cl.RuntimeError("clBuildProgram failed: BUILD_PROGRAM_FAILURE")
+            kernel = SimpleNamespace(get_sub_group_info=lambda device, question, group: 32)
+            return SimpleNamespace(all_kernels=lambda: [kernel])
+
+        monkeypatch.setattr(clsplat.programs, "build", build)
+        found = SimpleNamespace(
+            version=version, max_num_sub_groups=count, extensions=extensions, max_work_group_size=256
+        )
+        return probe_subgroups(None, found), tried
+
+    def test_the_newest_language_that_builds_is_taken(self, monkeypatch):
+        both = ["-cl-std=CL3.0", "-cl-std=CL2.0"]
+        assert self.probe(monkeypatch, both) == (Subgroups(32, both[0]), both[:1])
+        assert self.probe(monkeypatch, both[1:]) == (Subgroups(32, both[1]), both)
+        assert self.probe(monkeypatch, both, version="OpenCL 2.0 x") == (Subgroups(32, both[1]), both[1:])
+
+    def test_a_compiler_without_their_functions_has_none(self, monkeypatch):
+        """Whatever the driver says of itself: rusticl and ROCm name the extension, and do not declare it in 1.2."""
+        assert self.probe(monkeypatch, [])[0].size == 0
+        assert self.probe(monkeypatch, [BASE_LANGUAGE], version="OpenCL 1.2 x") == (Subgroups(0, BASE_LANGUAGE), [])
+        assert self.probe(monkeypatch, ["-cl-std=CL3.0"], count=0, extensions="") == (
+            Subgroups(0, BASE_LANGUAGE),
+            [],
+        )
+
+
+class TestLimits:
+    def test_a_query_that_the_driver_refuses(self):
+        class Refusing:
+            local_mem_size = "many"
+
+            @property
+            def max_num_sub_groups(self):
+                raise cl.LogicError("clGetDeviceInfo failed: INVALID_VALUE")
+
+        assert ask(Refusing(), "max_num_sub_groups", 0) == 0
+        assert ask(Refusing(), "no such query", "none") == "none"
+        assert ask(Refusing(), "local_mem_size", 0) == 0
+        assert probe_subgroups(None, Refusing()) == Subgroups(0, BASE_LANGUAGE)
+
+    @pytest.mark.parametrize(("limit", "expected"), [(1024, 256), (256, 256), (128, 128), (96, 64), (1, 1)])
+    def test_groups_are_halved_until_they_fit(self, limit, expected):
+        device = Device()
+        device.largest_group = limit  # shadows the cached property
+        assert device.group(256) == expected
+
+    def test_variants(self, monkeypatch):
+        for variants, is_cpu in (("cpu", True), ("gpu", False)):
+            monkeypatch.setenv("CLSPLAT_VARIANTS", variants)
+            assert Device().is_cpu == is_cpu
+        monkeypatch.setenv("CLSPLAT_VARIANTS", "fast")
+        with pytest.raises(InputError, match="CLSPLAT_VARIANTS: expected auto, cpu or gpu, found 'fast'"):
+            Device().is_cpu  # noqa: B018

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import open_device
 from skimage.metrics import structural_similarity
 from tolerances import DOUBLE, FLOAT
 
@@ -22,7 +23,7 @@ SIZES = [(1, 1), (3, 5), (16, 16), (33, 64), (29, 37), (131, 150), (3, 4099), (4
 def each_device(request):
     """The device in both precisions, with the launches for CPUs and for GPUs, whatever it is."""
     real, is_cpu = request.param
-    device = Device(real=real)
+    device = open_device(real)
     device.is_cpu = is_cpu  # shadows the cached property
     return device
 

@@ -1,5 +1,7 @@
 """Stage removal: against rendering anew without each splat, the kernel against the twin, pixels that stop early."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from test_composite import BACKGROUND, handmade, make_splats, on_device
@@ -7,9 +9,36 @@ from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.stages import Bins, Removal, Splats
 from clsplat.testing import ambiguous_pixels, assert_matches
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def variants(request):
+    """Kernel variant; each runs on every device."""
+    return request.param
+
+
+@pytest.fixture
+def each_device(any_device, variants):
+    """The device in both precisions, with the kernels for CPUs and for GPUs."""
+    return configured(any_device.real, variants)
+
+
+@pytest.fixture
+def each_device64(device64, variants):
+    """The device in double precision, with the kernels for CPUs and for GPUs."""
+    return configured(device64.real, variants)
+
+
+@cache
+def configured(real, variants):
+    device = Device(real=real)
+    device.is_cpu = variants == "cpu"  # shadows the cached property
+    return device
+
 
 NEVER_STOPS = 1e-3  # well above TRANSMITTANCE_MIN
 
@@ -47,7 +76,7 @@ def faint(n, seed, width, height):
     return splats
 
 
-def test_is_what_rendering_without_the_splat_shows(any_device):
+def test_is_what_rendering_without_the_splat_shows(each_device):
     """Exactly: the error without each splat less that with all, and with another colour, where pixels count."""
     width, height = 23, 17
     splats = faint(40, 1, width, height)
@@ -60,9 +89,9 @@ def test_is_what_rendering_without_the_splat_shows(any_device):
     removed = [squared_error(other, target, mask) - before for other in images]
     changed = [squared_error(other, image, mask) for other in images]
     assert min(removed) < 0 < max(removed), "removal makes it worse and better"
-    exact = any_device.real == np.float64
+    exact = each_device.real == np.float64
     table, tolerance = (DOUBLE, 1e-10) if exact else (FLOAT, 1e-4)
-    for found in (reference.removal(*args), by_kernel(any_device, *args)):
+    for found in (reference.removal(*args), by_kernel(each_device, *args)):
         assert_matches("errors", found.errors, np.array(removed), table)
         assert_matches("differences", found.differences, np.array(changed), table)
 
@@ -82,7 +111,7 @@ def test_is_what_rendering_without_the_splat_shows(any_device):
 
 @pytest.mark.parametrize("tile_size", [8, 16])
 @pytest.mark.parametrize("channels", [3, 4])
-def test_double_matches_twin(device64, tile_size, channels):
+def test_double_matches_twin(each_device64, tile_size, channels):
     """300 splats in one to four tiles: lists of several batches, pixels that stop and that do not count."""
     splats, width, height = make_splats(300, 2, channels=channels)
     bins = reference.bin_splats(splats, width, height, tile_size)
@@ -90,12 +119,14 @@ def test_double_matches_twin(device64, tile_size, channels):
     assert (image.alpha > 1 - 2 * TRANSMITTANCE_MIN).any() and np.diff(bins.tile_ranges).max() > 64
     target, mask = target_and_mask(image.rgb.shape)
     args = splats, bins, BACKGROUND[:channels], image.rgb - target, mask
-    expected, found = reference.removal(*args), by_kernel(device64, *args)
+    expected, found = reference.removal(*args), by_kernel(each_device64, *args)
     for name in Removal._fields:
         assert_matches(name, getattr(found, name), getattr(expected, name), DOUBLE)
 
 
-def test_float_matches_twin(device):
+@pytest.mark.parametrize("as_variants", ["cpu", "gpu"])
+def test_float_matches_twin(as_variants):
+    device = configured(np.float32, as_variants)
     splats, width, height = make_splats(400, 3, width=97, height=71, channels=3)
     bins = reference.bin_splats(splats, width, height, 16)
     image = reference.composite_fwd(splats, bins, BACKGROUND[:3])
@@ -112,13 +143,13 @@ def test_float_matches_twin(device):
         np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
 
 
-def test_an_opaque_splat_before_another_in_numbers(any_device):
+def test_an_opaque_splat_before_another_in_numbers(each_device):
     """By hand: behind 0.99 of red the pixel stops at the second splat, which without the red one would be seen."""
     colors = np.eye(4)[[0, 1, 2]][:, :3]
     splats = handmade([(0.5, 0.5)] * 3, np.eye(2), [1.0, 1.0, 0.5], colors)
     order = np.arange(3)
     bins = Bins(order, np.array([[0, 3]]), order, np.arange(4), order, 16, 1, 1)
-    found = by_kernel(any_device, splats, bins, np.zeros(3))
+    found = by_kernel(each_device, splats, bins, np.zeros(3))
     # Seen in front of what lies behind: red 0.99, green 0.0099; without red green 0.99, blue 0.005.
     less = np.array([0.99, 0.0099 - 0.99, 0.00005 - 0.005])
     assert found.errors[0] == pytest.approx(less @ less, rel=1e-5)
@@ -153,34 +184,34 @@ def test_pixels_that_stop_are_wrong_by_no_more_than_the_stop_hides():
     assert np.abs(price[shown] / expected[shown] - 1).max() < 0.01, "0.02 with the stop of the image"
 
 
-def test_nothing_visible(any_device):
+def test_nothing_visible(each_device):
     splats = Splats(*(np.zeros(s) for s in ((5, 2), (5, 3), (5,), (5, 2), (5,), (5, 3))))
-    uploaded = Splats(*(any_device.upload("splats", a) for a in splats))
-    found = ops.removal(any_device, uploaded, ops.bin_splats(any_device, uploaded, 20, 10, 16), np.ones(3))
+    uploaded = Splats(*(each_device.upload("splats", a) for a in splats))
+    found = ops.removal(each_device, uploaded, ops.bin_splats(each_device, uploaded, 20, 10, 16), np.ones(3))
     for name, array in found._asdict().items():
         assert (array == 0).all(), name
 
 
-def test_what_is_too_faint_to_be_drawn_costs_nothing(any_device):
+def test_what_is_too_faint_to_be_drawn_costs_nothing(each_device):
     splats = handmade([(8.0, 8.0)], np.eye(2) * 9, [0.5], [[1, 1, 1]])
     splats = splats._replace(opacities=np.array([0.9 * ALPHA_MIN]))
     one = np.zeros(1)
     bins = Bins(one, np.array([[0, 1]]), one, np.arange(2), one, 16, 16, 16)
-    assert by_kernel(any_device, splats, bins, np.zeros(3)).errors[0] == 0
+    assert by_kernel(each_device, splats, bins, np.zeros(3)).errors[0] == 0
 
 
-def test_splats_behind_a_finished_tile(any_device):
+def test_splats_behind_a_finished_tile(each_device):
     """Five splats finish the only pixel; the list goes on for batches, whose records nobody else writes."""
     n = 80
     rng = np.random.default_rng(0)
     splats = handmade(np.full((n, 2), 0.5), np.eye(2), np.full(n, 0.95), rng.uniform(size=(n, 3)))
     order = np.arange(n)
     bins = Bins(order, np.array([[0, n]]), order, np.arange(n + 1), order, 16, 1, 1)
-    any_device.upload("prices per intersection", np.full((n, 7), np.nan))  # what the next of this name will hold
+    each_device.upload("prices per intersection", np.full((n, 7), np.nan))  # what the next of this name will hold
     expected = reference.removal(splats, bins, (50.0, 20.0, 30.0))
-    found = by_kernel(any_device, splats, bins, (50.0, 20.0, 30.0))
+    found = by_kernel(each_device, splats, bins, (50.0, 20.0, 30.0))
     assert (found.errors[4:] == 0).all() and (found.weights[4:] == 0).all() and found.weights[3] > 0
-    table = DOUBLE if any_device.real == np.float64 else FLOAT
+    table = DOUBLE if each_device.real == np.float64 else FLOAT
     assert_matches("errors", found.errors, expected.errors, table)
 
 

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from clsplat import ops, reference
+from clsplat.device import Device
 from clsplat.errors import InputError
+from clsplat.ops import sort
 from clsplat.ops.sort import BITONIC_MAX, CPU_SHORT_SEGMENT
 
-# Around runs of 16 keys, work-groups of 64, the bitonic sort's capacity, and blocks of 64 x 16 keys.
-SIZES = [1, 2, 15, 16, 17, 63, 64, 65, 1023, 1024, 1025, 4097, 100_000]
+# Around runs of 8 keys, work-groups of 64 and 128, the bitonic sort's capacity, and chunks of 128 x 8 keys.
+SIZES = [1, 2, 7, 8, 9, 63, 64, 65, 127, 129, 1023, 1024, 1025, 4097, 100_000]
 WIDTHS = {32: np.uint32, 64: np.uint64}
 
 
@@ -46,6 +48,15 @@ def check(device, keys, bits, method):
 @pytest.mark.parametrize("n", SIZES)
 def test_radix(configured_device, n, width, kind):
     check(configured_device, keys_of(kind, n, width, WIDTHS[width]), width, "radix")
+
+
+@pytest.mark.parametrize("n", [7 * 1024 - 1, 7 * 1024 + 1, 9 * 1024])
+def test_blocks_of_several_chunks(monkeypatch, n):
+    """Of which the last block has fewer than the others, or none."""
+    monkeypatch.setenv("CLSPLAT_VARIANTS", "gpu")
+    monkeypatch.setattr(sort, "RADIX_GROUPS", 4)
+    for kind in ("random", "few", "largest"):
+        check(Device(), keys_of(kind, n, 32, np.uint32), 32, "radix")
 
 
 @pytest.mark.parametrize("kind", ["random", "few", "equal", "largest", "backwards"])

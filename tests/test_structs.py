@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 
 import clsplat.device
+import clsplat.programs
 from clsplat.camera import Camera
 from clsplat.structs import camera_struct
 
@@ -32,7 +33,7 @@ __kernel void echo(const Camera c, const uint bytes, __global real *out, __globa
 
 
 def test_camera(any_device, tmp_path, monkeypatch):
-    shutil.copytree(clsplat.device.kernel_folder(), tmp_path / "cl")
+    shutil.copytree(clsplat.programs.kernel_folder(), tmp_path / "cl")
     (tmp_path / "cl" / "echo.cl").write_text(ECHO)
     monkeypatch.setattr(clsplat.device, "kernel_folder", lambda: tmp_path / "cl")
     viewmat = Camera.look_at((1, 2, 3), (0, 0.5, 0), (0, 0, 1), 1, 1, 1).viewmat

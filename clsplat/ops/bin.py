@@ -64,9 +64,7 @@ def bin_splats(
 
     geometry = [width, height, order, ellipses]
     distribute = _counting_sort if device.is_cpu else _radix_sort
-    gauss_ids, slots, first_slots, tile_begins = distribute(device, n, tile_count, geometry, defines)
-    tile_ranges = device.empty("tile ranges", (tile_count, 2), np.uint32)
-    device.launch("bin", "bin_ranges", (tile_count,), [tile_count, tile_begins, tile_ranges], defines=defines)
+    gauss_ids, slots, first_slots, tile_ranges = distribute(device, n, tile_count, geometry, defines)
     m = gauss_ids.shape[0]
     if m and not by_depth:
         list_keys = device.empty("list keys", m, keys.dtype)
@@ -94,7 +92,7 @@ def _gather(device: Device, m: int, permutation: Array, values: Array, defines: 
 def _counting_sort(
     device: Device, n: int, tile_count: int, geometry: list[Any], defines: dict[str, Any]
 ) -> tuple[Array, Array, Array, Array]:
-    """gauss_ids, slots, first_slots and tile_begins by a counting sort, in which each core has its own counters."""
+    """gauss_ids, slots, first_slots and tile_ranges by a counting sort, in which each core has its own counters."""
     runs = min(n, 4 * device.cl_device.max_compute_units)
     head = [n, runs, tile_count, *geometry]
     counters = device.empty("tile counters", (runs, tile_count), np.uint32)
@@ -115,7 +113,9 @@ def _counting_sort(
     if m:
         arguments = [*head, counters, tile_begins, first_slots, gauss_ids, slots]
         device.launch("bin", "bin_scatter", (runs,), arguments, defines=defines, group=(1,))
-    return gauss_ids, slots, first_slots, tile_begins
+    tile_ranges = device.empty("tile ranges", (tile_count, 2), np.uint32)
+    device.launch("bin", "bin_ranges", (tile_count,), [tile_count, tile_begins, tile_ranges], defines=defines)
+    return gauss_ids, slots, first_slots, tile_ranges
 
 
 def _radix_sort(
@@ -127,7 +127,7 @@ def _radix_sort(
     first_slots, partial = queue_scan(device, counts)
     m = checked_total(partial, WHAT)
     tiles, slot_gauss = _list(device, m), _list(device, m)
-    tile_begins = device.empty("tile begins", tile_count + 1, np.uint32)
+    tile_ranges = device.empty("tile ranges", (tile_count, 2), np.uint32)
     gauss_ids = slots = slot_gauss
     if m:
         arguments = [n, *geometry, first_slots, tiles, slot_gauss]
@@ -137,5 +137,5 @@ def _radix_sort(
             gauss_ids = _gather(device, m, slots, slot_gauss, defines)
         else:
             tiles, gauss_ids = argsort(device, tiles, tile_count.bit_length(), values=slot_gauss)
-    device.launch("bin", "bin_bisect", (tile_count + 1,), [m, tile_count, tiles, tile_begins], defines=defines)
-    return gauss_ids, slots, first_slots, tile_begins
+    device.launch("bin", "bin_bisect", (tile_count,), [m, tile_count, tiles, tile_ranges], defines=defines)
+    return gauss_ids, slots, first_slots, tile_ranges

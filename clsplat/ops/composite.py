@@ -16,7 +16,7 @@ WINDOW = 32
 
 def gpu_batch(device: Device) -> int:
     """Number of splats per batch of the GPU variant: the work-items of a subgroup, if there are subgroups."""
-    return device.subgroup_size or GPU_BATCH
+    return device.group(device.subgroup_size or GPU_BATCH)
 
 
 def variant(device: Device, compositor: str = "auto", disparities: Any = None) -> str:
@@ -31,7 +31,11 @@ def variant(device: Device, compositor: str = "auto", disparities: Any = None) -
 def _defines(device: Device, bins: Bins, channels: int, stage: str) -> dict[str, Any]:
     own: dict[str, dict[str, int]] = {
         "composite_cpu": {"LANES": device.vector_width},
-        "composite_gpu": {"BATCH": gpu_batch(device), "SUBGROUPS": int(device.subgroup_size > 0)},
+        "composite_gpu": {
+            "ITEMS": device.group(bins.tile_size**2),
+            "BATCH": gpu_batch(device),
+            "SUBGROUPS": int(device.subgroup_size > 0),
+        },
         "composite_sorted": {"LANES": device.vector_width, "WINDOW": WINDOW},
     }
     return {"TILE": bins.tile_size, "CHANNELS": channels} | own[stage]
@@ -45,18 +49,31 @@ def packed(device: Device, splats: Splats, bins: Bins, stage: str) -> Any:
     device.launch(
         stage, "composite_pack", (n,), [n, *geometry, result], defines=_defines(device, bins, channels, stage)
     )
+    if bins.slots is not None:
+        device.keep("packed splats", splats, result)  # for the backward pass
     return result
 
 
-def _launch(device: Device, stage: str, kernel: str, bins: Bins, channels: int, arguments: list[Any]) -> None:
+def _launch(
+    device: Device, stage: str, kernel: str, bins: Bins, channels: int, arguments: list[Any], **changes: Any
+) -> None:
     tiles = bins.tile_ranges.shape[0]
     group = 1
     if stage == "composite_gpu":
-        group = bins.tile_size**2 if kernel == "composite_fwd" else gpu_batch(device)
+        group = device.group(bins.tile_size**2) if kernel == "composite_fwd" else gpu_batch(device)
     arguments = [bins.width, bins.height, arguments[0], bins.gauss_ids, bins.tile_ranges, *arguments[1:]]
-    device.launch(
-        stage, kernel, (tiles * group,), arguments, defines=_defines(device, bins, channels, stage), group=(group,)
-    )
+    defines = _defines(device, bins, channels, stage) | changes
+    device.launch(stage, kernel, (tiles * group,), arguments, defines=defines, group=(group,))
+
+
+def composite_until(device: Device, pack: Any, bins: Bins, background: Any, stop: float) -> Any:
+    """Image (H, W, C) by the GPU variant, whose pixels stop at another transmittance than TRANSMITTANCE_MIN."""
+    channels = len(background)
+    result = device.empty("image", (bins.height, bins.width, channels))
+    alpha = device.empty("alpha", (bins.height, bins.width))
+    arguments = [pack, device.constant("background", background), result, alpha]
+    _launch(device, "composite_gpu", "composite_fwd", bins, channels, arguments, TRANSMITTANCE_MIN=stop)
+    return result
 
 
 def composite_fwd(
@@ -108,7 +125,7 @@ def composite_bwd(
     Parameters
     ----------
     splats, bins, compositor, disparities
-        As given to `composite_fwd`.
+        As given to `composite_fwd`. The splats must not have changed since.
     image : Image
         Its result.
     v_image : Image
@@ -127,7 +144,10 @@ def composite_bwd(
     m = bins.gauss_ids.shape[0]
     records = device.empty("gradients per intersection", (max(m, 1), 6 + channels))
     stage = variant(device, compositor, disparities)
-    arguments = [packed(device, splats, bins, stage), bins.slots, *image, *v_image, records]
+    pack = device.kept("packed splats", splats)
+    if pack is None:
+        pack = packed(device, splats, bins, stage)
+    arguments = [pack, bins.slots, *image, *v_image, records]
     arguments += [] if disparities is None else [disparities]
     _launch(device, stage, "composite_bwd", bins, channels, arguments)
     v = SplatGrads(

@@ -37,13 +37,14 @@ def l1_ssim(
     v_image : (H, W, 3) real
     """
     height, width, _ = image.shape
-    shape, group = (CPU_SHAPE, 1) if device.is_cpu else (GPU_SHAPE, GROUP)
+    largest = device.group(GROUP)
+    shape, group = (CPU_SHAPE, 1) if device.is_cpu else (GPU_SHAPE, largest)
     defines = shape | {
         "SSIM_C1": SSIM_C1,
         "SSIM_C2": SSIM_C2,
         "SSIM_TAPS": ",".join(map(repr, SSIM_TAPS)),
         "RADIUS": RADIUS,
-        "GROUP": GROUP,
+        "GROUP": largest,
     }
     lanes, strip = shape["LANES"], shape["LANES"] * shape["VECTORS"]
     margin = -(-3 * RADIUS // lanes) * lanes
@@ -62,7 +63,7 @@ def l1_ssim(
     shared = [width, height, band, *weights, *pair, derivatives]
     for kernel, size, local, arguments in (
         ("loss_ssim", (groups * group, bands), (group, 1), [*shared, parts]),
-        ("loss_sum", (GROUP,), (GROUP,), [bands * groups, parts, loss]),
+        ("loss_sum", (largest,), (largest,), [bands * groups, parts, loss]),
         ("loss_grad", (groups * group, bands), (group, 1), [*shared, v_image]),
     ):
         device.launch("loss", kernel, size, arguments, defines=defines, group=local)

@@ -146,7 +146,8 @@ def _backward(
     if not defines["CAMERA_GRAD"]:
         _launch(device, kernel, n, arguments, defines)
         return None
-    groups, group = -(-n // CAMERA_GROUP), CAMERA_GROUP // defines["LANES"]
+    group = device.group(CAMERA_GROUP // defines["LANES"])
+    groups = -(-n // (group * defines["LANES"]))
     partial = device.empty("v_camera", (groups, 16))
     device.launch(
         "project",

@@ -1,4 +1,4 @@
-"""Launch of the stage removal (cl/removal.cl)."""
+"""Launch of the stage removal (cl/removal_cpu.cl, cl/removal_gpu.cl)."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.device import Device
 from clsplat.errors import InputError
-from clsplat.ops.composite import packed, variant
+from clsplat.ops.composite import composite_until, gpu_batch, packed, variant
 from clsplat.stages import Bins, Removal, Splats
 
 
@@ -48,11 +48,20 @@ def removal(
         device.upload("residuals", np.zeros((*size, channels)) if residuals is None else residuals),
         device.upload("mask", np.ones(size) if mask is None else mask, np.uint8),
     ]
-    lists = [packed(device, splats, bins, variant(device)), bins.gauss_ids, bins.tile_ranges, bins.slots]
-    arguments = [bins.width, bins.height, *lists, device.constant("background", background), *pixels, records]
-    defines = {"TILE": bins.tile_size, "CHANNELS": channels, "LANES": device.vector_width}
-    device.launch("removal", "removal", (tiles,), arguments, defines=defines, group=(1,))
+    stage = "removal_cpu" if device.is_cpu else "removal_gpu"
+    pack = packed(device, splats, bins, variant(device))
+    defines = {"TILE": bins.tile_size, "CHANNELS": channels}
+    if device.is_cpu:
+        group, behind = 1, device.constant("background", background)
+        defines |= {"LANES": device.vector_width}
+    else:
+        stop = device.model["TRANSMITTANCE_MIN"] * (1 - device.model["ALPHA_MAX"])  # see cl/removal_cpu.cl
+        group, behind = gpu_batch(device), composite_until(device, pack, bins, background, stop)
+        defines |= {"STOP": stop, "BATCH": group, "SUBGROUPS": int(device.subgroup_size > 0)}
+    lists = [bins.gauss_ids, bins.tile_ranges, bins.slots]
+    arguments = [bins.width, bins.height, pack, *lists, behind, *pixels, records]
+    device.launch(stage, "removal", (tiles * group,), arguments, defines=defines, group=(group,))
     arguments = [n, bins.order, bins.first_slots, records, sums]
-    device.launch("removal", "removal_sum", (n,), arguments, defines=defines)
+    device.launch(stage, "removal_sum", (n,), arguments, defines=defines)
     errors, differences, weights, squares, *pulls = sums.get().T
     return Removal(errors, differences, weights, squares, np.stack(pulls, axis=1))

@@ -3,8 +3,11 @@
 import numpy as np
 from pyopencl.array import Array
 
-from clsplat.device import Device
+from clsplat.device import GROUP, Device
 from clsplat.errors import DeviceError
+
+# Largest number of values that one core of a CPU sums up alone: that takes no longer than a second launch.
+SMALL = 16384
 
 
 def exclusive_scan(device: Device, values: Array, what: str = "scan") -> tuple[Array, int]:
@@ -47,20 +50,14 @@ def queue_scan(device: Device, values: Array) -> tuple[Array, Array]:
     n = values.shape[0]
     # A few chunks per core on a CPU; otherwise enough work-items to fill any GPU.
     chunks = 4 * device.cl_device.max_compute_units if device.is_cpu else 8192
-    chunks = min(chunks, n)
-    defines = {"GROUP": 1 if device.is_cpu else 64}
+    chunks = 1 if device.is_cpu and n <= SMALL else min(chunks, n)
+    defines = {"GROUP": 1 if device.is_cpu else device.group(GROUP)}
     partial = device.empty("scan", chunks + 1, np.uint64)
     sums = device.empty("scan", n + 1, np.uint32)
     # On a CPU, a group runs on one core, so each group has one chunk.
-    group = (1,) if device.is_cpu else None
-    device.launch("scan", "scan_reduce", (chunks,), [n, chunks, values, partial], defines=defines, group=group)
-    device.launch(
-        "scan",
-        "scan_spine",
-        (defines["GROUP"],),
-        [chunks, partial],
-        defines=defines,
-        group=(defines["GROUP"],),
-    )
-    device.launch("scan", "scan_down", (chunks,), [n, chunks, values, partial, sums], defines=defines, group=group)
+    group = (defines["GROUP"],)
+    size = (-(-chunks // group[0]) * group[0],)
+    if chunks > 1:
+        device.launch("scan", "scan_reduce", size, [n, chunks, values, partial], defines=defines, group=group)
+    device.launch("scan", "scan_down", size, [n, chunks, values, partial, sums], defines=defines, group=group)
     return sums, partial

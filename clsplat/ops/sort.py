@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from clsplat.device import Device
+from clsplat.device import GROUP, Device
 from clsplat.errors import InputError
 from clsplat.ops.scan import queue_scan
 
@@ -17,14 +17,27 @@ BITONIC_MAX = 1024
 CPU_SHORT_SEGMENT = 16
 
 
+# Number of work-items of a group that sorts on a GPU. Its local memory is then 15 KiB with 32-bit keys.
+RADIX_GROUP = 128
+
+# Number of keys per work-item and chunk, RUN in cl/sort.cl.
+RADIX_RUN = 8
+
+# Largest number of groups of a radix sort on a GPU. Each adds up the counts of the others.
+RADIX_GROUPS = 256
+
+
 def _defines(device: Device, keys: Array, **changes: Any) -> dict[str, Any]:
     return {
         "KEY_BITS": 8 * keys.dtype.itemsize,
-        # The 2048 counters of a core fit into its L1 cache. A work-item of a GPU has 16 counters in local memory.
-        "DIGIT_BITS": 11 if device.is_cpu else 4,
-        "GROUP": 1 if device.is_cpu else 64,
+        # The 2048 counters of a core fit into its L1 cache. A group of a GPU has 256 in local memory.
+        "DIGIT_BITS": 11 if device.is_cpu else 8,
+        "GROUP": 1 if device.is_cpu else device.group(RADIX_GROUP),
+        # A work-item of a GPU has 16 counters in local memory.
+        "SEGMENT_BITS": 8 if device.is_cpu else 4,
+        "SEGMENT_GROUP": 1 if device.is_cpu else device.group(GROUP),
         "BITONIC": BITONIC_MAX,
-        "BITONIC_GROUP": 64,
+        "BITONIC_GROUP": device.group(GROUP),
     } | changes
 
 
@@ -64,34 +77,25 @@ def argsort(
         sorted_keys = device.empty("sort keys", n, keys.dtype)
         order = device.empty("sort order", n, np.uint32)
         arguments = [n, positions, keys, order if values is None else values, sorted_keys, order]
-        device.launch("sort", "sort_bitonic", (64,), arguments, defines=defines, group=(64,))
+        group = (defines["BITONIC_GROUP"],)
+        device.launch("sort", "sort_bitonic", group, arguments, defines=defines, group=group)
         return sorted_keys, order
 
-    group, digit_bits = defines["GROUP"], defines["DIGIT_BITS"]
-    # A few blocks per core on a CPU; otherwise about 16 keys per work-item.
-    groups = 4 * device.cl_device.max_compute_units if device.is_cpu else -(-n // (group * 16))
+    group, digit_bits = (defines["GROUP"],), defines["DIGIT_BITS"]
+    # A few blocks per core on a CPU, and whole chunks on a GPU.
+    groups = 4 * device.cl_device.max_compute_units if group == (1,) else -(-n // (group[0] * RADIX_RUN))
+    groups = groups if group == (1,) else min(groups, RADIX_GROUPS)
+    size = (groups * group[0],)
     histogram = device.empty("sort histogram", groups << digit_bits, np.uint32)
     order = device.empty("sort order", n, np.uint32) if values is None else values
     for shift in range(0, max(bits, 1), digit_bits):
-        device.launch(
-            "sort",
-            "sort_count",
-            (groups * group,),
-            [n, groups, shift, keys, histogram],
-            defines=defines,
-            group=(group,),
-        )
-        offsets, _ = queue_scan(device, histogram)
+        arguments = [n, groups, shift, keys, histogram]
+        device.launch("sort", "sort_count", size, arguments, defines=defines, group=group)
+        offsets = queue_scan(device, histogram)[0] if group == (1,) else histogram
         keys_out = device.empty("sort keys", n, keys.dtype)
         order_out = device.empty("sort order", n, np.uint32)
-        device.launch(
-            "sort",
-            "sort_scatter",
-            (groups * group,),
-            [n, groups, shift, positions, keys, order, offsets, keys_out, order_out],
-            defines=defines,
-            group=(group,),
-        )
+        arguments = [n, groups, shift, positions, keys, order, offsets, keys_out, order_out]
+        device.launch("sort", "sort_scatter", size, arguments, defines=defines, group=group)
         keys, order, positions = keys_out, order_out, 0
     return keys, order
 
@@ -119,7 +123,7 @@ def argsort_segments(device: Device, keys: Array, bits: int, ranges: Array, valu
     n, segments = keys.shape[0], ranges.shape[0]
     defines = _defines(device, keys)
     if device.is_cpu:
-        defines |= {"DIGIT_BITS": 8, "BITONIC": CPU_SHORT_SEGMENT, "BITONIC_GROUP": 1}
+        defines |= {"BITONIC": CPU_SHORT_SEGMENT, "BITONIC_GROUP": 1}
     positions = int(values is None)
     order = device.empty("sort order", n, np.uint32)
     values_in = order if values is None else values
@@ -132,7 +136,7 @@ def argsort_segments(device: Device, keys: Array, bits: int, ranges: Array, valu
         defines=defines,
         group=(group,),
     )
-    group = defines["GROUP"]
+    group = defines["SEGMENT_GROUP"]
     sorted_keys, spare_keys = (device.empty("sort keys", n, keys.dtype) for _ in range(2))
     spare = device.empty("sort order", n, np.uint32)
     device.launch(

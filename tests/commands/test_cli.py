@@ -12,13 +12,17 @@ import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import clsplat.device
+import clsplat.selftest
 from clsplat.camera import Camera
 from clsplat.cli import main
+from clsplat.commands.listing import describe
 from clsplat.config import DataConfig, FewViewsConfig, TrainConfig
 from clsplat.dataset import load_scene
 from clsplat.formats import FORMATS, load_gaussians, save_gaussians
@@ -260,10 +264,42 @@ def test_no_color(wanted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     assert b"usage" in shown and (b"\x1b[" in shown) == wanted
 
 
-def test_devices_names_the_default(capsys: pytest.CaptureFixture[str]) -> None:
+def test_devices_names_the_default_and_tests_each(capsys: pytest.CaptureFixture[str]) -> None:
     run("devices")
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith("* ") for line in lines) == 2  # the device and the line that explains the star
+    assert (
+        sum(re.fullmatch(r"    works: all \d+ stages agree with the reference", line) is not None for line in lines)
+        > 0
+    )
+
+
+def test_devices_stars_one_of_two_equal_entries_and_checks(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two files of one driver in the list of drivers are two entries that compare equal."""
+    twice = clsplat.device.list_devices()[:1] * 2
+    monkeypatch.setattr(clsplat.device, "list_devices", lambda: twice)
+    monkeypatch.setattr(clsplat.selftest, "faults_of", lambda index: {"scan": "found 7"} if index else {})
+    with pytest.raises(SystemExit) as ended:
+        run("devices", "--check")
+    out = capsys.readouterr().out
+    assert ended.value.code == 1
+    assert len(re.findall(r"^\* .*: ", out, re.M)) == 1
+    assert out.count("works: all") == 1 and out.count("FAILS: scan: found 7") == 1
+    run("devices")  # without --check, faults are only reported
+    monkeypatch.setattr(clsplat.selftest, "faults_of", lambda index: {})
+    run("devices", "--check")
+
+
+def test_devices_shows_known_faults_and_what_a_driver_refuses(capsys: pytest.CaptureFixture[str]) -> None:
+    platform = SimpleNamespace(name="rusticl")
+    describe(
+        SimpleNamespace(name="llvmpipe", platform=platform, version="OpenCL 3.0", driver_version="25.0.7"), False
+    )
+    out = capsys.readouterr().out
+    assert "  rusticl: llvmpipe" in out and "0 compute units" in out
+    assert "known: declares subgroups in OpenCL C 3.0 alone" in out
 
 
 def test_a_run_is_not_overwritten(trained: Path, dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -328,8 +364,11 @@ def test_a_folder_is_no_scene(
     trained: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     expected = "expected a file of Gaussians, such as scene.ply, found a folder"
-    message = fails(capsys, "eval", trained, dataset, "-o", tmp_path / "eval")
-    assert message == f"clsplat: {trained}: {expected}; the scene in it is {trained / 'scene.ply'}"
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    shutil.copyfile(trained / "scene.ply", alone / "scene.ply")
+    message = fails(capsys, "eval", alone, dataset, "-o", tmp_path / "eval")
+    assert message == f"clsplat: {alone}: {expected}; the scene in it is {alone / 'scene.ply'}"
     original = tmp_path / "run" / "point_cloud" / "iteration_7000"
     original.mkdir(parents=True)
     shutil.copyfile(trained / "scene.ply", original / "point_cloud.ply")

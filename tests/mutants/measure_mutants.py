@@ -33,7 +33,13 @@ PROCESSOR_SECONDS = 900
 NO_TESTS = 3
 """Exit status of a process in which pytest itself has failed."""
 
-WHOLE = ("tests/test_gold.py", "tests/test_render.py", "tests/training/test_loop.py", "tests/training/test_resume.py")
+WHOLE = (
+    "tests/test_bounds.py",
+    "tests/test_gold.py",
+    "tests/test_render.py",
+    "tests/training/test_loop.py",
+    "tests/training/test_resume.py",
+)
 """Tests of the whole renderer and of training, for mutants that the tests of their file do not see."""
 
 PROJECT = ("tests/test_project.py", "tests/test_lens.py", "tests/test_project_degenerate.py")

@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 import pyopencl as cl
 import pytest
 
-from clsplat.device import Device, kernel_folder
+from clsplat.device import Device
+from clsplat.programs import kernel_folder
 
 RANDOM = (
     (re.compile(r"\.(.*)\.[0-9a-f]{16}\.part"), r"\1.part"),

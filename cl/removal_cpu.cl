@@ -1,4 +1,4 @@
-// Stage removal: change of an image's squared error if a single splat is removed, or changes its colour.
+// Stage removal, variant for CPUs: change of an image's squared error if a single splat is removed, or changes its colour.
 //
 // In a pixel, a splat has the weight w = alpha T and the colour c. S is the part of the image that lies behind it,
 // background included. Removing the splat reduces the image by
@@ -14,8 +14,7 @@
 // the colours. A second pass, also from front to back, subtracts the part of each splat to find what is behind it. So
 // nothing is divided by a transmittance, and alpha/(1 - alpha) is at most 99. The sums of a splat over the tile are
 // written, as a record, to the splat's slot in the unsorted list. removal_sum adds up the records of a splat in a fixed
-// order, with one work-item per splat and without atomics. There is one variant for all devices, because the stage runs
-// once per view in a pruning of many rounds, and not in training.
+// order, with one work-item per splat and without atomics. removal_gpu.cl is the variant for GPUs.
 //
 // Buffers: N, M, T, C and splats as in composite_cpu.cl, order[N], first_slots[N+1], slots[M] as in bin.cl
 //   in   splats[N], gauss_ids[M], tile_ranges[T,2], slots[M], background[C]; residuals[H,W,C], image - target;
@@ -26,11 +25,9 @@
 // -DLANES=8|16  number of pixels of a block
 #include "common.h"
 #include "composite_blocks.h"
+#include "removal_sums.h"
 
 #define STOP ((real)(TRANSMITTANCE_MIN * (1 - ALPHA_MAX)))
-
-// Number of reals of a record.
-#define SUMS (4 + CHANNELS)
 
 __kernel void removal(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
                       const __global uint *tile_ranges, const __global uint *slots, const __global real *background,
@@ -111,18 +108,5 @@ __kernel void removal(const int width, const int height, const __global Splat *s
     for (uint i = first; i < end; ++i) {
         for (int k = 0; k < SUMS; ++k)
             records[(size_t)SUMS * slots[i] + k] = 0;
-    }
-}
-
-__kernel void removal_sum(const uint n, const __global uint *order, const __global uint *first_slots,
-                          const __global real *records, __global real *sums) {
-    const size_t i = get_global_id(0);
-    if (i >= n)
-        return;
-    for (int k = 0; k < SUMS; ++k) {
-        real total = 0;
-        for (uint slot = first_slots[i]; slot < first_slots[i + 1]; ++slot)
-            total += records[(size_t)SUMS * slot + k];
-        sums[(size_t)SUMS * order[i] + k] = total;
     }
 }

@@ -1,0 +1,80 @@
+"""The command `devices`."""
+
+import re
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+from clsplat.commands.console import say
+
+KNOWN_FAULTS = (
+    (
+        r"PoCL (3\.0|3\.1) .*znver",
+        "on a Zen 4, built-in functions of vectors beyond 256 bits give wrong numbers or end the process (kernels of "
+        "clsplat call none)",
+    ),
+    (
+        r"rusticl .*\b22\.",
+        "no double precision; compiles slowly",
+    ),
+    (
+        r"rusticl .*\b25\.",
+        "declares subgroups in OpenCL C 3.0 alone, although it names the extension",
+    ),
+    (
+        r"AMD Accelerated Parallel Processing",
+        "names cl_khr_subgroups, and its compiler does not declare their functions in OpenCL C 1.2",
+    ),
+)
+"""Drivers, as patterns of platform, version and driver version, and what is known to be wrong with them (tried in:
+docs/howto/devices.md)."""
+
+
+@dataclass(frozen=True)
+class Devices:
+    """List the OpenCL devices and their capabilities, and test each: every stage against the float64 reference."""
+
+    check: bool = False
+    """Exit with status 1 if a device fails the test."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.device import list_devices, select_device
+        from clsplat.selftest import TESTS, faults_of
+
+        default, devices = select_device(), list_devices()
+        starred = devices.index(default)  # one of them, even where two entries of a driver are equal
+        failed = False
+        for index, device in enumerate(devices):
+            describe(device, starred=index == starred)
+            say("    testing ...")
+            faults = faults_of(index)
+            failed |= bool(faults)
+            if not faults:
+                print(f"    works: all {len(TESTS)} stages agree with the reference")
+            for stage, fault in faults.items():
+                print(f"    FAILS: {stage}: {fault}")
+        print("* is the default; choose another device with --device and part of its name, or with PYOPENCL_CTX")
+        if self.check and failed:
+            sys.exit(1)
+
+
+def describe(device: Any, starred: bool) -> None:
+    """Print the name, the capabilities and the known faults of a device."""
+    from clsplat.device import device_label
+    from clsplat.programs import ask
+
+    extensions, memory = ask(device, "extensions", ""), ask(device, "global_mem_size", 0)
+    version, driver = ask(device, "version", "").strip(), ask(device, "driver_version", "").strip()
+    capabilities = [
+        f"{ask(device, 'max_compute_units', 0)} compute units",
+        f"{memory / 2**30:.1f} GiB, {ask(device, 'max_mem_alloc_size', 0) / 2**30:.1f} GiB per buffer",
+        f"{ask(device, 'local_mem_size', 0) // 1024} KiB local",
+        f"{version}, driver {driver}",
+        "double precision" if "cl_khr_fp64" in extensions else "no double precision",
+        "subgroups" if "subgroups" in extensions else "no subgroups",
+    ]
+    print(f"{'*' if starred else ' '} {device_label(device)}\n    {'; '.join(capabilities)}")
+    for pattern, fault in KNOWN_FAULTS:
+        if re.search(pattern, f"{device.platform.name} {version} {driver}"):
+            print(f"    known: {fault}")

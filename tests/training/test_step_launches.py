@@ -1,0 +1,45 @@
+"""What a training step asks of the host: the number of launches and of reads that wait."""
+
+from pathlib import Path
+
+import pytest
+from test_memory import FIXED_N, make_scene
+
+from clsplat.config import TrainConfig
+from clsplat.device import Device
+from clsplat.training.loop import train
+
+STEPS = 8
+
+
+@pytest.mark.parametrize("variants", ["cpu", "gpu"])
+def test_a_step_takes_few_launches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variants: str) -> None:
+    """At most 30, with more tiles than one digit of the sort has, and lists longer than the bitonic sort takes."""
+    monkeypatch.setenv("CLSPLAT_VARIANTS", variants)
+    launched: list[list[str]] = [[]]
+    launch = Device.launch
+
+    def counted(self: Device, stage: str, kernel: str, *arguments: object, **options: object) -> None:
+        launched[-1].append(kernel)
+        launch(self, stage, kernel, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Device, "launch", counted)
+    config = TrainConfig(strategy="adc", size="fixed", iterations=STEPS, adc=FIXED_N, eval_every=0)
+    train(make_scene(2000, 288, 256), config, tmp_path, Device(), progress=lambda _: launched.append([]))
+    for step in launched[1:-2]:  # the first prepares, and after the last the scene is finished
+        assert len(step) <= 30, step
+        assert step.count("composite_pack") == 1 and step.count("composite_bwd") == 1
+    expected = 2 * (4 + 2) if variants == "gpu" else 2 * 3  # passes of the sorts by depth and by tile
+    assert sum(kernel in ("sort_count", "sort_scatter") for kernel in launched[2]) == expected
+
+
+def test_splats_are_packed_again_where_they_are_others(device: Device) -> None:
+    first, second = (device.upload("x", [1.0, 2.0]) for _ in range(2))
+    result = device.upload("y", [3.0])
+    device.keep("test", (first, second), result)
+    assert device.kept("test", (first, second)) is result
+    assert device.kept("test", (first, first)) is None
+    assert device.kept("test", (first,)) is None
+    assert device.kept("other", (first, second)) is None
+    del first
+    assert "test" not in device._kept  # its memory is free
