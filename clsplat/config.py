@@ -83,7 +83,7 @@ class DataConfig:
     random_background: bool = False
     """Train each iteration with another background colour. Dark areas then become opaque instead of transparent in
     front of a black background. Evaluation uses `background`."""
-    masks: str | None = None
+    masks: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder of masks, named as the photos are (NAME.png or NAME.jpg.png): white pixels train, black ones do not."""
     invert_masks: bool = False
     """Invert the masks: black pixels train, white ones do not."""
@@ -299,7 +299,7 @@ class TrainConfig:
     """Iterations between two checkpoints, from which an interrupted run resumes."""
     eval_every: Annotated[int, within(least=0)] = 500
     """Iterations between two evaluations of the held-out photos for the training curve (0: none before the end)."""
-    device: str | None = None
+    device: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Part of the platform's or device's name. Default: PYOPENCL_CTX, or the first GPU, or a CPU."""
     memory_limit: Annotated[str | None, byte_size()] = None
     """Limit of device memory, such as 4GB or 512MiB (default: all memory of the device). The number of Gaussians

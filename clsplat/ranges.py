@@ -41,7 +41,7 @@ class Rule:
         raise NotImplementedError
 
     def __call__(self, default: str) -> str:
-        return f"({self.words}; default: {default})"
+        return f"({self.words})" if default == "None" else f"({self.words}; default: {default})"
 
 
 @dataclass(frozen=True)
@@ -122,12 +122,12 @@ def within(
 
 def name_in(table: str) -> Any:
     """Annotation of a field of text: the names allowed, as of `NameIn`."""
-    return tyro.conf.arg(help_behavior_hint=NameIn(table))
+    return tyro.conf.arg(help_behavior_hint=NameIn(table), metavar="NAME")
 
 
 def byte_size() -> Any:
     """Annotation of a field of text: a number of bytes."""
-    return tyro.conf.arg(help_behavior_hint=ByteSize())
+    return tyro.conf.arg(help_behavior_hint=ByteSize(), metavar="SIZE")
 
 
 def rule_of(hint: Any) -> Rule | None:
@@ -154,10 +154,14 @@ def check(settings: Any, group: str = "") -> None:
     for field in fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
         if is_dataclass(value):
-            unnamed = any(getattr(item, "name", None) == "" for item in getattr(hint, "__metadata__", ()))
-            check(value, group if unnamed else f"{group}{field.name}.")
+            check(value, group if is_unnamed(hint) else f"{group}{field.name}.")
         elif value is not field.default:
             checked(value, hint, f"--{group}{field.name}".replace("_", "-"))
+
+
+def is_unnamed(hint: Any) -> bool:
+    """Whether the options of a group are typed without the name of its field, whose annotation is `hint`."""
+    return any(getattr(item, "name", None) == "" for item in getattr(hint, "__metadata__", ()))
 
 
 def checked(value: Any, hint: Any, name: str) -> Any:

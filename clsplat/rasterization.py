@@ -1,14 +1,17 @@
-"""`rasterization`: gsplat's function of that name on OpenCL, forward only."""
+"""`rasterization`: gsplat's function of that name on OpenCL, with its gradients."""
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.camera import Camera, CameraModel
+from clsplat.constants import BLUR
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
-from clsplat.renderer import Renderer, download
+from clsplat.raster_gradients import Rasterization, RasterPass
+from clsplat.renderer import Renderer, default_device, download
 from clsplat.stages import Splats
 
 if TYPE_CHECKING:
@@ -38,8 +41,12 @@ def rasterization(
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     camera_model: Literal["pinhole", "ortho", "fisheye"] = "pinhole",
     radial_coeffs: ArrayLike | None = None,
+    near_plane: float | None = None,
+    eps2d: float = BLUR,
+    radius_clip: float = 0.0,
+    gradients: bool = False,
     device: "Device | Literal['reference'] | None" = None,
-) -> tuple[NDArray[Any], NDArray[Any], dict[str, Any]]:
+) -> Rasterization:
     """Render a batch of cameras from activated parameters, with gsplat's arguments.
 
     Parameters
@@ -74,26 +81,29 @@ def rasterization(
         As `Camera` defines them.
     radial_coeffs : (C, 4), optional
         k1 to k4 of fisheyes; default 0.
+    near_plane : float, optional
+        Depth below which nothing is drawn, world units; default: as `Camera` chooses it.
+    eps2d : float
+        Variance that is added to the splats' 2D covariances, px^2. The reference has the default only.
+    radius_clip : float
+        Splats whose half width is at most this are left out, px.
+    gradients : bool
+        Whether `Rasterization.backward` follows. True keeps on the device what it needs.
     device : Device, "reference" or None
         None takes the default OpenCL device; "reference" the float64 twins, slowly.
 
     Returns
     -------
-    render : (C, H, W, X)
-        X channels: D, 1 or D + 1, the depth last.
-    alpha : (C, H, W, 1)
-    meta : dict
-        means2d (C, N, 2), conics (C, N, 3), depths (C, N), opacities (C, N) with the compensation, radii (C, N, 2) px
-        as integers, 0 for what is not visible, tiles_per_gauss (C, N); width, height, tile_size, n_cameras.
+    Rasterization
+        The tuple (render, alpha, meta), with a method `backward`. render (C, H, W, X) has X channels: D, 1 or D + 1,
+        the depth last. alpha is (C, H, W, 1). meta is a dict of means2d (C, N, 2), conics (C, N, 3), depths (C, N),
+        opacities (C, N) with the compensation, radii (C, N, 2) px as integers, 0 for what is not visible,
+        tiles_per_gauss (C, N), and width, height, tile_size, n_cameras.
 
     Raises
     ------
     InputError
-        If shapes do not fit each other, naming the argument.
-
-    Notes
-    -----
-    For gradients, of viewmats and intrinsics too, see `clsplat.render`.
+        If shapes do not fit each other or a number is out of range, naming the argument.
     """
     means, viewmats, Ks = (np.asarray(a, dtype=np.float64) for a in (means, viewmats, Ks))
     colors = np.asarray(colors, dtype=np.float64)
@@ -109,26 +119,50 @@ def rasterization(
         raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree} (what colors hold), found {sh_degree}")
     if render_mode not in get_args(RenderMode):
         raise InputError(f"render_mode: expected {', '.join(get_args(RenderMode))}, found {render_mode!r}")
-    cameras = _cameras(viewmats, Ks, width, height, camera_model, radial_coeffs)
+    cameras = _cameras(viewmats, Ks, (width, height), camera_model, radial_coeffs, near_plane)
     channels = colors.shape[2] if sh_degree is None else 3
     behind = np.zeros((count, channels)) if backgrounds is None else np.asarray(backgrounds, dtype=np.float64)
     _check_shape("backgrounds", behind, (count, channels))
     if not np.isfinite(behind).all():
         raise InputError("backgrounds: expected finite numbers, found NaN or infinity")
 
-    renderer = Renderer(device)
-    placed = renderer.place(gaussians)
-    parts: list[tuple[NDArray[Any], NDArray[Any], dict[str, Any]]] = []
+    renderer = Renderer(device if eps2d == BLUR else _blurred(device, eps2d))
+    placed, antialiased = renderer.place(gaussians), rasterize_mode == "antialiased"
+    parts: list[tuple[RasterPass, dict[str, Any]]] = []
     for i, camera in enumerate(cameras):
-        splats = renderer.stages.project_fwd(
-            placed, camera, sh_degree or 0, antialiased=rasterize_mode == "antialiased"
-        )
-        values = colors[i] if sh_degree is None else download(splats.colors)
-        parts.append(_composited(renderer, splats, camera, values, behind[i], render_mode, tile_size))
-    renders, alphas, metas = zip(*parts, strict=True)
-    stacked: dict[str, Any] = {name: np.stack([meta[name] for meta in metas]) for name in metas[0]}
+        splats = renderer.stages.project_fwd(placed, camera, sh_degree or 0, antialiased=antialiased, channels=4)
+        splats = _clipped(renderer, splats, radius_clip)
+        values = colors[i] if sh_degree is None else download(splats.colors)[:, :3]
+        parts.append(_composited(renderer, splats, camera, values, behind[i], (render_mode, tile_size, gradients)))
+    passes = [run for run, _ in parts]
+    stacked: dict[str, Any] = {name: np.stack([meta[name] for _, meta in parts]) for name in parts[0][1]}
     stacked |= {"width": width, "height": height, "tile_size": tile_size, "n_cameras": count}
-    return np.stack(renders), np.stack(alphas), stacked
+    result = Rasterization(np.stack([run.render for run in passes]), np.stack([run.alpha for run in passes]), stacked)
+    if gradients:
+        result.remember(renderer, placed, gaussians, passes, sh_degree, antialiased)
+    return result
+
+
+def _clipped(renderer: Renderer, splats: Splats, radius_clip: float) -> Splats:
+    """The splats without those whose half widths are at most `radius_clip`, px."""
+    if not radius_clip >= 0:
+        raise InputError(f"radius_clip: expected a number, 0 or more, found {radius_clip}")
+    if radius_clip == 0:
+        return splats
+    extents = download(splats.extents)
+    kept = (extents.max(axis=1) > radius_clip)[:, None]
+    return splats._replace(extents=renderer.upload("extents", extents * kept))
+
+
+@lru_cache(maxsize=4)
+def _blurred(device: Any, eps2d: float) -> Any:
+    """A device whose kernels add `eps2d` to the 2D covariances; it is kept, since it holds the compiled kernels."""
+    if not 0 < eps2d < float("inf") or device == "reference":
+        raise InputError(f"eps2d: expected a number above 0, on the reference {BLUR}, found {eps2d}")
+    from clsplat.device import Device
+
+    device = device or default_device()
+    return Device(device.cl_device, device.real, device.memory_limit, {"BLUR": eps2d})
 
 
 def _gaussians(means: Any, scales: ArrayLike, quats: ArrayLike, opacities: ArrayLike, sh: Any) -> Gaussians:
@@ -144,7 +178,12 @@ def _gaussians(means: Any, scales: ArrayLike, quats: ArrayLike, opacities: Array
 
 
 def _cameras(
-    viewmats: NDArray[Any], Ks: NDArray[Any], width: int, height: int, model: str, radial_coeffs: ArrayLike | None
+    viewmats: NDArray[Any],
+    Ks: NDArray[Any],
+    size: tuple[int, int],
+    model: str,
+    radial_coeffs: ArrayLike | None,
+    near_plane: float | None,
 ) -> list[Camera]:
     """Cameras from gsplat's arguments."""
     count = len(viewmats)
@@ -154,17 +193,16 @@ def _cameras(
         raise InputError(f"camera_model: expected {', '.join(CAMERA_MODELS)}, found {model!r}")
     distortions = np.zeros((count, 4)) if radial_coeffs is None else np.asarray(radial_coeffs, dtype=np.float64)
     _check_shape("radial_coeffs", distortions, (count, 4))
+    if near_plane is not None and not 0 < near_plane < float("inf"):
+        raise InputError(f"near_plane: expected a depth above 0, found {near_plane}")
     return [
         Camera(
             viewmat,
-            K[0, 0],
-            K[1, 1],
-            K[0, 2],
-            K[1, 2],
-            width,
-            height,
+            *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
+            *size,
             CAMERA_MODELS[model],
             tuple(distortion.tolist()),
+            near=near_plane,
         )
         for viewmat, K, distortion in zip(viewmats, Ks, distortions, strict=True)
     ]
@@ -176,12 +214,16 @@ def _composited(
     camera: Camera,
     values: NDArray[Any],
     behind: NDArray[Any],
-    render_mode: RenderMode,
-    tile_size: int,
-) -> tuple[NDArray[Any], NDArray[Any], dict[str, Any]]:
-    """Image, alpha and meta of one camera, from the values (N, D) of the splats."""
+    options: tuple[RenderMode, int, bool],
+) -> tuple[RasterPass, dict[str, Any]]:
+    """The pass of one camera from the values (N, D) of the splats, and its part of meta.
+
+    options: render mode, tile size, and whether gradients follow.
+    """
+    render_mode, tile_size, gradients = options
     edge = max(camera.width, camera.height) if renderer.device is None else tile_size
-    bins = renderer.stages.bin_splats(splats, camera.width, camera.height, edge, gradients=False)
+    bins = renderer.stages.bin_splats(splats, camera.width, camera.height, edge, gradients=gradients)
+    channels = values.shape[1]
     values = _with_depth(values, download(splats.depths), render_mode)
     background = np.zeros(values.shape[1])
     if "RGB" in render_mode:
@@ -194,7 +236,7 @@ def _composited(
     meta = {name: download(getattr(splats, name)) for name in ("means2d", "conics", "depths", "opacities")}
     meta["radii"] = np.ceil(download(splats.extents)).astype(np.int32)
     meta["tiles_per_gauss"] = np.bincount(download(bins.gauss_ids), minlength=len(meta["depths"]))
-    return render, alpha, meta
+    return RasterPass(camera, splats, colored, bins, image, render, alpha, background, render_mode, channels), meta
 
 
 def _with_depth(values: NDArray[Any], depths: NDArray[Any], render_mode: str) -> NDArray[Any]:

@@ -31,7 +31,7 @@ LAYERS = """
     structs reference device
     ops testing formats
     renderer selftest
-    render dataset demo
+    render dataset demo raster_gradients
     rasterization pruning
     training show
     evaluate
@@ -59,7 +59,7 @@ ONLY_IN = {
     "pyopencl": {"device", "programs", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
-    "av": {"dataset"},
+    "av": {"dataset", "show"},
     "pillow_heif": {"dataset"},
     "sqlite3": set(),  # with pycolmap in the same process it causes a bus error, see COUNT_ROWS in matching.py
 }

@@ -16,7 +16,8 @@ from clsplat.training.loop import train
 GUARD = 256
 """Bytes behind each array that nothing may change."""
 
-PATTERN = 0xA5
+PATTERNS = 251
+"""Number of values of guard bytes, in turn: a kernel may copy those of one array behind another one."""
 
 
 class GuardedDevice(Device):
@@ -29,17 +30,18 @@ class GuardedDevice(Device):
 
     def _allocate(self, what, nbytes):
         block = super()._allocate(what, nbytes + GUARD)
-        cl.enqueue_fill_buffer(self.queue, block, np.uint8(PATTERN), nbytes, GUARD)
-        self.guarded.append((what, nbytes, block))  # also keeps the memory from being used again
+        value = np.uint8(1 + len(self.guarded) % PATTERNS)
+        cl.enqueue_fill_buffer(self.queue, block, value, nbytes, GUARD)
+        self.guarded.append((what, nbytes, block, value))  # also keeps the memory from being used again
         return block
 
     def overwritten(self):
         """Names of the arrays behind which something was written."""
         found = set()
-        for what, nbytes, block in self.guarded:
+        for what, nbytes, block, value in self.guarded:
             guard = np.empty(GUARD, np.uint8)
             cl.enqueue_copy(self.queue, guard, block, src_offset=nbytes)
-            if (guard != PATTERN).any():
+            if (guard != value).any():
                 found.add(what)
         return found
 

@@ -99,6 +99,8 @@ def test_every_format_is_measured():
     page = (DOCS / "formats.md").read_text()
     for suffix in formats.FORMATS:
         assert page.count(f"| `{suffix}` |") == 2, suffix  # what is kept, and what it costs
+    for suffix in (*formats.READ_ONLY, *formats.WRITE_ONLY):
+        assert page.count(f"| `{suffix}` |") == 1, suffix
 
 
 def messages():

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from clsplat.bench.workloads import DEFAULT, KNOBS_DEFAULT, Workload, from_files, scaling_names, synthetic
+from clsplat.bench.workloads import (
+    DEFAULT,
+    FRAMES_DEFAULT,
+    KNOBS_DEFAULT,
+    Workload,
+    from_files,
+    scaling_names,
+    synthetic,
+)
 from clsplat.config import UINT32_MAX, UINT64_MAX, Count, DataConfig, RenderConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.ranges import byte_size, within
@@ -74,6 +82,33 @@ class Kernels:
         return _of_files(self.scene, self.cameras, self.views, self.downscale) or [
             synthetic(name) for name in dict.fromkeys(names)
         ]
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """Time the frames of the viewer, while the camera moves and when it rests."""
+
+    workloads: tuple[str, ...] = FRAMES_DEFAULT
+    """Synthetic scenes: number of Gaussians and size of the window."""
+    frames: Count = 30
+    """Number of timed frames of each kind."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """JSON file for all results."""
+    device: str | None = None
+    """Part of the platform's or device's name."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.bench.frame_rates import bench_frames, frames_text
+        from clsplat.device import Device, select_device
+
+        _check(self.out, "--out", None)
+        device = Device(select_device(self.device))
+        _say(f"device: {device.label}")
+        workloads = [synthetic(name) for name in self.workloads]
+        results = bench_frames(workloads, device, self.frames, lambda text: _say(f"drawing: {text}"))
+        _write(self.out, results)
+        print(frames_text(results))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from clsplat.scene import View
 
 DEFAULT = ("10k-640x480", "100k-640x480", "1M-640x480", "100k-1280x720")
 KNOBS_DEFAULT = "100k-640x480"
-"""Default workloads of `clsplat bench kernels` and `clsplat bench knobs`."""
+FRAMES_DEFAULT = ("10k-640x480", "100k-640x480", "300k-640x480", "100k-1280x720")
+"""Default workloads of `clsplat bench kernels`, `clsplat bench knobs` and `clsplat bench viewer`."""
 
 SCALING_GAUSSIANS = ("10k", "30k", "100k", "300k", "1M")
 SCALING_SIZES = ("160x120", "320x240", "640x480", "1280x960", "1920x1440")

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from clsplat.commands.console import Out, moved, open_device, say
-from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
+from clsplat.commands.console import DeviceName, Out, SceneOrRun, moved, open_device, say
+from clsplat.commands.options import DrawOptions, PhotoOptions
+from clsplat.commands.run_folders import scene_file, with_run
+from clsplat.config import BACKGROUNDS
 from clsplat.errors import InputError
 from clsplat.ranges import byte_size, parse_bytes, within
 
@@ -28,10 +30,10 @@ MATCH_MIN = 15.0
 
 @dataclass(frozen=True)
 class Compact:
-    """Make a scene smaller: fewer Gaussians, fewer bands of spherical harmonics, a compact format."""
+    """Make a scene smaller, within a loss of quality or a size of the file."""
 
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
+    scene: SceneOrRun
+    """File of Gaussians, or the folder of a run."""
     out: Out
     """File to write; its suffix determines the format."""
     max_gaussians: Annotated[int | None, within(least=1)] = None
@@ -41,31 +43,36 @@ class Compact:
     max_psnr_loss: Annotated[float | None, within(above=0)] = None
     """Largest loss of PSNR, dB; the smallest file within it is chosen. The loss is measured in evaluation views,
     which do not influence what is removed."""
-    cameras: Path | None = None
+    cameras: Annotated[Path | None, tyro.conf.arg(metavar="DATASET")] = None
     """Dataset, as for `train`: the scene is compared with its own renders from the cameras of this dataset."""
-    photos: Path | None = None
-    """Dataset, as for `train`: the scene is compared with the photos of this dataset. Without --cameras and --photos,
-    viewpoints are chosen automatically."""
-    device: str | None = None
+    photos: Annotated[Path | None, tyro.conf.arg(metavar="DATASET")] = None
+    """Dataset, as for `train`: the scene is compared with the photos of this dataset. Default: the dataset of the
+    run. Without --cameras and --photos, viewpoints of a file are chosen automatically."""
+    device: DeviceName = None
     """Part of the name of the platform or device."""
-    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
-    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+    data_config: Annotated[PhotoOptions, tyro.conf.arg(name="")] = field(default_factory=PhotoOptions)
+    render: Annotated[DrawOptions, tyro.conf.arg(name="")] = field(default_factory=DrawOptions)
+
+    def base(self) -> "Compact | None":
+        """The command with the settings of its run, before flags override them; None if it has none."""
+        return with_run(self, "photos" if self.cameras is None else "cameras")
 
     def run(self) -> None:
         """Run the command."""
         from clsplat.dataset import load_scene
-        from clsplat.formats import load_gaussians, save_gaussians, suffix_of
+        from clsplat.formats import FORMATS, load_gaussians, save_gaussians, suffix_of
         from clsplat.pruning.compaction import ASSUMED_PSNR, LossMeter, compact
         from clsplat.renderer import Renderer
         from clsplat.training.memory import bytes_text
 
         limits = self._limits()
         suffix = suffix_of(self.out)
-        if not suffix or not self.out.absolute().parent.is_dir():  # checked now, not after minutes
+        if suffix not in FORMATS or not self.out.absolute().parent.is_dir():  # checked now, not after minutes
             raise InputError(f"{self.out}: expected a file of Gaussians in a folder that exists; see docs/formats.md")
         if self.cameras is not None and self.photos is not None:
             raise InputError("--cameras, --photos: expected one of them, found both; --photos has cameras as well")
-        gaussians, mode, offset = load_gaussians(self.scene)
+        source = scene_file(self.scene)
+        gaussians, mode, offset = load_gaussians(source)
         device = open_device(self.device)
         background = BACKGROUNDS[self.data_config.background]
         renderer = Renderer(device, replace(self.render, mode=mode), background)
@@ -87,7 +94,7 @@ class Compact:
 
         found = compact(gaussians, pricing, loss, limits, stored, renderer)
         save_gaussians(self.out, found.gaussians, mode, offset)
-        size = self.scene.stat().st_size if self.scene.is_file() else stored(gaussians)[1]
+        size = source.stat().st_size if source.is_file() else stored(gaussians)[1]
         say(
             f"{self.scene}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, {bytes_text(size)}\n"
             f"{self.out}: {len(found.gaussians)} Gaussians of degree {found.gaussians.sh_degree}, "

@@ -26,6 +26,18 @@ loudness: Literal["quiet", "normal", "verbose"] = "normal"
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 """Type of the flag --out, -o."""
 
+OptionalOut = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
+"""Type of the flag --out, -o, where a run folder has a place for the result."""
+
+SceneOrRun = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE|RUN")]
+"""Type of the argument that names what was trained."""
+
+DeviceName = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
+"""Type of the flag --device."""
+
+Dataset = Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[DATASET]")]
+"""Type of the argument that names a dataset, which a run folder knows."""
+
 
 def say(text: str) -> None:
     """Print a message for the user, unless -q was given."""
@@ -85,9 +97,9 @@ def moved(gaussians: "Gaussians", by: Any) -> "Gaussians":
     return replace(gaussians, means=(gaussians.means + by).astype(gaussians.means.dtype))
 
 
-def say_cameras(dataset: Path, picture: Path) -> None:
-    """Print and draw the result of structure from motion, with warnings, if clsplat recovered the cameras."""
-    from clsplat.dataset.sfm.summary import draw_cameras, preview
+def say_cameras(dataset: Path) -> None:
+    """Print the result of structure from motion, with warnings, if clsplat recovered the cameras."""
+    from clsplat.dataset.sfm.summary import preview
 
     found = preview(dataset)
     if found is None:
@@ -95,8 +107,16 @@ def say_cameras(dataset: Path, picture: Path) -> None:
     say(f"cameras: {found.summary()}")
     for warning in found.warnings():
         warn(f"warning: {warning}")
-    draw_cameras(picture, found.model)
-    say(f"cameras: drawn in {picture}")
+
+
+def picture_cameras(dataset: Path, picture: Path) -> None:
+    """Draw the result of structure from motion, if clsplat recovered the cameras."""
+    from clsplat.dataset.sfm.reconstruction import read_record
+    from clsplat.dataset.sfm.summary import draw_cameras, read_sparse
+
+    if read_record(dataset) is not None:
+        draw_cameras(picture, read_sparse(dataset / "sparse" / "0"))
+        say(f"cameras: drawn in {picture}")
 
 
 def say_scores(report: dict[str, Any], out: Path) -> None:

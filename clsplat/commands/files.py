@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from clsplat.commands import console
-from clsplat.commands.console import Out, moved, say, say_cameras
-from clsplat.config import DataConfig, Mode, SfmConfig
+from clsplat.commands.console import OptionalOut, Out, SceneOrRun, moved, picture_cameras, say, say_cameras
+from clsplat.commands.options import PageOptions
+from clsplat.commands.run_folders import scene_file, with_run
+from clsplat.config import Mode, SfmConfig
 from clsplat.errors import InputError
+from clsplat.formats.spz_container import Axes, Version
 from clsplat.ranges import within
 
 if TYPE_CHECKING:
@@ -18,9 +21,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Frames:
-    """Extract photos from a video: the sharpest frame of each interval; `train` and `sfm` match only neighbours."""
+    """Extract photos from a video: the sharpest frame of each interval."""
 
-    video: tyro.conf.Positional[Path]
+    video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
     """The video; needs the extra `video`."""
     out: Out
     """New folder for the photos."""
@@ -37,11 +40,11 @@ class Frames:
 
 @dataclass(frozen=True)
 class Sfm:
-    """Recover the cameras of a folder of photos (pycolmap); `train` does this itself if there are no cameras."""
+    """Recover the cameras of a folder of photos; `train` does this itself."""
 
-    photos: tyro.conf.Positional[Path]
+    photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")]
     """Folder of photos."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: OptionalOut = None
     """Folder for the model; default: the folder of the photos."""
     sfm: Annotated[SfmConfig, tyro.conf.arg(name="")] = field(default_factory=SfmConfig)
 
@@ -50,36 +53,57 @@ class Sfm:
         from clsplat.dataset.sfm.reconstruction import reconstruct
 
         model = reconstruct(self.photos, self.sfm, self.out, verbose=console.loudness == "verbose")
-        say_cameras(self.out or self.photos, model.parent / "cameras.png")
+        say_cameras(self.out or self.photos)
+        picture_cameras(self.out or self.photos, model.parent / "cameras.png")
         print(model)
 
 
 @dataclass(frozen=True)
 class Export:
-    """Convert a file of Gaussians to another format, or to a web page that shows the scene offline in any browser."""
+    """Convert a scene to another format, or to a web page that shows it in any browser."""
 
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
-    to: tyro.conf.Positional[Path | None] = None
+    scene: SceneOrRun
+    """File of Gaussians, or the folder of a run."""
+    to: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FILE]")] = None
     """File to write; its suffix determines the format; .html makes a web page."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: OptionalOut = None
     """Alternative to the second argument."""
-    data: Path | None = None
+    spz_version: Version = 3
+    """Version of an .spz that is written: 3, which all programs read, or 4, which is compressed by Zstandard."""
+    spz_axes: Axes | None = None
+    """Axes of the .spz that is written, or of the one that is read if none is written: right, up, back as specified,
+    or right, down, forward as in a PLY, which splat-transform writes. Default: as specified, or as the file says."""
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DATASET")] = None
     """For a web page: dataset, as for `train`. Its first photo is the first view, and its cameras determine the
-    upward direction."""
-    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
+    upward direction. Default: the dataset of the run."""
+    data_config: Annotated[PageOptions, tyro.conf.arg(name="")] = field(default_factory=PageOptions)
+
+    def base(self) -> "Export | None":
+        """The command with the settings of its run, before flags override them; None if it has none."""
+        return with_run(self)
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.formats import load_gaussians, save_gaussians
+        from clsplat.formats import load_gaussians, save_gaussians, suffix_of
+        from clsplat.formats.spz import load_spz, save_spz
 
         if (self.to is None) == (self.out is None):
             raise InputError("export: expected one file to write, as in: clsplat export scene.ply scene.spz")
         out = self.to or self.out
         assert out is not None
-        gaussians, mode, offset = load_gaussians(self.scene)
+        scene = scene_file(self.scene)
+        to_spz, from_spz = (suffix_of(path) == ".spz" for path in (out, scene))
+        if self.spz_axes is not None and not (to_spz or from_spz):
+            raise InputError(f"--spz-axes: expected an .spz to read or to write, found {scene} and {out}")
+        if from_spz and not to_spz:
+            gaussians, mode, offset = load_spz(scene, self.spz_axes)
+        else:
+            gaussians, mode, offset = load_gaussians(scene)
         if out.suffix.lower() == ".html":
             self._page(out, gaussians, mode, offset)
+        elif to_spz:
+            axes = self.spz_axes or "rub"
+            save_spz(out, gaussians, mode, offset, version=self.spz_version, axes=axes)
         else:
             save_gaussians(out, gaussians, mode, offset)
         say(f"{out}: {len(gaussians)} Gaussians, {out.stat().st_size / 1e6:.3g} MB")

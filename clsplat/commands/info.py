@@ -1,16 +1,20 @@
 """The command `info`: describe a file of Gaussians, a run or a dataset."""
 
-import json
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import numpy as np
 import tyro
 
+from clsplat.commands.run_folders import SCENE, Run, is_run, read_run
+from clsplat.config import TrainConfig
 from clsplat.errors import InputError
+from clsplat.ranges import is_unnamed
+from clsplat.training.presets import read_settings
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,11 +40,11 @@ class Info:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.formats.sog import META
+        from clsplat.formats import described_by
 
         if not self.path.exists():
             raise InputError(f"{self.path}: expected a file of Gaussians, a run or a dataset, found nothing")
-        if self.path.is_dir() and not (self.path / META).is_file():
+        if self.path.is_dir() and described_by(self.path) is None:
             lines = run_lines(self.path) if (self.path / "log.jsonl").is_file() else dataset_lines(self.path)
         else:
             lines = scene_lines(self.path)
@@ -49,11 +53,11 @@ class Info:
 
 def scene_lines(path: Path) -> list[str]:
     """Describe a file of Gaussians."""
-    from clsplat.formats import FORMATS, load_gaussians, suffix_of
+    from clsplat.formats import anatomy_of, load_gaussians, suffix_of
 
     gaussians, mode, offset = load_gaussians(path)
-    anatomy = FORMATS[suffix_of(path) or ".sog"].anatomy(path)
-    size = path.stat().st_size if suffix_of(path) else sum(anatomy.parts.values())
+    anatomy = anatomy_of(path)
+    size = path.stat().st_size if suffix_of(path) and path.is_file() else sum(anatomy.parts.values())
     low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
     first, middle, last = np.percentile(gaussians.means, [1, 50, 99], axis=0)
     rows = {
@@ -78,28 +82,57 @@ def scene_lines(path: Path) -> list[str]:
 def run_lines(folder: Path) -> list[str]:
     """Describe a folder written by `train`, whether the run is finished or not."""
     from clsplat.show.training_curve import read_log
-    from clsplat.training.presets import DATA_PATH
 
+    run = read_run(folder) if is_run(folder) else Run(None, TrainConfig())
     last = read_log(folder / "log.jsonl")[-1]
     rows = {"what": "a run of clsplat train"}
-    config = folder / "config.json"
-    if config.is_file():
-        try:
-            settings = json.loads(config.read_text(encoding="utf-8"))
-            total = f" of {int(settings['iterations']):,}"
-            rows |= {"dataset": str(settings[DATA_PATH])} if DATA_PATH in settings else {}
-        except (ArithmeticError, ValueError, KeyError, TypeError, RecursionError) as error:
-            raise InputError(f"{config}: expected the settings of a run, found {error!r}") from error
-        rows["iterations"] = f"{last['iteration']:,}{total}"
+    if run.data is not None:
+        rows["dataset"] = f"{run.data}{'' if run.data.exists() else ', missing'}"
+    total = f" of {run.config.iterations:,}" if is_run(folder) else ""
+    rows["iterations"] = f"{last['iteration']:,}{total}"
     rows["time"] = f"{last['seconds']:.0f} s"
-    if last.get("psnr") is not None:
-        rows["held-out PSNR"] = f"{last['psnr']:.2f} dB"
-    scene = folder / "scene.ply"
+    rows |= _scores(folder, last)
+    if changed := _changed(run.config, TrainConfig(iterations=run.config.iterations)):
+        rows["settings"] = " ".join(changed)
+    scene = folder / SCENE
     if not scene.is_file():
         rows["Gaussians"] = f"{last['num_gaussians']:,}"
-        rows["scene.ply"] = "none: the run is in progress or was interrupted; --resume finishes it"
+        rows[SCENE] = "none: the run is in progress or was interrupted; --resume finishes it"
         return [str(folder), *_table(rows)]
     return [str(folder), *_table(rows), "", *scene_lines(scene)]
+
+
+def _scores(folder: Path, last: Mapping[str, Any]) -> dict[str, str]:
+    """Rows of the metrics of held-out photos: those of the evaluation, or the last PSNR of the log."""
+    from clsplat.show.evaluation_page import METRICS
+
+    metrics = folder / "eval" / "metrics.json"
+    if not metrics.is_file():
+        return {} if last.get("psnr") is None else {"held-out PSNR": f"{last['psnr']:.2f} dB"}
+    mean = read_settings(metrics).get("mean")
+    if not isinstance(mean, dict):
+        raise InputError(f"{metrics}: expected the metrics of an evaluation, found no means")
+    numbers = {name: mean.get(name) for name in METRICS}
+    return {
+        f"held-out {METRICS[name][0]}": f"{value:.{METRICS[name][2]}f} {METRICS[name][1]}".rstrip()
+        for name, value in numbers.items()
+        if isinstance(value, float)
+    }
+
+
+def _changed(settings: Any, usual: Any, within: str = "") -> list[str]:
+    """Settings that differ from the usual ones, as flags."""
+    hints = get_type_hints(type(settings), include_extras=True)
+    flags: list[str] = []
+    for field in fields(settings):
+        value, other = getattr(settings, field.name), getattr(usual, field.name)
+        name = field.name.replace("_", "-")
+        if is_dataclass(value):
+            flags += _changed(value, other, within if is_unnamed(hints[field.name]) else f"{within}{name}.")
+        elif value != other:
+            flag = f"--{within}{name}" if value is not False else f"--{within}no-{name}"
+            flags.append(flag if isinstance(value, bool) else shlex.join([flag, str(value)]))
+    return flags
 
 
 def dataset_lines(path: Path) -> list[str]:

@@ -4,31 +4,47 @@ import os
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from clsplat.commands.console import Out, moved, new_folder, open_device, say, say_scores, try_folder
-from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
+from clsplat.commands.console import (
+    Dataset,
+    DeviceName,
+    OptionalOut,
+    SceneOrRun,
+    moved,
+    new_folder,
+    open_device,
+    say,
+    say_scores,
+    try_folder,
+)
+from clsplat.commands.options import CameraOptions, DrawOptions, PhotoOptions
+from clsplat.commands.run_folders import dataset_of, place_of, scene_file, with_run
+from clsplat.config import BACKGROUNDS
 from clsplat.errors import InputError
 from clsplat.ranges import within
 
 
 @dataclass(frozen=True)
 class Eval:
-    """Compare renders of a scene with the held-out photos: metrics as JSON, and a web page."""
+    """Compare a scene with its held-out photos: metrics, and a page of pictures."""
 
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
-    data: tyro.conf.Positional[Path]
-    """Dataset, as for `train`."""
-    out: Out
-    """Folder for metrics.json, index.html and the renders."""
-    device: str | None = None
+    scene: SceneOrRun
+    """File of Gaussians, or the folder of a run."""
+    data: Dataset = None
+    """Dataset, as for `train`. Default: the dataset of the run."""
+    out: OptionalOut = None
+    """Folder for metrics.json, index.html and the renders. Default: the folder `eval` of the run."""
+    device: DeviceName = None
     """Part of the name of the platform or device."""
-    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
-    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+    data_config: Annotated[PhotoOptions, tyro.conf.arg(name="")] = field(default_factory=PhotoOptions)
+    render: Annotated[DrawOptions, tyro.conf.arg(name="")] = field(default_factory=DrawOptions)
+
+    def base(self) -> "Eval | None":
+        """The command with the settings of its run, before flags override them; None if it has none."""
+        return with_run(self)
 
     def run(self) -> None:
         """Run the command."""
@@ -37,39 +53,44 @@ class Eval:
         from clsplat.formats import load_gaussians
         from clsplat.renderer import Renderer
 
-        try_folder(self.out)
-        gaussians, mode, offset = load_gaussians(self.scene)
+        data, out = dataset_of("eval", self.data), place_of(self.out, self.scene, "eval")
+        try_folder(out)
+        gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
-        scene = load_scene(self.data, self.data_config)
+        scene = load_scene(data, self.data_config)
         if not scene.test:
-            raise InputError(f"{self.data}: expected held-out photos to compare with, found none; see --test-every")
+            raise InputError(f"{data}: expected held-out photos to compare with, found none; see --test-every")
         gaussians = moved(gaussians, offset - scene.offset)
-        new_folder(self.out)
+        new_folder(out)
         background = BACKGROUNDS[self.data_config.background]
         renderer = Renderer(device, replace(self.render, mode=mode), background)
-        say_scores(evaluate(gaussians, scene.test, self.out, renderer), self.out)
+        say_scores(evaluate(gaussians, scene.test, out, renderer), out)
 
 
 @dataclass(frozen=True)
 class Render:
-    """Render a scene to PNG files: the held-out views of its dataset, or an orbit around the photographed subject."""
+    """Render a scene to PNG files: the views of its held-out photos, or an orbit."""
 
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
-    data: tyro.conf.Positional[Path]
-    """Dataset, as for `train`; its cameras are the views, or determine the orbit."""
-    out: Out
-    """Folder for the images."""
+    scene: SceneOrRun
+    """File of Gaussians, or the folder of a run."""
+    data: Dataset = None
+    """Dataset, as for `train`; its cameras are the views, or determine the orbit. Default: the dataset of the run."""
+    out: OptionalOut = None
+    """Folder for the images. Default: the folder `render` of the run."""
     path: Literal["test", "orbit"] = "test"
     """test: the held-out views (all views if none is held out). orbit: a closed path around the scene."""
     frames: Annotated[int, within(least=1)] = 60
     """Number of images of an orbit."""
     depth: bool = False
     """Also write the expected depth, as 16-bit PNG scaled to the largest depth."""
-    device: str | None = None
+    device: DeviceName = None
     """Part of the name of the platform or device."""
-    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
-    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+    data_config: Annotated[CameraOptions, tyro.conf.arg(name="")] = field(default_factory=CameraOptions)
+    render: Annotated[DrawOptions, tyro.conf.arg(name="")] = field(default_factory=DrawOptions)
+
+    def base(self) -> "Render | None":
+        """The command with the settings of its run, before flags override them; None if it has none."""
+        return with_run(self)
 
     def run(self) -> None:
         """Run the command."""
@@ -84,10 +105,11 @@ class Render:
         from clsplat.render import Rendering, render_views
         from clsplat.show.camera_paths import orbit
 
-        try_folder(self.out)
-        gaussians, mode, offset = load_gaussians(self.scene)
+        data, out = dataset_of("render", self.data), place_of(self.out, self.scene, "render")
+        try_folder(out)
+        gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
-        scene = load_scene(self.data, self.data_config)
+        scene = load_scene(data, self.data_config)
         gaussians = moved(gaussians, offset - scene.offset)
         views = scene.test or scene.train
         if self.path == "test":
@@ -96,12 +118,12 @@ class Render:
             first = scene.train[0].camera
             path = orbit([view.camera for view in scene.train], self.frames, first.width, first.height)
             cameras = {f"{i:04d}": camera for i, camera in enumerate(path)}
-        new_folder(self.out)
+        new_folder(out)
         config = replace(self.render, mode=mode)
         background = BACKGROUNDS[self.data_config.background]
 
         def write(name: str, rendering: Rendering) -> None:
-            target = (self.out / name).with_suffix(".png")
+            target = (out / name).with_suffix(".png")
             new_folder(target.parent)
             with replacing(target) as file:
                 Image.fromarray(to_uint8(rendering.rgb)).save(file, format="PNG")
@@ -122,4 +144,4 @@ class Render:
                     writing.popleft().result()
             for image in writing:
                 image.result()
-        say(f"{self.out}: {len(cameras)} images")
+        say(f"{out}: {len(cameras)} images")

@@ -1,22 +1,22 @@
 """The commands `train` and `demo`."""
 
 import shlex
-import signal
 import sys
-import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from clsplat.commands import console
 from clsplat.commands.console import (
-    STARTED,
+    DeviceName,
     Out,
     new_folder,
+    picture_cameras,
     say,
     say_cameras,
     say_scores,
@@ -24,6 +24,10 @@ from clsplat.commands.console import (
     warn,
     write_json,
 )
+from clsplat.commands.options import ServerOptions
+from clsplat.commands.progress import train_with_progress
+from clsplat.commands.run_folders import CONFIG, FRAMES
+from clsplat.commands.viewing import open_viewer
 from clsplat.config import BACKGROUNDS, UINT32_MAX, TrainConfig
 from clsplat.errors import InputError
 from clsplat.ranges import within
@@ -39,40 +43,43 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Train:
-    """Train Gaussians on photos: a folder of them, a video, a COLMAP model with its photos, or a transforms.json."""
+    """Train Gaussians on photos, a video, a COLMAP model with its photos, or a transforms.json."""
 
-    data: tyro.conf.Positional[Path]
-    """Folder of the dataset, or of photos alone; or a video, the two sharpest frames of each second of
-    which are written to the folder `frames` of OUT (`clsplat frames` takes more or fewer)."""
+    data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS|VIDEO|DATASET")]
+    """Folder of photos, with or without cameras, or a video. The two sharpest frames of each second of a video are
+    written to the folder `frames` of OUT (`clsplat frames` takes more or fewer)."""
     out: Out
     """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians, such as scene.spz, which is
     written as well; its name without the suffix becomes the folder."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
     viewer: bool = False
-    """Watch and pause the training in the browser; needs the extra `viewer`."""
+    """Watch and pause the training in the browser, as --open does; needs the extra `viewer`."""
+    server: Annotated[ServerOptions, tyro.conf.arg(name="")] = field(default_factory=ServerOptions)
     preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
     """Named settings to start from instead of the defaults; flags override them."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The config.json of an earlier run, or a part of one, to start from; flags override it."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
-    def base(self) -> TrainConfig | None:
-        """The settings of the preset or the file, before flags override them; None if neither is given."""
+    def base(self) -> "Train | None":
+        """The command with the settings of the preset or the file, before flags override them; None without them."""
         if self.preset is not None and self.config is not None:
             raise InputError("--preset and --config: expected one of them, found both")
         if self.preset is not None:
-            return load_preset(self.preset)
-        return None if self.config is None else load_config(self.config)
+            return replace(self, settings=load_preset(self.preset))
+        return None if self.config is None else replace(self, settings=load_config(self.config))
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.formats import suffix_of
+        from clsplat.formats import check_writable, suffix_of
         from clsplat.training.checkpoint import CHECKPOINT, no_checkpoint
         from clsplat.training.run_folder import held
 
         suffix = "" if self.out.is_dir() else suffix_of(self.out)
         out = self.out.with_name(self.out.name[: -len(suffix)]) if suffix else self.out
+        if suffix:
+            check_writable(self.out)
         if self.resume and not (out / CHECKPOINT).exists():
             raise no_checkpoint(out)
         with held(out):
@@ -93,13 +100,15 @@ class Train:
                 f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
             )
         try_folder(out)
-        device = open_and_name(self.settings)
-        scene, config = self.prepared(out, device)
-        viewer = open_viewer(scene, config, device) if self.viewer else None
+        viewer = open_viewer(self.server) if self.viewer or self.server.open else None
         try:
-            gaussians = train_and_report(scene, config, device, out, self.resume, viewer)
-        except KeyboardInterrupt:
-            if (out / CHECKPOINT).is_file():
+            device = open_and_name(self.settings)
+            scene, config = self.prepared(out, device, viewer)
+            gaussians = train_and_report(scene, config, device, out, self.resume, viewer, self._began(out))
+        except BaseException as error:
+            if viewer:
+                viewer.close()
+            if isinstance(error, KeyboardInterrupt) and (out / CHECKPOINT).is_file():
                 again = sys.argv[1:] + ([] if self.resume else ["--resume"])
                 warn(f"to continue: {shlex.join(['clsplat', *again])}")
             raise
@@ -108,19 +117,39 @@ class Train:
             say(f"{self.out}: {self.out.stat().st_size / 1e6:.3g} MB")
         return gaussians, viewer
 
-    def prepared(self, out: Path, device: "Device") -> "tuple[Scene, TrainConfig]":
+    def _began(self, out: Path) -> Callable[[], None]:
+        """What is left to do after the first step, for which a user waits: a picture of recovered cameras."""
+
+        def draw() -> None:
+            if not self.resume:
+                picture_cameras(self._photos(out), out / "cameras.png")
+
+        return draw
+
+    def _photos(self, out: Path) -> Path:
+        from clsplat.dataset.video import is_video
+
+        return out / FRAMES if is_video(self.data) else self.data
+
+    def prepared(self, out: Path, device: "Device", viewer: "Viewer | None") -> "tuple[Scene, TrainConfig]":
         """Prepare scene and configuration, and check that they fit the device.
 
-        The configuration is written to `out`, and the cameras are drawn there, unless a run resumes: it keeps those
-        that it was started with, and `train` compares them.
+        The configuration is written to `out`, unless a run resumes: it keeps the one that it was started with, and
+        `train` compares them.
         """
-        from clsplat.dataset.video import extract_frames, is_video
+        from clsplat.dataset.video import extract_frames
         from clsplat.training.loop import check
         from clsplat.training.preparation import prepare
 
-        data = self.data
-        if is_video(data):
-            data = out / "frames"
+        def tell(text: str) -> None:
+            say(text)
+            if viewer:
+                viewer.wait(text)
+
+        data = self._photos(out)
+        if viewer:
+            viewer.wait("reading the photos, and recovering their cameras if they have none")
+        if data != self.data:
             say(f"{data}: {extract_frames(self.data, data)} frames of {self.data.name}")
         scene, config = prepare(
             data,
@@ -128,12 +157,12 @@ class Train:
             device,
             resume=self.resume,
             verbose=console.loudness == "verbose",
-            tell=say,
+            tell=tell,
         )
         check(scene, config)
         if not self.resume:
-            write_json(out / "config.json", {DATA_PATH: str(self.data.resolve()), **asdict(config)})
-            say_cameras(data, out / "cameras.png")
+            write_json(out / CONFIG, {DATA_PATH: str(self.data.resolve()), **asdict(config)})
+            say_cameras(data)
         return scene, config
 
 
@@ -146,31 +175,26 @@ def open_and_name(config: TrainConfig) -> "Device":
     return device
 
 
-def open_viewer(scene: "Scene", config: TrainConfig, device: "Device") -> "Viewer":
-    """A viewer of a training, at its first photo."""
-    from clsplat.renderer import Renderer
-    from clsplat.show.camera_paths import first_photo
-    from clsplat.show.viewer import Viewer
-
-    if not scene.train:
-        raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
-    start = first_photo([view.camera for view in scene.train])
-    viewer = Viewer(Renderer(device, config.render, BACKGROUNDS[config.data.background]), start, scene.train)
-    say(f"viewer: open {viewer.address} in a browser")
-    return viewer
-
-
 def train_and_report(
-    scene: "Scene", config: TrainConfig, device: "Device", out: Path, resume: bool, viewer: "Viewer | None" = None
+    scene: "Scene",
+    config: TrainConfig,
+    device: "Device",
+    out: Path,
+    resume: bool,
+    viewer: "Viewer | None" = None,
+    began: Callable[[], None] = lambda: None,
 ) -> "Gaussians":
-    """Train with a progress bar; write scene.ply, the evaluation and the training curve to `out`."""
+    """Train with a progress bar; write scene.ply, the evaluation and the training curve to `out`.
+
+    `began` is called after the first step.
+    """
     from clsplat.formats import save_gaussians
     from clsplat.renderer import Renderer
     from clsplat.show.training_curve import training_curve
     from clsplat.training.outcome import failure
 
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
-    gaussians = train_with_progress(scene, config, renderer, out, resume, viewer)
+    gaussians = train_with_progress(scene, config, renderer, out, resume, viewer, began)
     save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
     say(f"{out / 'scene.ply'}: {len(gaussians)} Gaussians")
     failed = failure(gaussians, scene.train, renderer)
@@ -181,50 +205,6 @@ def train_and_report(
         say_size(scene, out)
     if scene.test:
         evaluate_held_out(gaussians, scene, config, renderer, out)
-    return gaussians
-
-
-def train_with_progress(
-    scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path, resume: bool, viewer: "Viewer | None"
-) -> "Gaussians":
-    """Train with a progress bar and, if there is one, a viewer; Ctrl-C ends it after the iteration that runs."""
-    from tqdm import tqdm
-
-    from clsplat.evaluate import mean_metrics
-    from clsplat.training.loop import train
-
-    interrupted = threading.Event()
-    facts: dict[str, str] = {}  # lines of the viewer's panel
-
-    def interrupt(*_: object) -> None:
-        interrupted.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # the second Ctrl-C does not wait
-
-    signal.signal(signal.SIGINT, interrupt)
-    with tqdm(total=config.iterations, unit="it", dynamic_ncols=True) as bar:
-
-        def progress(record: dict[str, Any]) -> None:
-            if bar.n == 0:
-                say(f"first iteration: done {time.perf_counter() - STARTED:.1f} s after the start")
-            bar.update(record["iteration"] - bar.n)
-            bar.set_postfix_str(f"loss={record['loss']:.4f}, N={record['num_gaussians']}", refresh=False)
-            if viewer:
-                facts["Iteration"] = f"{record['iteration']:,} of {config.iterations:,}"
-                facts["Gaussians"], facts["Loss"] = f"{record['num_gaussians']:,}", f"{record['loss']:.4f}"
-                viewer.tell(facts)
-                viewer.follow(record["gaussians"], interrupted.is_set)
-            if interrupted.is_set():
-                warn(f"{out}: stopped after iteration {record['iteration']}")
-                raise KeyboardInterrupt
-
-        def held_out(gaussians: "Gaussians") -> dict[str, float]:
-            means = mean_metrics(gaussians, scene.test, renderer)
-            facts["Held-out photos"] = ", ".join(f"{name.upper()} {value:.4g}" for name, value in means.items())
-            return means
-
-        evaluate = held_out if scene.test else None
-        gaussians = train(scene, config, out, renderer.device, resume=resume, evaluate=evaluate, progress=progress)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     return gaussians
 
 
@@ -266,7 +246,7 @@ class Demo:
     """Folder for everything that is made."""
     iterations: Annotated[int, within(least=1, most=UINT32_MAX)] = 1500
     """Optimisation steps."""
-    device: str | None = None
+    device: DeviceName = None
     """Part of the platform's or device's name."""
 
     def run(self) -> None:
@@ -287,7 +267,7 @@ class Demo:
         make_photos(photos)
         say("cameras: structure from motion on the photos alone")
         scene, config = prepare(photos, config, device, tell=say)
-        write_json(self.out / "config.json", asdict(config))
+        write_json(self.out / CONFIG, {DATA_PATH: photos.name, **asdict(config)})
         gaussians = train_and_report(scene, config, device, self.out, resume=False)
         renderings = render_views(gaussians, [view.camera for view in scene.test], config.render, device)
         pairs = [(view.image, rendering.rgb) for view, rendering in zip(scene.test, renderings, strict=True)]

@@ -1,55 +1,85 @@
 """The command `view`."""
 
+import webbrowser
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from clsplat.commands.console import moved, open_device, say
-from clsplat.config import BACKGROUNDS, DataConfig, RenderConfig
-from clsplat.ranges import within
+from clsplat.commands.console import DeviceName, SceneOrRun, moved, open_device, say, warn
+from clsplat.commands.options import DrawOptions, ServerOptions, ViewOptions
+from clsplat.commands.run_folders import scene_file, with_run
+from clsplat.config import BACKGROUNDS
+
+if TYPE_CHECKING:
+    from clsplat.gaussians import Gaussians
+    from clsplat.show.viewer import Viewer
 
 
 @dataclass(frozen=True)
 class View:
-    """Show a scene in the browser, rendered on this machine; needs the extra `viewer`."""
+    """Show a scene in the browser; needs the extra `viewer`."""
 
-    scene: tyro.conf.Positional[Path]
-    """File of Gaussians."""
-    data: Path | None = None
-    """Dataset, as for `train`: its cameras are shown, and a click on one moves the view there."""
-    host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 admits other machines, with the token in the printed address."""
-    port: Annotated[int, within(least=0, most=65535)] = 8080
-    """Port to listen on; if it is in use, the next free one."""
-    device: str | None = None
+    scene: SceneOrRun
+    """File of Gaussians, or the folder of a run."""
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DATASET")] = None
+    """Dataset, as for `train`: its cameras are shown, and a click on one moves the view there. Default: the dataset
+    of the run."""
+    server: Annotated[ServerOptions, tyro.conf.arg(name="")] = field(default_factory=ServerOptions)
+    device: DeviceName = None
     """Part of the name of the platform or device."""
-    data_config: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
-    render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
+    data_config: Annotated[ViewOptions, tyro.conf.arg(name="")] = field(default_factory=ViewOptions)
+    render: Annotated[DrawOptions, tyro.conf.arg(name="")] = field(default_factory=DrawOptions)
+
+    def base(self) -> "View | None":
+        """The command with the settings of its run, before flags override them; None if it has none."""
+        return with_run(self)
 
     def run(self) -> None:
         """Run the command."""
         from clsplat.dataset import load_scene
-        from clsplat.formats import load_gaussians
+        from clsplat.formats import load_gaussians, save_gaussians
         from clsplat.renderer import Renderer
         from clsplat.show.camera_paths import first_photo, overview
-        from clsplat.show.viewer import Viewer
 
-        gaussians, mode, offset = load_gaussians(self.scene)
-        device = open_device(self.device)
-        views = []
-        if self.data is not None:
-            scene = load_scene(self.data, self.data_config)
-            gaussians = moved(gaussians, offset - scene.offset)
-            views = scene.train + scene.test
-        start = first_photo([view.camera for view in views]) if views else overview(gaussians)
-        background = BACKGROUNDS[self.data_config.background]
-        renderer = Renderer(device, replace(self.render, mode=mode), background)
-        viewer = Viewer(renderer, start, views, host=self.host, port=self.port)
-        viewer.tell({"File": self.scene.name, "Gaussians": f"{len(gaussians):,}", "Device": device.label})
-        say(f"viewer: open {viewer.address} in a browser; Ctrl-C closes the viewer")
-        with suppress(KeyboardInterrupt):
-            viewer.hold(gaussians)
-        viewer.close()
+        path = scene_file(self.scene)
+        viewer = open_viewer(self.server)
+        try:
+            viewer.wait(f"reading {path.name}")
+            gaussians, mode, offset = load_gaussians(path)
+            device = open_device(self.device)
+            views = []
+            if self.data is not None:
+                viewer.wait("reading the photos")
+                scene = load_scene(self.data, self.data_config)
+                gaussians, offset = moved(gaussians, offset - scene.offset), scene.offset
+                views = scene.train + scene.test
+            start = first_photo([view.camera for view in views]) if views else overview(gaussians)
+            renderer = Renderer(device, replace(self.render, mode=mode), BACKGROUNDS[self.data_config.background])
+            edited = path.with_name(f"{path.name.removesuffix('.ply').removesuffix('.compressed')}_edited.ply")
+
+            def save(rest: "Gaussians") -> str:
+                save_gaussians(edited, rest, mode, offset)
+                return f"{edited}: {len(rest):,} Gaussians"
+
+            viewer.wait("compiling kernels")
+            viewer.show(renderer, start, views)
+            viewer.edit(gaussians, save)
+            viewer.tell({"File": path.name, "Gaussians": f"{len(gaussians):,}", "Device": device.label})
+            with suppress(KeyboardInterrupt):
+                viewer.hold(gaussians)
+        finally:
+            viewer.close()
+
+
+def open_viewer(options: ServerOptions) -> "Viewer":
+    """Start the viewer's server, report its address, and open a browser if the options say so."""
+    from clsplat.show.viewer import Viewer
+
+    viewer = Viewer(host=options.host, port=options.port)
+    say(f"viewer: open {viewer.address} in a browser")
+    if options.open and not webbrowser.open(viewer.address):
+        warn(f"--open: no browser was found; open {viewer.address} yourself")
+    return viewer

@@ -1,20 +1,23 @@
 """The anatomy of a file of Gaussians: format and version, bytes by part, comments.
 
-There is a function for each format in `clsplat.formats.FORMATS`. The functions expect files that
+There is a function for each format that `clsplat.formats` reads. The functions expect files that
 `clsplat.formats.load_gaussians` has read without an error.
 """
 
-import gzip
 import json
 import struct
+import warnings
 import zipfile
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from clsplat.formats import compressed_ply, ply, sog, splat, spz
+from clsplat.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, streamed_sog
+from clsplat.formats.axes import RIGHT_UP_BACK, turned
+from clsplat.formats.glb_container import DTYPES, WIDTHS
 from clsplat.formats.ply_container import read_header
+from clsplat.formats.spz_container import HEADER, RDF, TABLE_ROW, read_container
 
 
 @dataclass(frozen=True)
@@ -92,19 +95,81 @@ def spz_anatomy(path: Path) -> Anatomy:
     names = ("means", "opacities", "colours (sh of band 0)", "scales", "quaternions", "sh above band 0")
     data = path.read_bytes()
     zipped = data[:2] == b"\x1f\x8b"
+    header, planes = read_container(path)
     if zipped:
-        with gzip.open(path) as file:
-            data = file.read(spz.HEADER.size)
-    _, version, n, degree, bits, _, streams = spz.HEADER.unpack_from(data)
-    comments = [f"positions have {bits} fractional bits"]
-    if zipped:
-        sizes = spz.plane_sizes(n, degree, version)
+        sizes = [len(plane) for plane in planes]
     else:
-        (start,) = struct.unpack_from("<I", data, spz.HEADER.size)
-        sizes = [struct.unpack_from("<Q", data, start + 16 * i)[0] for i in range(streams)]
+        last = HEADER.unpack_from(data)[-1]
+        (start,) = struct.unpack_from("<I", data, HEADER.size)
+        sizes = [TABLE_ROW.unpack_from(data, start + TABLE_ROW.size * i)[0] for i in range(last)]
     parts = {name: size for name, size in zip(names, sizes, strict=False) if size}
     packing = "gzip" if zipped else "Zstandard"
-    return Anatomy(f"SPZ (Niantic), version {version}, {packing}", parts, packed=zipped, comments=comments)
+    comments = [f"positions have {header.bits} fractional bits", _axes(path, header.axes)]
+    return Anatomy(f"SPZ (Niantic), version {header.version}, {packing}", parts, packed=zipped, comments=comments)
+
+
+AXIS_NAMES = {"rub": "right, up, back", "rdf": "right, down, forward"}
+"""The axes of an .spz in words."""
+
+
+def _axes(path: Path, recorded: int | None) -> str:
+    """Say which axes an .spz has: those that it records, or the specified ones and what the scene suggests."""
+    if recorded:
+        words = {1: "left, down, back", 4: AXIS_NAMES["rub"], RDF: AXIS_NAMES["rdf"], 7: "left, up, forward"}
+        return f"axes recorded as {words[recorded]}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the file was read before
+        guess = spz.guessed_axes(turned(spz.load_spz(path, "rub")[0], RIGHT_UP_BACK))
+    read = f"axes not recorded, read as {AXIS_NAMES['rub']} as specified"
+    if guess is None:
+        return f"{read}; the scene does not tell"
+    if guess == "rub":
+        return f"{read}; so its level surfaces suggest"
+    return f"{read}, but its level surfaces suggest {AXIS_NAMES[guess]}: export --spz-axes {guess} reads it so"
+
+
+def glb_anatomy(path: Path) -> Anatomy:
+    document = gltf.SplatDocument(path, path.read_bytes())
+    names = {"POSITION": "means", "SCALE": "scales", "ROTATION": "quaternions", "OPACITY": "opacities"}
+    names["SH_DEGREE_0_COEF_0"] = "colours (sh of band 0)"
+    parts: Counter[str] = Counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the file was read before
+        primitives = [primitive for primitive, _ in document.primitives()]
+    for attributes in (primitive["attributes"] for primitive in primitives):
+        for name in gltf.attribute_names(attributes):
+            accessor = document.json["accessors"][attributes[name]]
+            row = WIDTHS[accessor["type"]] * DTYPES[accessor["componentType"]].itemsize
+            parts[names.get(name.rpartition(":")[2], "sh above band 0")] += accessor["count"] * row
+    parts["JSON and other data"] = max(0, path.stat().st_size - sum(parts.values()))
+    generator = document.json["asset"].get("generator")
+    comments = [f"generator: {generator}"] if generator else []
+    return Anatomy("glTF 2.0 (.glb), KHR_gaussian_splatting", dict(parts), comments=comments)
+
+
+def ksplat_anatomy(path: Path) -> Anatomy:
+    data = path.read_bytes()
+    header, sections = ksplat.read_sections(path, data)
+    names = {"means": "means", "scales": "scales", "quats": "quaternions", "rgba": "colours and opacities"}
+    names["sh"] = "sh above band 0"
+    parts: Counter[str] = Counter()
+    for section in sections:
+        for column in section.row.names or ():
+            parts[names[column]] += int(section.header["count"]) * section.row[column].itemsize
+    parts["headers, buckets and empty rows"] = len(data) - sum(parts.values())
+    kind = f".ksplat (mkkellogg), compression level {header['level']}"
+    return Anatomy(kind, {name: size for name, size in parts.items() if size})
+
+
+def streamed_sog_anatomy(path: Path) -> Anatomy:
+    folder, meta, _ = streamed_sog.read_tree(path)
+    parts: Counter[str] = Counter({streamed_sog.LOD_META: (folder / streamed_sog.LOD_META).stat().st_size})
+    names = [*meta["filenames"], *([meta["environment"]] if "environment" in meta else [])]
+    for name in dict.fromkeys(names):
+        if (folder / name).exists():  # a copy may hold the finest level only
+            parts.update(sog_anatomy(folder / name).parts)
+    levels = meta.get("lodLevels", "some")
+    return Anatomy(f"streamed SOG (PlayCanvas), {levels} levels of detail", dict(parts))
 
 
 def sog_anatomy(path: Path) -> Anatomy:

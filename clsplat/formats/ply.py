@@ -93,8 +93,23 @@ def save_ply(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
     """
     from plyfile import PlyData, PlyElement
 
-    check_storable(path, gaussians)
+    names, table = table_of(path, gaussians)
     comments = comments_of(mode, offset)
+    vertices = table.view([(name, "<f4") for name in names])[:, 0]
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
+    with replacing(path) as out:
+        ply.write(out)
+
+
+def table_of(path: str | Path, gaussians: Gaussians) -> tuple[tuple[str, ...], Array]:
+    """Make the rows of a PLY: the names of its properties, and a table (N, properties) of float32.
+
+    Raises
+    ------
+    InputError
+        If there is no Gaussian, or a value is not finite as float32.
+    """
+    check_storable(path, gaussians)
     n, k = gaussians.sh.shape[:2]
     rest = tuple(f"f_rest_{i}" for i in range(3 * (k - 1)))
     names = (*MEANS, *NORMALS, *SH0, *rest, "opacity", *LOG_SCALES, *QUATS)
@@ -114,11 +129,7 @@ def save_ply(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
                 table[:, first : first + len(group)] = values
     if not np.isfinite(table).all():
         raise not_finite(path, dict(zip(names, table.T, strict=True)))
-
-    vertices = table.view([(name, "<f4") for name in names])[:, 0]
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
-    with replacing(path) as out:
-        ply.write(out)
+    return names, table
 
 
 def _properties(path: str | Path, header: PlyHeader) -> list[str]:

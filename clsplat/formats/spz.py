@@ -1,7 +1,6 @@
 """The .spz of Niantic: planes of 8-bit and 24-bit numbers, compressed.
 
-Version 3 (gzip) is written, which all readers support; versions 2 and 4 (Zstandard) are read as well. The header is
-followed by these planes, each for all Gaussians:
+Versions 3 (gzip) and 4 (Zstandard) are written; version 2 is read as well. These planes hold all Gaussians each:
 
 * positions: 3 signed 24-bit fixed-point numbers;
 * opacities: 255 times the opacity;
@@ -11,17 +10,15 @@ followed by these planes, each for all Gaussians:
   version 2, 3 bytes xyz;
 * spherical harmonics above band 0: 128 times the coefficient, + 128; coefficient by coefficient, RGB within each.
 
-The axes of the file are right, up, back; those of a PLY are right, down, forward.
+The axes of the file are specified as right, up, back; those of a PLY are right, down, forward. Some programs, such as
+splat-transform, write the axes of a PLY unchanged and do not say so.
 Source: the description next to the implementation, https://github.com/nianticlabs/spz.
 """
 
-import gzip
 import math
-import struct
 import warnings
-import zlib
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,12 +27,11 @@ from clsplat.atomic import replacing
 from clsplat.config import Mode
 from clsplat.constants import SH_DEGREE_MAX
 from clsplat.errors import InputError
+from clsplat.formats.axes import RIGHT_UP_BACK, turned
 from clsplat.formats.codebook import PALETTE_SHARE, shared_rows
 from clsplat.formats.quantisation import (
     SQRT1_2,
-    check_expansion,
     checked,
-    file_size,
     from_smallest_three,
     logits_of,
     morton_order,
@@ -44,24 +40,21 @@ from clsplat.formats.quantisation import (
     smallest_three,
     warn_lost,
 )
-from clsplat.formats.validity import normalised, reading
+from clsplat.formats.spz_container import (
+    ANTIALIASED,
+    AXES,
+    RDF,
+    Axes,
+    Header,
+    Version,
+    plane_sizes,
+    read_container,
+    write_container,
+)
+from clsplat.formats.validity import normalised
 from clsplat.gaussians import Gaussians
 
 Array = NDArray[Any]
-
-MAGIC = 0x5053474E
-HEADER = struct.Struct("<IIIBBBB")
-"""Layout of the header: magic, version, number of Gaussians, SH degree, fractional bits, flags, 0 (in version 4 the
-number of streams)."""
-
-ANTIALIASED = 1
-"""Flag of scenes trained in the antialiased mode."""
-
-EXTENDED = 2
-"""Flag of files with vendor-specific records."""
-
-GZIP_LEVEL = 6
-"""Compression level of gzip, 1 to 9. Measurement: docs/formats.md."""
 
 SIGMA_STEPS = 5
 """Number of steps of the positions per smallest standard deviation of the median Gaussian, before it is rounded up to
@@ -77,41 +70,54 @@ SH_STEP = 4
 band 1 and 16 above, which is coarser than the coefficients of most scenes. Shared bands have steps of 1, since their
 repetitions take few bytes. Measurement: docs/formats.md."""
 
-SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""Signs by which the coefficients change when y and z change sign: the parity of the basis functions in y and z,
-which are y, z, x; xy, yz, zz, xz, xx; y, xyz, y, z, x, zxx, x."""
+LEVEL = 0.9
+"""Cosine of the angle between a Gaussian's thinnest axis and y from which it counts as part of a level surface."""
+
+SHIFT_MIN = 0.05
+"""Smallest distance of the level surfaces from the middle, in standard deviations of the heights, from which the axes
+are guessed. Four trained scenes of others have 0.13 to 0.33."""
 
 
-def load_spz(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
+def load_spz(path: str | Path, axes: Axes | None = None) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
     """Read Gaussians from an .spz file of version 2, 3 or 4.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    axes : {"rub", "rdf"}, optional
+        Axes of the file: right, up, back or right, down, forward. The default is what the file records and, if it
+        records nothing, right, up, back.
 
     Returns
     -------
     gaussians, mode, offset
-        As in `clsplat.formats.load_gaussians`. The Gaussians are in the axes of a PLY, so that y and z have the
-        opposite sign of those in the file. The format does not store the offset.
+        As in `clsplat.formats.load_gaussians`. The Gaussians are in the axes of a PLY: those of a file in right, up,
+        back have y and z of the opposite sign. The format does not store the offset.
 
     Raises
     ------
     InputError
-        If the file cannot be read, is of another format or version, is truncated, holds no Gaussian, or declares more
-        than a file of its size can hold.
+        If the file cannot be read, is of another format or version, is truncated, holds no Gaussian, declares axes
+        that clsplat does not know, or declares more than a file of its size can hold.
     """
-    with reading(path), open(path, "rb") as file:
-        head = file.read(4)
-        file.seek(0)
-        try:
-            if head[:2] == b"\x1f\x8b":
-                return _load_gzip(path, file)
-            if head == struct.pack("<I", MAGIC):
-                return _load_zstd(path, file)
-        except (EOFError, zlib.error) as error:
-            raise InputError(f"cannot read {path}: {error}; is the file truncated?") from error
-    raise InputError(f"{path}: expected an .spz file, which begins as gzip or with NGSP, found {head!r}")
+    header, planes = read_container(path)
+    gaussians = _decode(path, header, planes)
+    signs = AXES[header.axes or 0] if axes is None else AXES[RDF] if axes == "rdf" else RIGHT_UP_BACK
+    mode: Mode = "antialiased" if header.flags & ANTIALIASED else "classic"
+    return turned(gaussians, signs).astype(np.float32), mode, np.zeros(3)
 
 
-def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", offset: ArrayLike | None = None) -> None:
-    """Write Gaussians as an .spz file of version 3.
+def save_spz(
+    path: str | Path,
+    gaussians: Gaussians,
+    mode: Mode = "classic",
+    offset: ArrayLike | None = None,
+    *,
+    version: Version = 3,
+    axes: Axes = "rub",
+) -> None:
+    """Write Gaussians as an .spz file.
 
     The Gaussians are sorted along a Z-order curve, which compresses better. Those that share their bands above 0 come
     one after the other, if that is so for three on average. Largest rounding errors: positions half of 2^-b units (b:
@@ -124,6 +130,11 @@ def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
     ----------
     path, gaussians, mode, offset
         As in `clsplat.formats.save_gaussians`.
+    version : {3, 4}
+        3 is compressed by gzip, 4 by Zstandard.
+    axes : {"rub", "rdf"}
+        Axes of the file: right, up, back, as specified, or right, down, forward, as in a PLY. Version 4 records the
+        latter.
 
     Raises
     ------
@@ -131,7 +142,7 @@ def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
         If there is no Gaussian, a value is not finite as float32, a position is too large for 24 bits, or the file
         cannot be written.
     """
-    g = _turned(checked(path, gaussians))
+    g = turned(checked(path, gaussians), AXES[RDF] if axes == "rdf" else RIGHT_UP_BACK)
     g = g.take(morton_order(g.means))
     shared = shared_rows(g.sh[:, 1:].reshape(len(g), -1), len(g) // PALETTE_SHARE) if g.sh_degree else None
     if shared is not None:  # equal bands next to each other
@@ -149,10 +160,9 @@ def save_spz(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
         _sh_bytes(path, g.sh[:, 1:], SH_STEP if shared is None else 1),
     ]
     flags = ANTIALIASED if mode == "antialiased" else 0
-    with replacing(path) as out, gzip.GzipFile("", "wb", GZIP_LEVEL, out, mtime=0) as packed:
-        packed.write(HEADER.pack(MAGIC, 3, n, g.sh_degree, bits, flags, 0))
-        for plane in planes:
-            packed.write(np.ascontiguousarray(plane).tobytes())
+    header = Header(version, n, g.sh_degree, bits, flags, RDF if axes == "rdf" else None)
+    with replacing(path) as out:
+        write_container(out, header, [np.ascontiguousarray(plane).tobytes() for plane in planes])
 
 
 def fractional_bits(path: str | Path, gaussians: Gaussians) -> int:
@@ -177,92 +187,35 @@ def fractional_bits(path: str | Path, gaussians: Gaussians) -> int:
     return max(0, min(wanted, room, 23))
 
 
-def _load_gzip(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
-    size = file_size(path)
-    with gzip.GzipFile(fileobj=file) as packed:
-        header = packed.read(HEADER.size)
-        version, n, degree, bits, flags, _ = _parse_header(path, header, (2, 3))
-        sizes = plane_sizes(n, degree, version)
-        check_expansion(path, sum(sizes), size)
-        planes = [packed.read(count) for count in sizes]
-        if [len(plane) for plane in planes] != sizes:
-            raise EOFError(f"expected {sum(sizes)} bytes for {n} Gaussians, found {sum(map(len, planes))}")
-        if not flags & EXTENDED and packed.read(1):  # reading to the end also verifies the checksum
-            raise InputError(
-                f"{path}: expected {n} Gaussians as the header declares, found more bytes than they take"
-            )
-    return _decode(path, planes, (version, n, degree, bits, flags))
+def guessed_axes(gaussians: Gaussians) -> Axes | None:
+    """Guess the axes of the file of a scene, in the coordinates of that file; None if they cannot be told.
+
+    Level surfaces, which floors, tables and lawns have and ceilings rarely, lie below the rest of a scene. A
+    Gaussian counts as level if its thinnest axis is within 26 degrees of y. Weights are the largest cross-section
+    times opacity, up to the 99th percentile, since the background has few huge Gaussians.
+    """
+    scales = np.sort(gaussians.scales.astype(np.float64), axis=1)
+    weights = scales[:, 1] * scales[:, 2] * gaussians.opacities
+    weights = np.minimum(weights, np.quantile(weights, 0.99))
+    w, x, y, z = gaussians.quats.T.astype(np.float64)
+    # The second row of the rotation matrix: the y of each principal axis.
+    upward = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1)
+    thinnest = np.argmin(gaussians.log_scales, axis=1)[:, None]
+    level = weights * (np.abs(np.take_along_axis(upward, thinnest, axis=1))[:, 0] > LEVEL)
+    low, high = np.quantile(gaussians.means[:, 1], [0.02, 0.98])
+    heights = np.clip(gaussians.means[:, 1].astype(np.float64), low, high)
+    if not (level.sum() > 0 and heights.std() > 0):
+        return None
+    shift = np.average(heights, weights=level) - np.average(heights, weights=weights)
+    return None if abs(shift) < SHIFT_MIN * heights.std() else "rub" if shift < 0 else "rdf"
 
 
-def _load_zstd(path: str | Path, file: BinaryIO) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
-    """Read version 4: header of 32 bytes, vendor-specific records, table of compressed and plain sizes, planes."""
-    import zstandard
-
-    data = file.read()
-    version, n, degree, bits, flags, streams = _parse_header(path, data, (4,))
-    sizes = [size for size in plane_sizes(n, degree, version) if size]
-    check_expansion(path, sum(sizes), len(data))
-    try:
-        (start,) = struct.unpack_from("<I", data, HEADER.size)
-        table = [struct.unpack_from("<QQ", data, start + 16 * i) for i in range(streams)]
-    except struct.error as error:
-        raise EOFError("the table of streams is missing") from error
-    if [plain for _, plain in table] != sizes:
-        raise InputError(
-            f"{path}: expected streams of {sizes} bytes for {n} Gaussians of degree {degree}, "
-            f"found {[plain for _, plain in table]}"
-        )
-    planes, at = [], start + 16 * streams
-    for length, plain in table:
-        packed = data[at : at + length]
-        try:
-            # zstandard allocates the size that a frame declares, whatever max_output_size is; -1 means no
-            # declaration.
-            if zstandard.frame_content_size(packed) not in (-1, plain):
-                raise EOFError("a stream declares another size than the table of streams")
-            plane = zstandard.ZstdDecompressor().decompress(packed, max_output_size=plain)
-        except zstandard.ZstdError as error:
-            raise EOFError(str(error)) from error
-        if len(plane) != plain:
-            raise EOFError(f"a stream has {len(plane)} bytes instead of {plain}")
-        planes.append(plane)
-        at += length
-    return _decode(path, [*planes, b""][:6], (version, n, degree, bits, flags))
-
-
-def _parse_header(path: str | Path, header: bytes, versions: tuple[int, ...]) -> tuple[int, int, int, int, int, int]:
-    """Read version, number of Gaussians, SH degree, fractional bits, flags and last byte from the header."""
-    if len(header) < HEADER.size:
-        raise EOFError(f"the header has only {len(header)} bytes")
-    magic, version, n, degree, bits, flags, last = HEADER.unpack_from(header)
-    if magic != MAGIC:
-        raise InputError(f"{path}: expected an .spz file, whose header begins with NGSP, found {header[:4]!r}")
-    if version not in versions:
-        raise InputError(f"{path}: expected .spz of version 2, 3 or 4, found version {version}")
-    if n == 0:
-        raise InputError(f"{path}: expected at least one Gaussian, found none")
-    if degree > SH_DEGREE_MAX + 1 or bits > 23:
-        raise InputError(f"{path}: expected SH degree 0 to 4 and 0 to 23 fractional bits, found {degree} and {bits}")
-    if flags & EXTENDED:
-        warnings.warn(
-            f"{path}: vendor-specific records are ignored; axes are assumed to be right, up, back", stacklevel=2
-        )
-    return version, n, degree, bits, flags, last
-
-
-def plane_sizes(n: int, degree: int, version: int) -> list[int]:
-    """Compute the bytes of each plane before compression, in the order of the file."""
-    rest = 3 * ((degree + 1) ** 2 - 1)
-    return [n * width for width in (9, 1, 3, 3, 3 if version == 2 else 4, rest)]
-
-
-def _decode(
-    path: str | Path, planes: list[bytes], header: tuple[int, int, int, int, int]
-) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
-    version, n, degree, bits, flags = header
+def _decode(path: str | Path, header: Header, planes: list[bytes]) -> Gaussians:
+    """Convert planes to Gaussians in the axes of the file."""
+    n, degree = header.n, header.degree
     positions, opacities, colors, scales, quats, rest = (
         np.frombuffer(plane, np.uint8).reshape(n, size // n)
-        for plane, size in zip(planes, plane_sizes(n, degree, version), strict=True)
+        for plane, size in zip(planes, plane_sizes(n, degree, header.version), strict=True)
     )
     fixed = np.zeros((n, 3, 4), np.uint8)
     fixed[:, :, 1:] = positions.reshape(n, 3, 3)  # fills the upper 24 bits; the division by 256 below keeps the sign
@@ -271,14 +224,13 @@ def _decode(
     if degree > SH_DEGREE_MAX:
         warnings.warn(f"{path}: spherical harmonics of degree {degree} are cut to {SH_DEGREE_MAX}", stacklevel=2)
         sh = sh[:, : (SH_DEGREE_MAX + 1) ** 2]
-    gaussians = Gaussians(
-        fixed.view("<i4")[:, :, 0] / 256 / 2.0**bits,
+    return Gaussians(
+        fixed.view("<i4")[:, :, 0] / 256 / 2.0**header.bits,
         (scales.astype(np.float32) - LOG_SCALE[1]) / LOG_SCALE[0],
-        _unpack_xyz(quats) if version == 2 else _unpack(quats),
+        _unpack_xyz(quats) if header.version == 2 else _unpack(quats),
         logits_of(opacities[:, 0]),
         sh,
     )
-    return _turned(gaussians).astype(np.float32), "antialiased" if flags & ANTIALIASED else "classic", np.zeros(3)
 
 
 def _sh_bytes(path: str | Path, sh: Array, step: int) -> Array:
@@ -308,15 +260,3 @@ def _unpack_xyz(packed: Array) -> Array:
     xyz = packed / 127.5 - 1
     w = np.sqrt(np.maximum(1 - np.einsum("ni,ni->n", xyz, xyz), 0))
     return normalised(np.concatenate([w[:, None], xyz], axis=1))
-
-
-def _turned(gaussians: Gaussians) -> Gaussians:
-    """Turn a scene by 180 degrees about x: from the axes right, down, forward to right, up, back, or back again."""
-    signs = np.array([1.0, -1.0, -1.0], np.float32)
-    return Gaussians(
-        gaussians.means * signs,
-        gaussians.log_scales,
-        gaussians.quats * np.array([1.0, 1.0, -1.0, -1.0], np.float32),
-        gaussians.logit_opacities,
-        gaussians.sh * SH_SIGNS[: gaussians.sh.shape[1], None],
-    )

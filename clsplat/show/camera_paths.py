@@ -1,6 +1,7 @@
 """Camera paths and viewpoints: an orbit around the scene, and the first view that a viewer shows."""
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -84,6 +85,76 @@ def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[C
     fx = first.fx * min(width / first.width, height / first.height)
     rim = radii.mean() * (np.cos(path)[:, None] * east + np.sin(path)[:, None] * north)
     return [Camera.look_at(centre + arm + heights.mean() * up, centre, up, fx, width, height) for arm in rim]
+
+
+def around(camera: Camera, focus: Array, up: Array, frames: int) -> list[Camera]:
+    """Turn a camera once around an axis through a point, for a video that loops.
+
+    Parameters
+    ----------
+    camera : Camera
+        The first of the result.
+    focus, up : (3,)
+        Point and direction of the axis.
+    frames : int
+        Number of cameras, at least 1.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_rotvec(2 * math.pi * np.arange(frames)[:, None] / frames * up).as_matrix()
+    result = []
+    for turn in turns:
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = camera.viewmat[:3, :3] @ turn.T
+        viewmat[:3, 3] = -viewmat[:3, :3] @ (focus + turn @ (camera.position - focus))
+        result.append(replace(camera, viewmat=viewmat))
+    return result
+
+
+def through(cameras: list[Camera], frames: int, *, closed: bool = False) -> list[Camera]:
+    """Cameras on a smooth path through others, at equal intervals of time.
+
+    Parameters
+    ----------
+    cameras : list of Camera
+        At least two pinholes. Consecutive ones that are equal count as one.
+    frames : int
+        Number of cameras on the path, at least 1. The first is that of `cameras`, and so is the last unless the path
+        is closed.
+    closed : bool
+        The path returns to the first camera.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two different cameras, or no frame.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    stops = [b for a, b in zip([None, *cameras], cameras, strict=False) if a is None or not _equal(a, b)]
+    if closed:
+        stops = [*stops, stops[0]] if stops and not _equal(stops[0], stops[-1]) else stops
+    if len(stops) < 2 or frames < 1:
+        raise InputError(f"path: expected two different cameras and a frame, found {len(stops)} and {frames}")
+    times = np.arange(len(stops), dtype=np.float64)
+    at = np.linspace(0, times[-1], frames, endpoint=not closed)
+    positions = CubicSpline(
+        times, [c.position for c in stops], bc_type="periodic" if closed and len(stops) > 2 else "not-a-knot"
+    )(at)
+    turned = RotationSpline(times, Rotation.from_matrix([c.viewmat[:3, :3] for c in stops]))(at).as_matrix()
+    focals = np.interp(at, times, [c.fx for c in stops]) / stops[0].fx
+    result = []
+    for position, rotation, zoom in zip(positions, turned, focals, strict=True):
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = rotation
+        viewmat[:3, 3] = -rotation @ position
+        result.append(replace(stops[0], viewmat=viewmat, fx=stops[0].fx * zoom, fy=stops[0].fy * zoom))
+    return result
+
+
+def _equal(a: Camera, b: Camera) -> bool:
+    return bool(np.array_equal(a.viewmat, b.viewmat) and a.fx == b.fx)
 
 
 class Viewpoint(NamedTuple):

@@ -2,7 +2,8 @@
 
 On its own, viser accepts connections from the pages of any site, and its handlers trust the messages: one can open a
 public tunnel, others fill the memory or replace attributes of Python objects. Therefore this module admits only the
-viewer's own page, and only the three kinds of messages that this page sends.
+viewer's own page, and only the four kinds of messages that this page sends. A change of the panel must name an input
+and a value that the input can have.
 """
 
 import contextlib
@@ -13,7 +14,7 @@ import secrets
 import socket
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from http import HTTPStatus
 from typing import Any, Literal
@@ -32,6 +33,9 @@ from clsplat.show.browser_cameras import client_camera
 LARGEST_MESSAGE = 2**16
 """Size of the largest message that is read, bytes. A camera takes about 300, and a click names a photo, whose file
 name can have 255 characters. viser's own limit, for uploads that this viewer does not have, is 50 MiB."""
+
+Inputs = dict[str, Callable[[Any], bool]]
+"""The inputs of the panel by their identifiers: whether an input can have a value."""
 
 _LOGGER = logging.getLogger(__name__)
 """Receives what websockets says about broken connections. With its handler, nothing is printed: tracebacks would end
@@ -64,7 +68,7 @@ class _CameraMessage(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_f
 
 class _InputMessage(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True):
     uuid: str
-    updates: dict[Literal["value"], str | bool]
+    updates: dict[Literal["value"], str | bool | int | float | Vector]
     """viser sets any attribute that a message names; those of the panel only change their values."""
 
 
@@ -78,27 +82,44 @@ class _ClickMessage(msgspec.Struct, tag="SceneNodeClickMessage", forbid_unknown_
     owner: str = ""
 
 
-_DECODER = msgspec.msgpack.Decoder(_CameraMessage | _InputMessage | _ClickMessage)
+class _RectangleMessage(msgspec.Struct, tag="ScenePointerMessage", forbid_unknown_fields=True):
+    event_type: Literal["rect-select"]
+    ray_origin: Vector | None
+    ray_direction: Vector | None
+    screen_pos: tuple[tuple[float, float], tuple[float, float]]
+    modifier: str | None
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.screen_pos).all():
+            raise InputError(f"rectangle: expected finite corners, found {self.screen_pos}")
 
 
-def acceptable(message: str | bytes) -> bool:
-    """Whether a message is one that the viewer's page sends, with a camera that can be rendered."""
+_DECODER = msgspec.msgpack.Decoder(_CameraMessage | _InputMessage | _ClickMessage | _RectangleMessage)
+
+
+def acceptable(message: str | bytes, inputs: Inputs) -> bool:
+    """Whether a message is one that the viewer's page sends, with a usable camera or a possible value."""
     if isinstance(message, str):
         return False
     try:
-        _DECODER.decode(message)
+        found = _DECODER.decode(message)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return False
-    return True
+    if not isinstance(found, _InputMessage):
+        return True
+    return found.uuid in inputs and all(inputs[found.uuid](value) for value in found.updates.values())
 
 
-class _Connection(ServerConnection):
-    """A connection that ignores all other messages."""
+def _connection(inputs: Inputs) -> type[ServerConnection]:
+    """Class of connections that ignore all other messages."""
 
-    async def recv(self, decode: bool | None = None) -> Any:
-        while not acceptable(message := await super().recv(decode)):
-            pass
-        return message
+    class Connection(ServerConnection):
+        async def recv(self, decode: bool | None = None) -> Any:
+            while not acceptable(message := await super().recv(decode), inputs):
+                pass
+            return message
+
+    return Connection
 
 
 def is_loopback(host: str | None) -> bool:
@@ -142,7 +163,7 @@ def _checked(process_request: Any, token: str | None) -> Any:
 
 
 @contextlib.contextmanager
-def _checking(token: str | None) -> Iterator[list[bool]]:
+def _checking(token: str | None, inputs: Inputs) -> Iterator[list[bool]]:
     """Add the checks to a server that is started in the block; the list is empty if none was.
 
     viser 1.1 has no option for them: it passes its own arguments to `websockets.asyncio.server.serve`, and no object
@@ -152,7 +173,7 @@ def _checking(token: str | None) -> Iterator[list[bool]]:
 
     def checked_serve(handler: Any, *address: Any, process_request: Any, **options: Any) -> serve:
         started.append(True)
-        checks = {"process_request": _checked(process_request, token), "create_connection": _Connection}
+        checks = {"process_request": _checked(process_request, token), "create_connection": _connection(inputs)}
         return serve(handler, *address, **options | checks | {"max_size": LARGEST_MESSAGE, "logger": _LOGGER})
 
     with _PATCHING:
@@ -163,7 +184,7 @@ def _checking(token: str | None) -> Iterator[list[bool]]:
             websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-def start_server(host: str, port: int) -> tuple[Any, str]:
+def start_server(host: str, port: int, inputs: Inputs) -> tuple[Any, str]:
     """Start viser's server with the checks.
 
     Parameters
@@ -173,6 +194,8 @@ def start_server(host: str, port: int) -> tuple[Any, str]:
         only requests with this token are answered.
     port : int
         First port to try. If it is taken, the next free one is used.
+    inputs : dict
+        Those of the panel. The caller adds them as it makes them.
 
     Returns
     -------
@@ -194,7 +217,7 @@ def start_server(host: str, port: int) -> tuple[Any, str]:
     # A browser may leave while its frame is drawn. viser warns of the frame, which nobody misses.
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     # viser prints its own address, without the token.
-    with _checking(token) as started, contextlib.redirect_stdout(io.StringIO()):
+    with _checking(token, inputs) as started, contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label="clsplat", verbose=False)
     if not started:
         server.stop()

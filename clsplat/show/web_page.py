@@ -10,7 +10,6 @@ import html
 import json
 import math
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,9 @@ from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
 from clsplat.config import BACKGROUNDS, Background, Mode
+from clsplat.formats.axes import rotated
 from clsplat.formats.sog import save_sog
 from clsplat.gaussians import Gaussians
-from clsplat.reference.sh import sh_basis
 from clsplat.show.camera_paths import Viewpoint
 
 Array = NDArray[Any]
@@ -35,10 +34,6 @@ ANTIALIASED = "aa: url.searchParams.has('aa')"
 """Parts of the viewer's page that are replaced: its title, its content, whether the camera stands still at first
 (otherwise it circles, and soon leaves the directions of the photos), and whether opacities are those of
 Mip-Splatting."""
-
-SAMPLES = 64
-"""Number of random directions at which spherical harmonics are compared. It must exceed the 16 coefficients of degree
-3."""
 
 
 def save_page(path: str | Path, gaussians: Gaussians, mode: Mode, start: Viewpoint, background: Background) -> None:
@@ -132,28 +127,3 @@ def upright(up: Array) -> Array:
     if np.allclose(up / np.linalg.norm(up), [0, -1, 0], atol=1e-6):
         return np.eye(3)
     return np.asarray(Rotation.align_vectors([[0.0, -1.0, 0.0]], [up])[0].as_matrix())
-
-
-def rotated(gaussians: Gaussians, rotation: Array) -> Gaussians:
-    """The Gaussians in a world turned by `rotation` (3, 3), including their view dependence.
-
-    The turned colour is c'(d) = c(R^T d) for every direction d. A least-squares fit over directions finds the new
-    coefficients. The fit is exact, because the basis of each degree is closed under rotations.
-    """
-    from scipy.spatial.transform import Rotation
-
-    if np.array_equal(rotation, np.eye(3)):
-        return gaussians
-    directions = np.random.default_rng(0).normal(size=(SAMPLES, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    degree, dtype = gaussians.sh_degree, gaussians.means.dtype
-    new, old = sh_basis(directions, degree), sh_basis(directions @ rotation, degree)
-    matrix = np.linalg.lstsq(new, old, rcond=None)[0]
-    norms = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
-    turned = Rotation.from_matrix(rotation) * Rotation.from_quat(np.roll(gaussians.quats / norms, -1, axis=1))
-    return replace(
-        gaussians,
-        means=(gaussians.means @ rotation.T).astype(dtype),
-        quats=np.roll(turned.as_quat(), 1, axis=1).astype(dtype),
-        sh=np.einsum("kl,nlc->nkc", matrix, gaussians.sh).astype(dtype),
-    )

@@ -82,6 +82,51 @@ def adam_settings(
     return AdamStep(iteration, rates, config.beta1, config.beta2, config.eps, sh_degree, penalties)
 
 
+class Adam:
+    """Adam for loops of one's own, with the learning rates of training; parameters and moments stay on the device.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        What is trained; its arrays are replaced by those of the device, which `step` changes in place.
+    renderer : Renderer
+        Where the gradients come from.
+    iterations : int
+        Number of steps, over which the learning rate of the means falls.
+    extent : float
+        Scale of the scene, world units; the learning rate of the means is proportional to it.
+    config : OptimConfig
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        renderer: Renderer,
+        iterations: int,
+        extent: float = 1.0,
+        config: OptimConfig = OptimConfig(),
+    ):
+        moments = Moments.zeros(fetch(gaussians))
+        self.gaussians = renderer.place(gaussians)
+        self.iteration = 0
+        self._moments = renderer.place(moments.first), renderer.place(moments.second)
+        self._renderer, self._iterations, self._extent, self._config = renderer, iterations, extent, config
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics to be rendered next."""
+        return sh_degree_at(self.iteration + 1, self._config.sh_degree_every, self.gaussians.sh_degree)
+
+    def step(self, gradients: Gaussians) -> None:
+        """Take one step down the gradients with respect to the Gaussians, on the device or the host."""
+        degree = self.sh_degree
+        self.iteration += 1
+        progress = min(1.0, self.iteration / self._iterations)
+        settings = adam_settings(self.iteration, progress, self._extent, self._config, degree)
+        gradients = self._renderer.place(gradients)
+        self._renderer.stages.adam_step(self.gaussians, gradients, *self._moments, settings)
+
+
 class Optimizer:
     """Adam on the device, or in NumPy on the host: the same to rounding.
 

@@ -2,10 +2,11 @@
 
 ``{constants}``: table of clsplat/constants.py.
 ``{config} NAME``: table of a dataclass of clsplat/config.py.
-``{command} NAME``: output of ``clsplat NAME --help``.
+``{command} NAME``: output of ``clsplat NAME --help-all``.
 ``{presets}``: table of the settings of each preset.
 ``{bench_kernels} FILE [WORKLOAD]``: results of ``clsplat bench kernels -o FILE``, or the stages of one workload.
 ``{bench_knobs} FILE``: table of ``clsplat bench knobs -o FILE``.
+``{bench_viewer} FILE``: table of ``clsplat bench viewer -o FILE``.
 ``{bench_stability} FILE``: rows and charts that ``make bench-stability`` wrote to the folder of FILE.
 ``{bench_quality} FILE [COST]``: environment of the records of ``clsplat bench quality`` in FILE, or charts and table
 of one cost.
@@ -36,6 +37,7 @@ from sphinx.util.docutils import SphinxDirective
 from clsplat import cli, config, constants
 from clsplat.bench import captures_report, charts, quality_summary, results
 from clsplat.bench import kernel_report as report
+from clsplat.bench.frame_rates import frames_text
 from clsplat.bench.knob_report import knobs_text
 from clsplat.bench.stability import stability_report as stability
 from clsplat.ranges import rule_of
@@ -145,13 +147,13 @@ def presets_table() -> str:
 
 
 def help_text(command: str) -> str:
-    """Output of ``clsplat COMMAND --help`` on a terminal with 100 columns, without colours."""
+    """Output of ``clsplat COMMAND --help-all`` on a terminal with 100 columns, without colours."""
     text = io.StringIO()
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "100"
     try:
         with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-            cli.main([*command.split(), "--help"])
+            cli.main([*command.split(), "--help-all"])
     finally:
         os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
     return re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue())
@@ -228,6 +230,17 @@ class BenchKnobs(SphinxDirective):
         relative, path = self.env.relfn2path(self.arguments[0])
         self.env.note_dependency(relative)
         return self.parse_text_to_nodes(knobs_text(json.loads(Path(path).read_text())))
+
+
+class BenchViewer(SphinxDirective):
+    """``{bench_viewer} FILE``. The path of the file is relative to the page."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        relative, path = self.env.relfn2path(self.arguments[0])
+        self.env.note_dependency(relative)
+        return self.parse_text_to_nodes(frames_text(json.loads(Path(path).read_text())))
 
 
 class BenchStability(SphinxDirective):
@@ -328,6 +341,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("command", Command)
     app.add_directive("bench_kernels", BenchKernels)
     app.add_directive("bench_knobs", BenchKnobs)
+    app.add_directive("bench_viewer", BenchViewer)
     app.add_directive("bench_stability", BenchStability)
     app.add_directive("bench_quality", BenchQuality)
     app.add_directive("bench_captures", BenchCaptures)

@@ -364,8 +364,11 @@ def test_a_folder_is_no_scene(
     trained: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     expected = "expected a file of Gaussians, such as scene.ply, found a folder"
-    message = fails(capsys, "eval", trained, dataset, "-o", tmp_path / "eval")
-    assert message == f"clsplat: {trained}: {expected}; the scene in it is {trained / 'scene.ply'}"
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    shutil.copyfile(trained / "scene.ply", alone / "scene.ply")
+    message = fails(capsys, "eval", alone, dataset, "-o", tmp_path / "eval")
+    assert message == f"clsplat: {alone}: {expected}; the scene in it is {alone / 'scene.ply'}"
     original = tmp_path / "run" / "point_cloud" / "iteration_7000"
     original.mkdir(parents=True)
     shutil.copyfile(trained / "scene.ply", original / "point_cloud.ply")

@@ -1,6 +1,7 @@
 """The viewer, opened by the commands `view` and `train`."""
 
 # ruff: noqa: F811 (a fixture is imported and then named as an argument)
+import shutil
 import sys
 import warnings
 from pathlib import Path
@@ -52,13 +53,13 @@ def test_view_goes_to_the_photos(
     from clsplat.show.viewer import Viewer
 
     made: list[tuple[object, ...]] = []
-    start = Viewer.__init__
+    show = Viewer.show
 
-    def watched(self: Viewer, *arguments: object, **options: object) -> None:
+    def watched(self: Viewer, *arguments: object) -> None:
         made.append(arguments)
-        start(self, *arguments, **options)  # type: ignore[arg-type]
+        show(self, *arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Viewer, "__init__", watched)
+    monkeypatch.setattr(Viewer, "show", watched)
     gaussians = load_gaussians(trained / "scene.ply")[0]
     save_gaussians(tmp_path / "scene.ply", gaussians, offset=(10.0, 0.0, 0.0))  # the offset of the dataset is 0
     run("view", tmp_path / "scene.ply", "--data", dataset, "--port", 18090)
@@ -76,7 +77,7 @@ def test_train_with_a_viewer_ends_with_the_same_bits_and_stays_open(
 
     sizes: list[int] = []
     monkeypatch.setattr(Viewer, "follow", lambda self, gaussians, interrupted: sizes.append(len(gaussians)))
-    run("train", dataset, "-o", tmp_path / "out", "--viewer", *TRAIN)
+    run("train", dataset, "-o", tmp_path / "out", "--viewer", "--port", 18090, *TRAIN)
     ((facts, gaussians),) = held
     assert sizes == [200] * 20, "every iteration is shown"
     assert "20 of 20" in facts and f"{len(gaussians):,}" in facts and "PSNR" in facts
@@ -88,3 +89,61 @@ def test_a_missing_viewer_is_a_sentence(
 ) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     assert "pip install 'clsplat[viewer]'" in fails(capsys, "view", trained / "scene.ply")
+
+
+def test_view_of_a_run_has_its_cameras_and_saves_edits_beside_its_scene(
+    trained: Path, held: list[tuple[str, Gaussians]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from clsplat.show.viewer import Viewer
+
+    seen: list[object] = []
+    monkeypatch.setattr(Viewer, "edit", lambda self, gaussians, save: seen.append(save(gaussians.take(np.arange(5)))))
+    monkeypatch.setattr(Viewer, "show", lambda self, renderer, start, views: seen.append(len(views)))
+    monkeypatch.setattr(Viewer, "wait", lambda self, reason: seen.append(reason))
+    folder = Path(shutil.copytree(trained, tmp_path / "run"))
+    run("view", folder, "--port", 18090)
+    path = folder / "scene_edited.ply"
+    assert seen == ["reading scene.ply", "reading the photos", "compiling kernels", 9, f"{path}: 5 Gaussians"]
+    assert len(load_gaussians(path)[0]) == 5
+    assert (folder / "scene.ply").read_bytes() == (trained / "scene.ply").read_bytes()
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_open_opens_a_browser_also_for_a_training(
+    dataset: Path,
+    tmp_path: Path,
+    held: list[tuple[str, Gaussians]],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    found: bool,
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", lambda address: opened.append(address) or found)
+    run("train", dataset, "-o", tmp_path / "out", "--open", "--port", 18090, *TRAIN)
+    assert len(opened) == 1 and opened[0].startswith("http://127.0.0.1:180")
+    assert ("no browser was found" in capsys.readouterr().err) == (not found)
+    assert len(held) == 1
+
+
+def test_what_a_training_waits_for_is_said_before_the_first_step(
+    dataset: Path,
+    tmp_path: Path,
+    held: list[tuple[str, Gaussians]],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from clsplat.show.viewer import Viewer
+
+    steps: list[str] = []
+    monkeypatch.setattr(Viewer, "wait", lambda self, reason: steps.append(reason.split(",")[0]))
+    monkeypatch.setattr(Viewer, "show", lambda self, *_: steps.append("shown"))
+    monkeypatch.setattr(Viewer, "follow", lambda self, *_: steps.append("step"))
+    monkeypatch.setattr("clsplat.commands.train.picture_cameras", lambda *_: steps.append("picture of the cameras"))
+    run("train", dataset, "-o", tmp_path / "out", "--viewer", "--port", 18090, *TRAIN)
+    before = ["compiling kernels", "shown", "picture of the cameras"]
+    assert steps[0] == "reading the photos" and steps[-23:-20] == before
+    assert steps[-20:] == ["step"] * 20
+    said = capsys.readouterr().err
+    waits, first, bar = (said.index(text) for text in ("waiting for the first step", "first iteration: done", "1/20"))
+    assert waits < first < bar
+    assert " 0/20" not in said, "no bar, and no estimate, before the first step"

@@ -117,7 +117,7 @@ def test_a_run(gaussians, tmp_path, capsys):
     (tmp_path / "config.json").write_text("[")
     with pytest.raises(SystemExit):
         main(["info", str(tmp_path)])
-    assert "config.json: expected the settings of a run" in capsys.readouterr().err
+    assert "config.json: expected JSON" in capsys.readouterr().err
 
 
 def test_photos_and_transforms(tmp_path, capsys):

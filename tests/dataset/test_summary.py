@@ -10,7 +10,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from clsplat.camera import Camera
-from clsplat.commands.console import say_cameras
+from clsplat.commands.console import picture_cameras, say_cameras
 from clsplat.config import SfmConfig
 from clsplat.dataset.photos import photo_sharpness
 from clsplat.dataset.sfm.reconstruction import RECORD
@@ -107,7 +107,8 @@ def test_the_model_is_read(dataset):
 def test_what_was_found_is_said_and_drawn(dataset, tmp_path, capsys):
     found = preview(dataset)
     assert found.photos == [*NAMES, "d.png"]
-    say_cameras(dataset, tmp_path / "cameras.png")
+    say_cameras(dataset)
+    picture_cameras(dataset, tmp_path / "cameras.png")
     error = capsys.readouterr().err
     assert "cameras: 3 of 4 photos have a pose; 1 points" in error
     assert "no pose was found for 1 of 4 photos: d.png;" in error and "blurred compared with the others" in error
@@ -117,7 +118,8 @@ def test_what_was_found_is_said_and_drawn(dataset, tmp_path, capsys):
 
 
 def test_cameras_of_others_are_not_commented(tmp_path, capsys):
-    say_cameras(tmp_path, tmp_path / "cameras.png")
+    say_cameras(tmp_path)
+    picture_cameras(tmp_path, tmp_path / "cameras.png")
     assert capsys.readouterr().err == "" and not (tmp_path / "cameras.png").exists()
 
 

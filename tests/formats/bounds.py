@@ -47,6 +47,7 @@ BOUNDS = {
         np.ptp(g.sh[:, 0]) / 256,
         np.ptp(g.sh[:, 1:]) / 256 if g.sh_degree else 0,
     ),
+    ".glb": lambda g: (0, 1e-6, 0, 0, 0, 0),
 }
 
 # What each format stores in addition: the rendering mode, the world offset, bands of sh above 0.
@@ -56,6 +57,7 @@ HOLDS = {
     ".splat": set(),
     ".spz": {"mode", "sh"},
     ".sog": {"mode", "offset", "sh"},
+    ".glb": {"mode", "offset", "sh"},
 }
 SLACK = 1 + 1e-4
 """Factor on the bounds, in addition to 1e-6, since the arithmetic is float32."""

@@ -1,13 +1,12 @@
 """Files of other programs: trained scenes next to the project, and splat-transform in both directions."""
 
-import shutil
-import subprocess
-
 import numpy as np
 import pytest
 from bounds import BOUNDS, assert_within, matched, random_gaussians, save
+from foreign_code import splat_transform
 
 from clsplat.formats import load_gaussians
+from clsplat.formats.spz import load_spz
 
 # Formats that splat-transform reads. A .ply is not listed: its reader is compared with the other formats' readers.
 THEIRS = [".compressed.ply", ".splat", ".spz", ".sog"]
@@ -55,20 +54,9 @@ def test_two_files_of_one_scene_agree(shared):
     assert cosine.min() > 0.99999
 
 
-@pytest.fixture(scope="session")
-def splat_transform():
-    """Run PlayCanvas' converter from npm: directly, or by npx if it is installed there."""
-    for command in (["splat-transform"], ["npx", "--no-install", "splat-transform"]):
-        if shutil.which(command[0]) and subprocess.run([*command, "--version"], capture_output=True).returncode == 0:
-            return lambda *arguments: subprocess.run(
-                [*command, "-q", "-w", "-g", "cpu", *map(str, arguments)],
-                check=True,
-                capture_output=True,
-                timeout=300,
-            )
-    pytest.skip(
-        "splat-transform (npm install -g @playcanvas/splat-transform) is missing: no foreign reader to compare"
-    )
+def stored(path):
+    """The Gaussians of a file as splat-transform reads it: it takes the axes of an .spz for those of a PLY."""
+    return load_spz(path, "rdf")[0] if path.suffix == ".spz" else load_gaussians(path)[0]
 
 
 def assert_same(found, expected, quats=1e-5):
@@ -81,23 +69,23 @@ def assert_same(found, expected, quats=1e-5):
     np.testing.assert_allclose(found.quats * sign, expected.quats, atol=quats)
 
 
+@pytest.mark.foreign
 @pytest.mark.parametrize("suffix", THEIRS)
-def test_splat_transform_reads_what_we_write(splat_transform, tmp_path, suffix):
+def test_splat_transform_reads_what_we_write(tmp_path, suffix):
     gaussians = random_gaussians(3000, degree=0 if suffix == ".splat" else 3)
     path = tmp_path / f"ours{suffix}"
     save(path, gaussians)
     splat_transform(path, tmp_path / "theirs.ply")
     # It decodes the quaternions of a .splat as 127.5 q + 127.5, half a step off the original viewer.
-    assert_same(
-        load_gaussians(tmp_path / "theirs.ply")[0], load_gaussians(path)[0], 0.01 if suffix == ".splat" else 1e-5
-    )
+    assert_same(load_gaussians(tmp_path / "theirs.ply")[0], stored(path), 0.01 if suffix == ".splat" else 1e-5)
 
 
+@pytest.mark.foreign
 @pytest.mark.parametrize(
     ("suffix", "options"),
     [(".spz", ["--spz-version", 3]), (".spz", ["--spz-version", 4]), (".compressed.ply", []), (".sog", ["-i", 2])],
 )
-def test_we_read_what_splat_transform_writes(splat_transform, tmp_path, suffix, options):
+def test_we_read_what_splat_transform_writes(tmp_path, suffix, options):
     gaussians = random_gaussians(1500, degree=3)
     np.maximum(
         gaussians.logit_opacities, -4, out=gaussians.logit_opacities
@@ -105,7 +93,7 @@ def test_we_read_what_splat_transform_writes(splat_transform, tmp_path, suffix, 
     save(tmp_path / "ours.ply", gaussians)
     path = tmp_path / f"theirs{suffix}"
     splat_transform(*options, tmp_path / "ours.ply", path)
-    found = load_gaussians(path)[0]
+    found = stored(path)
     splat_transform(path, tmp_path / "again.ply")
     assert_same(found, load_gaussians(tmp_path / "again.ply")[0])
     # It rounds down where we round to nearest, positions of .spz to 1/4096; its codebooks and palette have no bound.

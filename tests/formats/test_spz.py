@@ -7,10 +7,12 @@ import warnings
 import numpy as np
 import pytest
 import zstandard
+from bounds import BOUNDS, assert_within, matched, random_gaussians
+from foreign_code import read_spz, write_spz
 
 from clsplat.errors import InputError
-from clsplat.formats import quantisation
-from clsplat.formats.spz import fractional_bits, load_spz, save_spz
+from clsplat.formats import anatomy_of, quantisation
+from clsplat.formats.spz import fractional_bits, guessed_axes, load_spz, save_spz
 from clsplat.gaussians import Gaussians
 
 HALF = 0.5**0.5
@@ -232,3 +234,116 @@ def test_a_bomb_is_refused_before_it_unfolds(tmp_path, monkeypatch):
     monkeypatch.setattr(quantisation, "EXPANSION_FREE", 1 << 10)
     with pytest.raises(InputError, match="exhaust memory"):
         load_spz(path)
+
+
+def axes_record(axes):
+    return struct.pack("<III", 0xADBE0003, 4, axes)
+
+
+OTHER = struct.pack("<II", 0x12340001, 3) + b"abc"
+
+
+@pytest.mark.parametrize(
+    ("axes", "signs"), [(0, (1, -1, -1)), (1, (-1, 1, -1)), (4, (1, -1, -1)), (6, (1, 1, 1)), (7, (-1, -1, 1))]
+)
+def test_recorded_axes_are_obeyed(tmp_path, axes, signs):
+    """In version 4 before the table, in version 3 after the planes; after another vendor's record, too."""
+    path = tmp_path / "a.spz"
+    streams = [POSITION, OPACITY, COLORS, SCALES, ROTATION, REST]
+    for content in (
+        version4(streams, flags=2, extension=OTHER + axes_record(axes)),
+        gzip.compress(header(flags=2) + BODY + OTHER + axes_record(axes)),
+    ):
+        path.write_bytes(content)
+        np.testing.assert_allclose(load_spz(path)[0].means, [np.array([1.5, -2, 0.25]) * signs])
+        np.testing.assert_allclose(load_spz(path, "rdf")[0].means, [[1.5, -2, 0.25]])
+        np.testing.assert_allclose(load_spz(path, "rub")[0].means, [[1.5, 2, -0.25]])
+
+
+@pytest.mark.parametrize("axes", [2, 9, 2**32 - 1])
+def test_axes_that_are_not_read(tmp_path, axes):
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(header(flags=2) + BODY + axes_record(axes)))
+    with pytest.raises(InputError, match=f"found axes {axes} of SPZ_ADOBE_coordinate_system"):
+        load_spz(path)
+
+
+@pytest.mark.parametrize("records", [OTHER, OTHER[:9], b"", axes_record(6)[:-1]])
+def test_records_without_axes_are_ignored(tmp_path, records):
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(header(flags=2) + BODY + records))
+    with pytest.warns(UserWarning, match="vendor-specific records are ignored"):
+        expect(load_spz(path)[0])
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("axes", ["rub", "rdf"])
+@pytest.mark.parametrize("degree", [0, 2])
+def test_versions_and_axes_hold_the_same(tmp_path, version, axes, degree):
+    path = tmp_path / "a.spz"
+    gaussians = random_gaussians(200, degree)
+    save_spz(path, gaussians, "antialiased", version=version, axes=axes)
+    recorded = (version, axes) == (4, "rdf")
+    found, mode, _ = load_spz(path) if recorded else load_spz(path, axes)
+    assert mode == "antialiased"
+    assert_within(matched(found, gaussians), gaussians, BOUNDS[".spz"](gaussians))
+    assert path.read_bytes()[:4] == (b"NGSP" if version == 4 else b"\x1f\x8b\x08\x00")
+    text = "axes recorded as right, down, forward" if recorded else "axes not recorded"
+    assert text in anatomy_of(path).comments[1]
+
+
+def room(up):
+    """A floor and a table, and above them shapes without a level; `up` is the sign of y upwards."""
+    rng = np.random.default_rng(0)
+    means = rng.uniform(-1, 1, (900, 3))
+    means[:, 1] *= up
+    means[:400, 1] = -up
+    log_scales = np.full((900, 3), -3.0)
+    log_scales[:400, 1] = -6
+    quats = rng.normal(size=(900, 4))
+    quats[:400] = [1, 0, 0, 0]
+    return Gaussians(means, log_scales, quats, np.full(900, 2.0), np.zeros((900, 1, 3))).astype(np.float32)
+
+
+def test_axes_are_guessed_from_level_surfaces(tmp_path):
+    path = tmp_path / "a.spz"
+    assert guessed_axes(room(1)) == "rub" and guessed_axes(room(-1)) == "rdf"
+    tilted = room(1)
+    tilted.means[:, [0, 1]] = tilted.means[:, [1, 0]]
+    assert guessed_axes(tilted) is None and guessed_axes(room(1).take(np.arange(3))) is None
+    for axes, text in {
+        "rub": "axes not recorded, read as right, up, back as specified; so its level surfaces suggest",
+        "rdf": "but its level surfaces suggest right, down, forward: export --spz-axes rdf reads it so",
+    }.items():
+        save_spz(path, room(-1), axes=axes)
+        assert text in anatomy_of(path).comments[1]
+
+
+@pytest.mark.foreign
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("axes", ["rub", "rdf"])
+def test_the_library_of_niantic_reads_what_we_write(tmp_path, version, axes):
+    path = tmp_path / "a.spz"
+    gaussians = random_gaussians(2000, 3)
+    save_spz(path, gaussians, "antialiased", version=version, axes=axes)
+    theirs, found = read_spz(path)
+    ours = load_spz(path)[0]  # axes that are not recorded are those of the specification for both
+    assert found["antialiased"] and found["axes"] == ([6] if (version, axes) == (4, "rdf") else [])
+    np.testing.assert_allclose(theirs.means, ours.means, atol=1e-6)
+    np.testing.assert_allclose(theirs.log_scales, ours.log_scales, atol=1e-6)
+    np.testing.assert_allclose(theirs.sh, ours.sh, atol=1e-6)
+    assert np.abs(np.einsum("ni,ni->n", theirs.quats, ours.quats)).min() > 1 - 1e-6
+    finite = np.isfinite(theirs.logit_opacities)  # infinite ones are not in the JSON
+    np.testing.assert_allclose(theirs.opacities[finite], ours.opacities[finite], atol=1e-6)
+
+
+@pytest.mark.foreign
+@pytest.mark.parametrize("version", [3, 4])
+def test_we_read_what_the_library_of_niantic_writes(tmp_path, version):
+    path = tmp_path / "a.spz"
+    gaussians = random_gaussians(2000, 3)
+    write_spz(gaussians, path, version)
+    means, *others, sh = BOUNDS[".spz"](gaussians)
+    # It has 12 fractional bits, and rounds down where we round to nearest.
+    bounds = (max(means, 1 / 4096), *(2 * bound for bound in others), 2 * sh)
+    assert_within(load_spz(path)[0], gaussians, bounds)

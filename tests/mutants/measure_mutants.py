@@ -24,7 +24,7 @@ from sites import Mutant, drawn
 
 ROOT = Path(__file__).resolve().parents[2]
 
-NOT_MEASURED = ("cl/roof.cl", "cl/power.h", "clsplat/ops/__init__.py")
+NOT_MEASURED = ("cl/roof.cl", "clsplat/ops/__init__.py")
 """Files without mathematics of the method: kernels that measure a device, and a list of the stages."""
 
 PROCESSOR_SECONDS = 900
@@ -33,11 +33,18 @@ PROCESSOR_SECONDS = 900
 NO_TESTS = 3
 """Exit status of a process in which pytest itself has failed."""
 
-WHOLE = ("tests/test_gold.py", "tests/test_render.py", "tests/training/test_loop.py", "tests/training/test_resume.py")
+WHOLE = (
+    "tests/test_bounds.py",
+    "tests/test_gold.py",
+    "tests/test_render.py",
+    "tests/training/test_loop.py",
+    "tests/training/test_resume.py",
+)
 """Tests of the whole renderer and of training, for mutants that the tests of their file do not see."""
 
 PROJECT = ("tests/test_project.py", "tests/test_lens.py", "tests/test_project_degenerate.py")
 COMPOSITE = ("tests/test_composite.py", "tests/test_composite_gpu.py", "tests/test_composite_sorted.py")
+REMOVAL = ("tests/test_removal.py",)
 TESTS: dict[str, tuple[str, ...]] = {
     "common": ("tests/test_composite.py", *PROJECT),
     "composite": COMPOSITE,
@@ -46,10 +53,16 @@ TESTS: dict[str, tuple[str, ...]] = {
     "composite_gpu": COMPOSITE[1:2],
     "composite_sorted": COMPOSITE[2:],
     "composite_splats": COMPOSITE,
+    "composite_tiles": (*COMPOSITE[:2], *REMOVAL),
     "ellipse": ("tests/test_bin.py", *COMPOSITE[:1]),
+    "lanes": PROJECT,
     "lens": PROJECT,
     "linalg": PROJECT,
+    "power": (*COMPOSITE[:1], *PROJECT[:1]),
     "project": PROJECT,
+    "removal_cpu": REMOVAL,
+    "removal_gpu": REMOVAL,
+    "removal_sums": REMOVAL,
     "sh": PROJECT,
     "structs": PROJECT,
     "philox": ("tests/test_noise.py", "tests/test_dropout.py"),

@@ -3,6 +3,7 @@
 import ast
 from pathlib import Path
 
+import measure_mutants
 import pytest
 from sites import drawn, mutants
 
@@ -83,3 +84,9 @@ def test_draws_are_spread_over_files_and_repeat(tmp_path: Path, count: int) -> N
     assert len(set(chosen)) == len(chosen)
     assert {m.path for m in chosen} == {"a.cl", "b.cl"}
     assert count == 5 or len(chosen) == 24
+
+
+def test_every_measured_file_has_tests() -> None:
+    for path in measure_mutants.measured_files():
+        for test in measure_mutants.tests_of(path.relative_to(measure_mutants.ROOT).as_posix()):
+            assert (measure_mutants.ROOT / test).is_file(), f"{path}: {test}"

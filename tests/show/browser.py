@@ -55,6 +55,36 @@ class Page:
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
+    def open_tab(self, name: str) -> None:
+        """Open a tab of the panel."""
+        find = f"[...document.querySelectorAll('[role=tab]')].find(t => t.innerText.trim() == {name!r})"
+        wait_for(lambda: self.evaluate(f"Boolean({find})"), f"the tab {name}")
+        box = f"(() => {{ const b = {find}.getBoundingClientRect(); return [b.x + b.width / 2, b.y + 9]; }})()"
+
+        def opened() -> bool:
+            if self.evaluate(f"{find}.ariaSelected") != "true":
+                self.click(*self.evaluate(box))  # again, in case the page was busy
+                time.sleep(1)
+            return self.evaluate(f"{find}.ariaSelected") == "true"
+
+        wait_for(opened, f"the open tab {name}")
+
+    def press(self, label: str) -> None:
+        """Click the button with a label."""
+        find = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {label!r})"
+        wait_for(lambda: self.evaluate(f"Boolean({find})"), f"the button {label}")
+        self.evaluate(f"{find}.click()")
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], *, shift: bool = False) -> None:
+        """Drag with the left button from one place to another."""
+        held = {"modifiers": 8 if shift else 0, "button": "left"}
+        points = np.linspace(start, end, 6).tolist()
+        events = [("mouseMoved", start), ("mousePressed", start), *(("mouseMoved", p) for p in points)]
+        for kind, (x, y) in [*events, ("mouseReleased", end)]:
+            pressed = {"buttons": 1, "clickCount": 1} if kind != "mouseReleased" else {"clickCount": 1}
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **held, **pressed)
+            time.sleep(0.1)  # the page follows the pointer from frame to frame
+
     def click(self, x: float, y: float) -> None:
         """Press and release the left button."""
         where = {"x": x, "y": y, "button": "left", "clickCount": 1}

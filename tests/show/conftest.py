@@ -13,6 +13,7 @@ def viewer(device):
     """A viewer of five cameras. A test adds its clients."""
     pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
     cams = cameras()[1]
-    result = Viewer(Renderer(device), first_photo(cams), views_of(cams), port=18080)
+    result = Viewer(port=18080)
+    result.show(Renderer(device), first_photo(cams), views_of(cams))
     yield result
     result.close()

@@ -88,7 +88,8 @@ def soak(minutes: float, out: Path) -> dict[str, Any]:
         clients that the viewer still held at the end.
     """
     device, cams = Device(), cameras()[1]
-    viewer = Viewer(Renderer(device), first_photo(cams), views_of(cams), port=18080)
+    viewer = Viewer(port=18080)
+    viewer.show(Renderer(device), first_photo(cams), views_of(cams))
     came: set[int] = set()
     samples: list[tuple[float, float, int]] = []
     trainings, started = 0, time.monotonic()

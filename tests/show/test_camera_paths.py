@@ -1,12 +1,15 @@
 """The point that the cameras look at, the path around it, and viewpoints of scenes without cameras."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from clsplat.camera import Camera, focus_point
 from clsplat.errors import InputError
 from clsplat.pruning.viewpoints import STATIONS, surround
-from clsplat.show.camera_paths import first_photo, orbit, overview
+from clsplat.show.camera_paths import around, first_photo, orbit, overview, through
 from clsplat.testing import synthetic_scene
 
 TARGET = np.array([1.0, -2.0, 3.0])
@@ -212,3 +215,46 @@ def test_first_photo_is_the_first_camera_with_the_mean_up_direction():
     np.testing.assert_allclose(focus, 0, atol=1e-9)
     assert np.linalg.norm(found) == pytest.approx(1)
     assert found @ up / np.linalg.norm(up) > 0.98
+
+
+class TestThrough:
+    def stops(self):
+        return [
+            replace(Camera.look_at((3 * np.sin(a), -1, 3 * np.cos(a)), (0, 0, 0), (0, -1, 0), 40 + a, 64, 48))
+            for a in (0.0, 1.0, 2.5, 4.0)
+        ]
+
+    def test_it_meets_each_camera_at_equal_intervals(self):
+        stops = self.stops()
+        path = through(stops, 31)
+        assert len(path) == 31
+        for stop, camera in zip(stops, path[::10], strict=True):
+            np.testing.assert_allclose(camera.viewmat, stop.viewmat, atol=1e-9)
+            assert camera.fx == pytest.approx(stop.fx)
+        steps = [np.linalg.norm(b.position - a.position) for a, b in pairwise(path)]
+        assert max(steps) < 3 * np.median(steps), "no jump"
+
+    def test_a_closed_path_returns(self):
+        path = through(self.stops(), 40, closed=True)
+        np.testing.assert_allclose(path[0].viewmat, self.stops()[0].viewmat, atol=1e-9)
+        gap = np.linalg.norm(path[-1].position - path[0].position)
+        assert 0 < gap < 3 * np.linalg.norm(path[1].position - path[0].position)
+
+    def test_equal_neighbours_count_once_and_one_camera_is_no_path(self):
+        first, second, *_ = self.stops()
+        assert len(through([first, first, second], 5)) == 5
+        for cameras, frames in (([first, first], 5), ([first, second], 0)):
+            with pytest.raises(InputError, match="two different cameras"):
+                through(cameras, frames)
+
+
+def test_around_keeps_the_distance_and_the_height():
+    camera = Camera.look_at((2, -1, 0), (0, 0, 0), (0, -1, 0), 50, 64, 48)
+    path = around(camera, np.zeros(3), np.array([0.0, -1, 0]), 8)
+    np.testing.assert_allclose(path[0].viewmat, camera.viewmat, atol=1e-12)
+    centres = np.array([c.position for c in path])
+    np.testing.assert_allclose(centres[:, 1], -1)
+    np.testing.assert_allclose(np.linalg.norm(centres, axis=1), np.sqrt(5))
+    np.testing.assert_allclose(centres[4], [-2, -1, 0], atol=1e-12)
+    for c in path:  # each looks at the focus
+        np.testing.assert_allclose((c.viewmat @ [0, 0, 0, 1])[:2], 0, atol=1e-12)

@@ -94,7 +94,8 @@ class TestToken:
     def opened(self, device):
         """A viewer that other machines reach, and the way to it by 127.0.0.1."""
         cams = cameras()[1]
-        result = Viewer(Renderer(device), first_photo(cams), views_of(cams), host="0.0.0.0", port=18080)
+        result = Viewer(host="0.0.0.0", port=18080)
+        result.show(Renderer(device), first_photo(cams), views_of(cams))
         yield result, f"http://127.0.0.1:{result._server.get_port()}"
         result.close()
 
@@ -117,7 +118,7 @@ class TestToken:
         assert status(here, "/") == status(here, "/index.html") == 403
 
     def test_every_server_has_another(self, opened, device):
-        second = Viewer(Renderer(device), first_photo(cameras()[1]), [], host="0.0.0.0", port=18080)
+        second = Viewer(host="0.0.0.0", port=18080)
         second.close()
         assert second.address.rpartition("/")[2] != opened[0].address.rpartition("/")[2]
 
@@ -130,7 +131,7 @@ def test_a_server_that_cannot_be_checked_is_not_started(monkeypatch):
     server = SimpleNamespace(stop=lambda: stopped.append(True))
     monkeypatch.setattr(viser, "ViserServer", lambda **_: server)
     with pytest.raises(InputError, match=r"viser: expected a version whose connections can be checked"):
-        start_server("127.0.0.1", 18080)
+        start_server("127.0.0.1", 18080, {})
     assert stopped
 
 
@@ -143,7 +144,7 @@ def test_websockets_is_as_before(viewer):
 @pytest.mark.parametrize("host", ["192.0.2.1", "no.such.host.invalid"])
 def test_an_address_of_another_machine_is_a_sentence(host):
     with pytest.raises(InputError, match=f"--host: cannot listen on '{host}'"):
-        start_server(host, 18080)
+        start_server(host, 18080, {})
 
 
 NAN, INF = float("nan"), float("inf")
@@ -176,7 +177,7 @@ class TestCameras:
         names = ("wxyz", "position", "fov", "image_width", "image_height")
         with pytest.raises(InputError):
             client_camera(*(values[name] for name in names))
-        assert acceptable(camera_message()) and not acceptable(camera_message(**changes))
+        assert acceptable(camera_message(), {}) and not acceptable(camera_message(**changes), {})
 
     @pytest.mark.parametrize(
         "size", [(LARGEST_EDGE, LARGEST_EDGE), (LARGEST_EDGE, 1), (5120, 2880), (1, LARGEST_EDGE)]
@@ -203,11 +204,14 @@ class TestMessages:
             _messages.ViewerCameraMessage((1, 0, 0, 0), (0, 0, 0), 1.0, 0.1, 10.0, 48, 64, (0, 0, 1), (0, 1, 0)),
             _messages.GuiUpdateMessage("5", {"value": "depth"}),
             _messages.GuiUpdateMessage("5", {"value": True}),
+            _messages.GuiUpdateMessage("5", {"value": 2}),
+            _messages.GuiUpdateMessage("5", {"value": [0.1, 2, 3]}),
+            _messages.ScenePointerMessage("rect-select", None, None, ((0.1, 0.2), (0.5, 0.9)), "shift"),
             _messages.SceneNodeClickMessage("/cameras/1.png", None, (0, 0, 0), (0, 0, 1), (0.5, 0.5), None),
         ],
     )
     def test_those_of_visers_page_are_read(self, message):
-        assert acceptable(msgspec.msgpack.encode(message.as_serializable_dict()))
+        assert acceptable(msgspec.msgpack.encode(message.as_serializable_dict()), {"5": lambda value: True})
 
     @pytest.mark.parametrize(
         "message",
@@ -230,11 +234,11 @@ class TestMessages:
         ids=str,
     )
     def test_others_are_not(self, message):
-        assert not acceptable(msgspec.msgpack.encode(message))
+        assert not acceptable(msgspec.msgpack.encode(message), {"5": lambda value: True})
 
     def test_nor_is_what_is_no_message(self):
-        assert not acceptable("text") and not acceptable(b"") and not acceptable(b"\xa1\xff")
-        assert not acceptable(b"\x91" * 50_000), "nested too deeply"
+        assert not acceptable("text", {}) and not acceptable(b"", {}) and not acceptable(b"\xa1\xff", {})
+        assert not acceptable(b"\x91" * 50_000, {}), "nested too deeply"
 
     @pytest.mark.parametrize(
         "changes",
@@ -242,7 +246,7 @@ class TestMessages:
         ids=str,
     )
     def test_nor_cameras_that_viser_cannot_move(self, changes):
-        assert not acceptable(camera_message(**changes))
+        assert not acceptable(camera_message(**changes), {})
 
     def test_nonsense_leaves_the_connection_open(self, viewer):
         with connect(**own(viewer.address)) as socket_:
@@ -268,10 +272,27 @@ class TestMessages:
             other.send(camera_message())
             wait_for(lambda: viewer._clients, "the other client")
 
-    def test_an_unknown_mode_is_ignored(self, viewer):
-        (show,) = (h for h in viewer._server.gui._gui_input_handle_from_uuid.values() if h.value == "render")
-        for value, mode in (("nonsense", "render"), ("alpha", "alpha")):
-            show._impl.value = value  # as viser sets it when the message arrives
-            for callback in show._impl.update_cb:
-                callback(None)
-            assert viewer._mode == mode
+    def test_inputs_take_only_the_values_that_they_can_have(self, viewer, capfd):
+        viewer.edit(cameras()[0], lambda gaussians: "saved")
+        handles = dict(viewer._server.gui._gui_input_handle_from_uuid)
+        # Every input has a rule, so that a new one cannot be forgotten.
+        assert handles.keys() == viewer._panel._inputs.keys()
+        before = {uuid: handle.value for uuid, handle in handles.items()}
+        hostile = ["nonsense", "x" * 5000, -1, 2**40, 1e30, NAN, INF, [NAN, 0, 0], [-1, 300, 1e9], [1e30, 1, 1]]
+        with connect(**own(viewer.address)) as socket_:
+            socket_.send(camera_message())
+            wait_for(lambda: viewer._clients, "the client")
+            (client,) = viewer._clients.values()
+            seen = client.camera
+            for uuid in [*handles, "unknown"]:
+                for value in hostile:
+                    message = {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}}
+                    socket_.send(msgspec.msgpack.encode(message))
+            show = next(uuid for uuid, handle in handles.items() if handle.value == "render")
+            message = {"type": "GuiUpdateMessage", "uuid": show, "updates": {"value": "normals"}}
+            socket_.send(msgspec.msgpack.encode(message))
+            socket_.send(camera_message(position=[1, 2, 3]))
+            wait_for(lambda: client.camera is not seen, "the camera after the nonsense")
+        assert {uuid: handle.value for uuid, handle in handles.items()} == before | {show: "normals"}
+        assert viewer._look.look().mode == "normals"
+        assert "Traceback" not in capfd.readouterr().err

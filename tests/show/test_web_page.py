@@ -16,10 +16,11 @@ from clsplat.camera import Camera
 from clsplat.cli import main
 from clsplat.config import RenderConfig
 from clsplat.formats import load_gaussians, save_gaussians
+from clsplat.formats.axes import rotated
 from clsplat.metrics import psnr, to_uint8
 from clsplat.render import render
 from clsplat.show.camera_paths import Viewpoint, overview
-from clsplat.show.web_page import VENDOR, rotated, save_page, upright
+from clsplat.show.web_page import VENDOR, save_page, upright
 from clsplat.testing import synthetic_scene
 
 WINDOW = (480, 360)

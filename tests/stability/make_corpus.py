@@ -1,6 +1,7 @@
 """Write the corpus that fuzzing starts from; found cases stay.
 
-Run it as ``PYTHONPATH=.:tests:tests/dataset python tests/stability/make_corpus.py`` from the root of the project.
+Run it from the root of the project as
+``PYTHONPATH=.:tests:tests/dataset:tests/formats python tests/stability/make_corpus.py``.
 The files come from clsplat's own writers and those of its tests; the pictures cover the kinds that Pillow writes.
 """
 
@@ -16,12 +17,15 @@ from mutations import packed
 from PIL import Image, PngImagePlugin
 from readers import CHECKPOINT_CONFIG, CORPUS, READERS
 from test_colmap import write_bin, write_txt
+from test_ksplat import scene as ksplat_scene
 from test_loading import write_transforms
 
 from clsplat.config import SfmConfig, TrainConfig
 from clsplat.dataset.sfm import reconstruction
 from clsplat.formats import FORMATS, save_gaussians
 from clsplat.formats.sog import META
+from clsplat.formats.spz import save_spz
+from clsplat.formats.streamed_sog import LOD_META
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
 from clsplat.training.autosize.rule import Candidate, Search, SmallSide, Trial
@@ -70,6 +74,9 @@ def gaussians(folder):
     text.write(folder / "text.ply")
     put("ply", "text", (folder / "text.ply").read_bytes())
     sog_version_1()
+    spz_version_4(folder)
+    ksplat()
+    streamed_sog(folder)
 
 
 def sog_version_1():
@@ -83,6 +90,35 @@ def sog_version_1():
         "sh0": {"mins": [-1.0] * 4, "maxs": [1.0] * 4, "files": ["a.webp"]},
     }
     put("sog", "version-1", packed({META: json.dumps(meta).encode(), "a.webp": webp}))
+
+
+def spz_version_4(folder):
+    scene = synthetic_scene(6, sh_degree=1)[0].astype(np.float32)
+    save_spz(folder / "four.spz", scene, "antialiased", version=4, axes="rdf")
+    put("spz", "version-4", (folder / "four.spz").read_bytes())
+
+
+def ksplat():
+    """As many Gaussians as make a partial bucket; files of the format's own library are in tests/formats/foreign."""
+    for level in range(3):
+        put("ksplat", f"level-{level}", ksplat_scene(level, ((5, 2), (1, 2))))
+
+
+def streamed_sog(folder):
+    root = folder / "streamed"
+    root.mkdir()
+    for name, n in (("a.sog", 6), ("sky.sog", 2)):
+        save_gaussians(root / name, synthetic_scene(n, sh_degree=1)[0].astype(np.float32))
+    nodes = [{"lods": {"0": {"file": 0, "offset": first, "count": 3}}} for first in (3, 0)]
+    meta = {
+        "version": 1,
+        "lodLevels": 1,
+        "filenames": ["a.sog"],
+        "environment": "sky.sog",
+        "tree": {"children": nodes},
+    }
+    (root / LOD_META).write_text(json.dumps(meta))
+    put("streamed-sog", "two-nodes", tree(root))
 
 
 def pictures():

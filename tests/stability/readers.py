@@ -32,7 +32,7 @@ from clsplat.dataset.photos import (
 )
 from clsplat.dataset.sfm.summary import preview
 from clsplat.errors import InputError
-from clsplat.formats import FORMATS, load_gaussians
+from clsplat.formats import FORMATS, READ_ONLY, load_gaussians
 from clsplat.formats.quantisation import EXPANSION_FREE
 from clsplat.training.checkpoint import load_state
 from clsplat.training.initialize import initialize
@@ -181,7 +181,8 @@ def read_results(path):
 
 
 READERS = {
-    **{suffix[1:].replace(".", "-"): (f"scene{suffix}", read_gaussians) for suffix in FORMATS},
+    **{suffix[1:].replace(".", "-"): (f"scene{suffix}", read_gaussians) for suffix in (*FORMATS, *READ_ONLY)},
+    "streamed-sog": ("scene", read_gaussians),
     "photo": ("photo.png", read_image),
     "mask": ("mask.png", read_a_mask),
     "colmap-bin": ("data", read_dataset),

@@ -14,7 +14,6 @@ from clsplat.config import InitConfig
 from clsplat.errors import InputError
 from clsplat.metrics import to_uint8
 from clsplat.render import render
-from clsplat.training import initialize
 from clsplat.training.initialize import NEIGHBOURS, from_points
 from clsplat.training.loop import train
 
@@ -148,7 +147,7 @@ def test_a_pose_at_another_place_altogether_fails_by_a_sentence(scene, trained):
 @pytest.mark.slow
 def test_five_million_gaussians_fit_24_gb(scene, device, tmp_path, monkeypatch):
     """One iteration, and a render, of tiny photos; without the search for neighbours, which takes minutes."""
-    monkeypatch.setattr(initialize, "_variances", lambda points: np.full(len(points), 0.005**2))
+    monkeypatch.setattr("clsplat.training.initialize._variances", lambda points: np.full(len(points), 0.005**2))
     count = 5_000_000
     points = np.random.default_rng(0).uniform(-0.7, 0.7, (count, 3))
     config = replace(CONFIG, iterations=1, max_gaussians=count, init=InitConfig(sh_degree=3))

@@ -23,6 +23,7 @@ FILES = [(reader, path.name) for reader in READERS for path in sorted((CORPUS / 
 READ = {
     "ply/found-scales-overflow",  # `clsplat info` overflowed in the histogram of its sizes
     "colmap-bin/found-distortion-subnormal",  # a quotient of a fisheye's coefficients overflowed
+    "glb/found-unused-attribute",  # `clsplat info` looked up an attribute that is not read
     "photo/found-exif",  # tags that Pillow reads but cannot write, when the photo was copied upright
     "recovered/found-frames-endless",  # COLMAP did not return; frames and rigs are not read any more
     "recovered/found-rigs-missing",  # COLMAP's own IndexError

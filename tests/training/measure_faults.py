@@ -254,9 +254,10 @@ def outside(root: Path) -> Iterator[list[str]]:
     parse = tyro.cli
 
     def parse_once(*arguments: Any, args: list[str], **named: Any) -> Any:
-        if tuple(args) not in PARSED:
-            PARSED[tuple(args)] = parse(*arguments, args=args, **named)
-        return PARSED[tuple(args)]
+        typed = (named["prog"], *args)
+        if typed not in PARSED:
+            PARSED[typed] = parse(*arguments, args=args, **named)
+        return PARSED[typed]
 
     def hang(*_: object) -> None:
         raise Hung

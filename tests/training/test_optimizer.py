@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
+from clsplat import reference
 from clsplat.config import OptimConfig, TrainConfig
+from clsplat.device import Device
+from clsplat.gaussians import Gaussians
+from clsplat.renderer import Renderer, fetch
 from clsplat.testing import synthetic_scene
-from clsplat.training.optimizer import Moments, adam_settings, sh_degree_at
+from clsplat.training.optimizer import Adam, Moments, adam_settings, sh_degree_at
 
 CONFIG = OptimConfig()
 
@@ -32,3 +36,29 @@ def test_schedules_at_their_ends() -> None:
 
 def test_short_runs_shorten_their_schedules() -> None:
     assert [TrainConfig(iterations=n).shortened(500) for n in (30_000, 7000, 700, 1)] == [500, 500, 50, 1]
+
+
+def test_adam_for_loops_of_ones_own_is_that_of_training(device: Device) -> None:
+    """Its steps are those of the twin with the settings of training, wherever the gradients are."""
+    rng = np.random.default_rng(0)
+    gaussians = synthetic_scene(30, sh_degree=2)[0].astype(np.float32)
+    config = OptimConfig(sh_degree_every=2)
+    adam = Adam(gaussians, Renderer(device), 4, 2.5, config)
+    expected, moments = gaussians.astype(np.float64), Moments.zeros(gaussians.astype(np.float64))
+    for iteration in range(1, 6):
+        v = Gaussians(**{k: rng.normal(size=a.shape) for k, a in gaussians.arrays().items()}).astype(np.float32)
+        degree = sh_degree_at(iteration, 2, 2)
+        assert adam.sh_degree == degree
+        adam.step(v if iteration % 2 else adam._renderer.place(v))
+        settings = adam_settings(iteration, min(1.0, iteration / 4), 2.5, config, degree)
+        reference.adam_step(expected, v.astype(np.float64), moments.first, moments.second, settings)
+    for name, array in fetch(adam.gaussians).arrays().items():
+        np.testing.assert_allclose(array, expected.arrays()[name], rtol=1e-4, atol=1e-5)
+    assert adam.iteration == 5 and adam.gaussians is not gaussians
+
+
+def test_names_at_the_top_of_the_package() -> None:
+    from clsplat import training
+
+    assert {"Adam", "Strategy", "initialize", "train"} <= set(training.__all__)
+    assert callable(training.initialize) and training.STRATEGIES["error"] is not None

@@ -1,0 +1,58 @@
+"""Settings that commands share: parts of configurations that have an effect on a command, and those of the viewer."""
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
+
+from clsplat.config import DataConfig, Mode, RenderConfig, SfmConfig
+from clsplat.ranges import within
+
+
+@dataclass(frozen=True)
+class PhotoOptions(DataConfig):
+    """Settings of the photos that a scene is compared with. Their cameras are those that the scene was trained on."""
+
+    random_background: tyro.conf.Fixed[bool] = False
+    sfm: tyro.conf.Fixed[SfmConfig] = field(default_factory=SfmConfig)
+
+
+@dataclass(frozen=True)
+class CameraOptions(PhotoOptions):
+    """Settings of cameras from which a scene is rendered."""
+
+    masks: tyro.conf.Fixed[str | None] = None
+    invert_masks: tyro.conf.Fixed[bool] = False
+
+
+@dataclass(frozen=True)
+class ViewOptions(CameraOptions):
+    """Settings of a view of a scene, which shows training photos and held-out ones alike."""
+
+    test_every: tyro.conf.Fixed[int] = 8
+
+
+@dataclass(frozen=True)
+class PageOptions(ViewOptions):
+    """Settings of a web page, which has no photos."""
+
+    downscale: tyro.conf.Fixed[int] = 1  # type: ignore[assignment]
+
+
+@dataclass(frozen=True)
+class DrawOptions(RenderConfig):
+    """Settings of rendering a file of Gaussians, which knows its mode."""
+
+    mode: tyro.conf.Fixed[Mode] = "classic"
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """Settings of the viewer's server."""
+
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address that the viewer listens on; 0.0.0.0 admits other machines, with the token in the printed address."""
+    port: Annotated[int, within(least=0, most=65535)] = 8080
+    """Port that the viewer listens on; if it is in use, the next free one."""
+    open: bool = False
+    """Open the viewer in the browser of this machine."""

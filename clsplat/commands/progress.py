@@ -1,0 +1,167 @@
+"""Training with a progress bar, which begins with the first step, and with the viewer if there is one."""
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clsplat.commands.console import STARTED, say, warn
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+    from clsplat.config import TrainConfig
+    from clsplat.gaussians import Gaussians
+    from clsplat.renderer import Renderer
+    from clsplat.scene import Scene
+    from clsplat.show.viewer import Viewer
+
+WAITING = "compiling kernels, which are kept for the next run, and waiting for the first step"
+"""What happens before the first step. Drivers compile some kernels only when they run for the first time."""
+
+
+class Progress:
+    """The bar, the viewer's panel and Ctrl-C of one training.
+
+    Parameters
+    ----------
+    scene : Scene
+    config : TrainConfig
+    renderer : Renderer
+    out : Path
+        Folder of the run.
+    viewer : Viewer or None
+    began : callable
+        Called after the first step.
+    """
+
+    def __init__(
+        self,
+        scene: "Scene",
+        config: "TrainConfig",
+        renderer: "Renderer",
+        out: Path,
+        viewer: "Viewer | None",
+        began: Callable[[], None],
+    ):
+        self._scene, self._config, self._renderer, self._out, self._viewer = scene, config, renderer, out, viewer
+        self._began, self._shown = began, False
+        self._bar: tqdm[Any] | None = None
+        self._begun = threading.Event()
+        self._interrupted = threading.Event()
+        self._facts: dict[str, str] = {}  # lines of the viewer's panel
+        self._psnr: float | None = None
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Show in the block what the training waits for and then its progress; Ctrl-C ends it after an iteration."""
+        if self._viewer:
+            self._viewer.wait(WAITING)
+        waits = threading.Thread(target=self._wait, daemon=True)
+        waits.start()
+        before = signal.signal(signal.SIGINT, self._interrupt)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+            self._begun.set()
+            waits.join()
+            if self._bar is not None:
+                self._bar.close()
+
+    def _interrupt(self, *_: object) -> None:
+        self._interrupted.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # the second Ctrl-C does not wait
+
+    def _wait(self) -> None:
+        """Say what the training waits for; on a terminal, count the seconds."""
+        from tqdm import tqdm
+
+        if not sys.stderr.isatty():
+            say(WAITING)
+            return
+        with tqdm(bar_format="{desc} {elapsed}", desc=WAITING, leave=False) as line:
+            while not self._begun.wait(1):
+                line.refresh()
+
+    def after(self, record: dict[str, Any]) -> None:
+        """Report an iteration; the argument `progress` of `clsplat.training.loop.train`."""
+        if self._bar is None:
+            self._start(record)
+        assert self._bar is not None
+        self._bar.update(record["iteration"] - self._bar.n)
+        self._bar.set_postfix_str(f"loss={record['loss']:.4f}, N={record['num_gaussians']}", refresh=False)
+        if self._viewer:
+            self._facts["Iteration"] = f"{record['iteration']:,} of {self._config.iterations:,}"
+            self._facts["Gaussians"], self._facts["Loss"] = f"{record['num_gaussians']:,}", f"{record['loss']:.4f}"
+            self._viewer.tell(self._facts)
+            self._viewer.record(record["iteration"], record["num_gaussians"], self._psnr)
+            self._psnr = None
+            self._viewer.follow(record["gaussians"], self._interrupted.is_set)
+        if self._interrupted.is_set():
+            warn(f"{self._out}: stopped after iteration {record['iteration']}")
+            raise KeyboardInterrupt
+
+    def _start(self, record: dict[str, Any]) -> None:
+        """Replace what the training waited for by a bar, whose estimate does not contain the wait."""
+        from tqdm import tqdm
+
+        self._begun.set()
+        say(f"first iteration: done {time.perf_counter() - STARTED:.1f} s after the start")
+        first = record["iteration"]
+        self._bar = tqdm(total=self._config.iterations, initial=first, unit="it", dynamic_ncols=True)
+        self.show()
+        self._began()
+
+    def show(self) -> None:
+        """Show the scene in the viewer, once. An error of the viewer does not end a training."""
+        if self._viewer is None or self._shown:
+            return
+        from clsplat.show.camera_paths import first_photo
+
+        self._shown = True
+        try:
+            start = first_photo([view.camera for view in self._scene.train])
+            self._viewer.show(self._renderer, start, self._scene.train)
+        except Exception as error:
+            warn(f"warning: the viewer failed: {type(error).__name__}: {error}")
+
+    def held_out(self, gaussians: "Gaussians") -> dict[str, float]:
+        """Evaluate the held-out photos; the argument `evaluate` of `clsplat.training.loop.train`."""
+        from clsplat.evaluate import mean_metrics
+
+        means = mean_metrics(gaussians, self._scene.test, self._renderer)
+        self._psnr = means["psnr"]
+        self._facts["Held-out photos"] = ", ".join(f"{name.upper()} {value:.4g}" for name, value in means.items())
+        return means
+
+
+def train_with_progress(
+    scene: "Scene",
+    config: "TrainConfig",
+    renderer: "Renderer",
+    out: Path,
+    resume: bool,
+    viewer: "Viewer | None",
+    began: Callable[[], None],
+) -> "Gaussians":
+    """Train with a progress bar and, if there is one, a viewer; `began` is called after the first step."""
+    from clsplat.training.loop import train
+
+    progress = Progress(scene, config, renderer, out, viewer, began)
+    with progress.watching():
+        gaussians = train(
+            scene,
+            config,
+            out,
+            renderer.device,
+            resume=resume,
+            evaluate=progress.held_out if scene.test else None,
+            progress=progress.after,
+        )
+    progress.show()  # a finished run that is resumed has no step
+    return gaussians

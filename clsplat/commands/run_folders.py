@@ -1,0 +1,123 @@
+"""Run folders as arguments: the scene that `train` wrote, with its dataset and the settings of both."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from clsplat.commands.console import warn
+from clsplat.config import TrainConfig
+from clsplat.errors import InputError
+
+CONFIG, SCENE, FRAMES = "config.json", "scene.ply", "frames"
+"""Files of a run: its settings and its scene; and the folder of a video's photos."""
+
+Command = TypeVar("Command")
+
+
+class Run(NamedTuple):
+    """A folder that `train` wrote: dataset, if config.json names it, and settings."""
+
+    data: Path | None
+    config: TrainConfig
+
+
+def is_run(path: Path) -> bool:
+    """Whether a path is the folder of a run."""
+    return path.is_dir() and (path / CONFIG).is_file()
+
+
+def read_run(folder: Path) -> Run:
+    """Read which dataset a run was trained on, and how.
+
+    Raises
+    ------
+    InputError
+        If config.json cannot be read.
+    """
+    from clsplat.dataset.video import is_video
+    from clsplat.training.presets import DATA_PATH, load_config, read_settings
+
+    named = read_settings(folder / CONFIG).get(DATA_PATH)
+    if not isinstance(named, str):
+        return Run(None, load_config(folder / CONFIG))
+    data = folder / named  # a dataset within the folder of the run moves with it
+    return Run(folder / FRAMES if is_video(data) else data, load_config(folder / CONFIG))
+
+
+def scene_file(path: Path) -> Path:
+    """The file of Gaussians that an argument names, which may be the folder of a run.
+
+    Raises
+    ------
+    InputError
+        If the run has none yet.
+    """
+    if not is_run(path):
+        return path
+    if not (path / SCENE).is_file():
+        raise InputError(
+            f"{path}: expected a finished run, found no {SCENE} in it; it is in progress, or --resume finishes it"
+        )
+    return path / SCENE
+
+
+def with_run(command: Command, dataset: str = "data") -> Command | None:
+    """A command with the dataset and the settings of the run that it names as defaults; None if it names none.
+
+    Parameters
+    ----------
+    command : dataclass
+        With the fields `scene`, `data_config`, maybe `render`, and the one that `dataset` names.
+    """
+    given: Any = command
+    if not is_run(given.scene):
+        return None
+    run = read_run(given.scene)
+    changes: dict[str, Any] = {"data_config": _with(given.data_config, run.config.data)}
+    if hasattr(given, "render"):
+        changes["render"] = _with(given.render, run.config.render)
+    if getattr(given, dataset) is None and run.data is not None:
+        if run.data.is_dir():
+            changes[dataset] = run.data
+        else:
+            warn(f"warning: {run.data}, the dataset of {given.scene}, is missing")
+    result: Command = replace(given, **changes)
+    return result
+
+
+def _with(part: Any, settings: Any) -> Any:
+    """A part of a configuration with the values of the whole one."""
+    return replace(part, **{f.name: getattr(settings, f.name) for f in fields(settings)})
+
+
+def dataset_of(command: str, data: Path | None) -> Path:
+    """The dataset of a command that needs one.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if data is None:
+        raise InputError(
+            f"{command}: expected a dataset or the folder of a run that has one, as in: clsplat {command} scene.ply "
+            "DATASET; found none"
+        )
+    return data
+
+
+def place_of(out: Path | None, scene: Path, name: str) -> Path:
+    """The folder of a result: the one given, or `name` within the folder of the run.
+
+    Raises
+    ------
+    InputError
+        If there is neither.
+    """
+    if out is not None:
+        return out
+    if not is_run(scene):
+        raise InputError(
+            "-o: expected a folder for the result, found none; only the folder of a run has a place for it"
+        )
+    return scene / name

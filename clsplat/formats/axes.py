@@ -1,0 +1,69 @@
+"""Rotations of whole scenes: the axes of a format in place of those of a PLY, and poses that a file declares.
+
+The axes of a PLY from photogrammetry are right, down, forward.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.gaussians import Gaussians
+from clsplat.reference.sh import BASIS, sh_basis
+
+Array = NDArray[Any]
+
+RIGHT_UP_BACK = (1.0, -1.0, -1.0)
+"""Signs by which the coordinates change from right, down, forward to right, up, back (OpenGL, .spz): half a turn
+about x."""
+
+LEFT_UP_FORWARD = (-1.0, -1.0, 1.0)
+"""Signs by which the coordinates change to left, up, forward (glTF): half a turn about z."""
+
+DIRECTIONS = 64
+"""Number of directions from which the rotation of the spherical harmonics is computed: more than the 16 coefficients,
+so that the system is well conditioned."""
+
+
+def turned(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
+    """Turn a scene by half a turn about one axis, whose sign in `signs` is positive; twice is the identity, exactly.
+
+    A basis function of the spherical harmonics changes its sign as the first of its monomials does: all have the same
+    parity in each coordinate.
+    """
+    parities = np.array([terms[0][1] for terms in BASIS])
+    sh_signs = np.prod(np.where(parities % 2, signs, 1.0), axis=1).astype(np.float32)
+    axes = np.array(signs, np.float32)
+    return Gaussians(
+        gaussians.means * axes,
+        gaussians.log_scales,
+        gaussians.quats * np.append(np.float32(1), axes),
+        gaussians.logit_opacities,
+        gaussians.sh * sh_signs[: gaussians.sh.shape[1], None],
+    )
+
+
+def rotated(gaussians: Gaussians, rotation: Array) -> Gaussians:
+    """The Gaussians in a world turned by `rotation` (3, 3), including their view dependence.
+
+    The turned colour is c'(d) = c(R^T d) for every direction d. A least-squares fit over directions finds the new
+    coefficients. The fit is exact, because the basis of each degree is closed under rotations.
+    """
+    from scipy.spatial.transform import Rotation
+
+    if np.array_equal(rotation, np.eye(3)):
+        return gaussians
+    directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    degree, dtype = gaussians.sh_degree, gaussians.means.dtype
+    new, old = sh_basis(directions, degree), sh_basis(directions @ rotation, degree)
+    matrix = np.linalg.lstsq(new, old, rcond=None)[0]
+    norms = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    turn = Rotation.from_matrix(rotation) * Rotation.from_quat(np.roll(gaussians.quats / norms, -1, axis=1))
+    return replace(
+        gaussians,
+        means=(gaussians.means @ rotation.T).astype(dtype),
+        quats=np.roll(turn.as_quat(), 1, axis=1).astype(dtype),
+        sh=np.einsum("kl,nlc->nkc", matrix, gaussians.sh).astype(dtype),
+    )

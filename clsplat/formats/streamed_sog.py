@@ -1,0 +1,121 @@
+"""The streamed SOG of PlayCanvas, which is read: a tree of SOG scenes in several levels of detail.
+
+``lod-meta.json`` names the SOG scenes beside it (folders or .sog files), and has a tree whose nodes give, for each
+level of detail, the scene, the first Gaussian and the number of Gaussians that show the node. Level 0 is the finest.
+Another scene, the environment, may always be shown.
+Source: the writer and the reader of splat-transform, https://github.com/playcanvas/splat-transform.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config import Mode
+from clsplat.errors import InputError
+from clsplat.formats.sog import load_sog
+from clsplat.formats.validity import reading
+from clsplat.gaussians import Gaussians
+
+LOD_META = "lod-meta.json"
+"""Name of the file that describes the scene."""
+
+Span = tuple[int, int, int]
+"""A file's index, the first row and the number of rows in it."""
+
+
+def load_streamed_sog(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
+    """Read the finest level of detail from a folder with a lod-meta.json, or from the lod-meta.json in it.
+
+    Returns
+    -------
+    gaussians, mode, offset
+        As in `clsplat.formats.load_gaussians`, with the environment if there is one. The offset is that of the first
+        scene.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read or is not what the tree expects, the tree is damaged, or it holds no Gaussian.
+    """
+    folder, meta, spans = read_tree(path)
+    units: dict[str, list[Span]] = {}
+    try:
+        for span in spans:
+            units.setdefault(_inside(path, meta["filenames"][span[0]]), []).append(span)
+        if "environment" in meta:
+            units[_inside(path, meta["environment"])] = []
+    except (AttributeError, LookupError, TypeError) as error:
+        raise InputError(f"cannot read {path}: {LOD_META} names its files wrongly: {error!r}") from error
+    parts, modes, offsets = [], [], []
+    for name, own in units.items():
+        gaussians, mode, offset = load_sog(folder / name)
+        modes.append(mode)
+        offsets.append(offset)
+        taken = sum(count for _, _, count in own)
+        if taken > len(gaussians) or any(first + count > len(gaussians) for _, first, count in own):
+            raise InputError(
+                f"{path}: expected {name} to hold the {taken} Gaussians that the tree names, found "
+                f"{len(gaussians)}; the files are of different scenes or damaged"
+            )
+        if own:
+            rows = np.concatenate([np.arange(first, first + count) for _, first, count in own])
+            gaussians = gaussians.take(rows)
+        parts.append(gaussians)
+    most = max(part.sh.shape[1] for part in parts)
+    for part in parts:
+        part.sh = np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))
+    return Gaussians.concatenate(parts), "antialiased" if "antialiased" in modes else "classic", offsets[0]
+
+
+def read_tree(path: str | Path) -> tuple[Path, dict[str, Any], list[Span]]:
+    """Read lod-meta.json; return its folder, its content, and the spans of Gaussians of the finest level.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is damaged or of another version, or names no Gaussian.
+    """
+    path = Path(path)
+    folder = path if path.is_dir() else path.parent
+    with reading(path):
+        text = (folder / LOD_META).read_bytes()
+    try:
+        meta = json.loads(text)
+        if meta.get("version", 1) != 1:
+            raise InputError(f"{path}: expected {LOD_META} of version 1, found version {meta['version']!r}")
+        spans = list(_finest(meta["tree"]))
+    except (AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"cannot read {path}: its {LOD_META} is damaged: {error!r}") from error
+    if not spans:
+        raise InputError(f"{path}: expected Gaussians in the tree of {LOD_META}, found none")
+    return folder, meta, spans
+
+
+def _finest(tree: dict[str, Any]) -> Iterator[Span]:
+    """Yield the spans of the finest level of each node that has some, without empty ones."""
+    waiting = [tree]
+    while waiting:
+        node = waiting.pop()
+        lods = node.get("lods") or {}
+        if lods:
+            lod = lods[min(lods, key=int)]
+            span = (lod["file"], lod["offset"], lod["count"])
+            if not all(type(value) is int and 0 <= value < 2**32 for value in span):
+                raise ValueError(f"the span {lod}")
+            if lod["count"]:
+                yield span
+        waiting += reversed(node.get("children") or [])
+
+
+def _inside(path: str | Path, name: str) -> str:
+    """Return the name of a file in the folder of lod-meta.json; raise an InputError if it lies elsewhere."""
+    parts = PurePosixPath(name).parts
+    if not parts or name.startswith("/") or ".." in parts or "\\" in name or ":" in name:
+        raise InputError(f"{path}: expected files beside {LOD_META}, found {name!r}")
+    return name

@@ -1,0 +1,180 @@
+"""Gradients of `rasterization`: with respect to activated parameters, values of D channels, and cameras."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.renderer import Renderer, download, fetch
+from clsplat.stages import Bins, Image, SplatGrads, Splats
+
+Array = NDArray[Any]
+
+
+class RasterPass(NamedTuple):
+    """What the gradients of one camera need.
+
+    splats: as projected, with RGB and the depth as colours; colored: the same with the values that were composited.
+    render (H, W, X), alpha (H, W, 1) and background (X,) are on the host, the others where the stages ran.
+    channels: D.
+    """
+
+    camera: Camera
+    splats: Splats
+    colored: Splats
+    bins: Bins
+    image: Image
+    render: Array
+    alpha: Array
+    background: Array
+    render_mode: str
+    channels: int
+
+
+class RasterGradients(NamedTuple):
+    """Gradients of a scalar with respect to the arguments of `rasterization`, of their shapes.
+
+    colors is that of the values or of the coefficients of spherical harmonics, summed over the cameras if they share
+    them. viewmats (C, 4, 4) has each entry as an independent variable, Ks (C, 3, 3) those of fx, fy, cx and cy.
+    means2d (C, N, 2) is the gradient with respect to the splats' centres, px, which densification uses.
+    """
+
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    colors: Array
+    viewmats: Array
+    Ks: Array
+    backgrounds: Array
+    means2d: Array
+
+
+class _Outputs(NamedTuple):
+    render: Array
+    alpha: Array
+    meta: dict[str, Any]
+
+
+class Rasterization(_Outputs):
+    """The result of `rasterization`: the tuple (render, alpha, meta), and its gradients."""
+
+    _kept: tuple[Renderer, Gaussians, Gaussians, list[RasterPass], int | None, bool] | None = None
+
+    def remember(
+        self,
+        renderer: Renderer,
+        placed: Gaussians,
+        gaussians: Gaussians,
+        passes: list[RasterPass],
+        sh_degree: int | None,
+        antialiased: bool,
+    ) -> None:
+        """Keep what `backward` needs; `rasterization` calls it."""
+        self._kept = (renderer, placed, gaussians, passes, sh_degree, antialiased)
+
+    def backward(self, v_render: Any, v_alpha: Any = None, *, shared_colors: bool = True) -> RasterGradients:
+        """Gradients of a scalar with respect to the Gaussians and the cameras.
+
+        Parameters
+        ----------
+        v_render : (C, H, W, X)
+            The scalar's gradient with respect to render.
+        v_alpha : (C, H, W, 1), optional
+            The same for alpha; default 0.
+        shared_colors : bool
+            Whether all cameras have the same values (N, D), whose gradients are summed. False keeps (C, N, D).
+
+        Returns
+        -------
+        RasterGradients
+            float64. The gradient of an opacity of 0 or 1, and of a scale of 0, is 0: the kernels differentiate
+            logits and logarithms.
+
+        Raises
+        ------
+        InputError
+            If `gradients` was not set, or a shape does not fit.
+        """
+        if self._kept is None:
+            raise InputError("gradients: expected a rasterization made with gradients=True, found another")
+        renderer, placed, gaussians, passes, sh_degree, antialiased = self._kept
+        v_render = _checked("v_render", v_render, self.render.shape)
+        v_alpha = np.zeros(self.alpha.shape) if v_alpha is None else _checked("v_alpha", v_alpha, self.alpha.shape)
+        total = {name: np.zeros(array.shape) for name, array in gaussians.arrays().items()}
+        values, viewmats, intrinsics, backgrounds, means2d = [], [], [], [], []
+        for run, v_image, v_cover in zip(passes, v_render, v_alpha, strict=True):
+            v_splats, v_values = _to_splats(renderer, run, v_image, v_cover, sh_degree is not None)
+            v, v_camera = renderer.stages.project_bwd(
+                placed,
+                run.camera,
+                sh_degree or 0,
+                run.splats,
+                v_splats,
+                antialiased=antialiased,
+                camera_grad=True,
+            )
+            for name, array in fetch(v).arrays().items():
+                total[name] += array
+            assert v_camera is not None
+            values.append(v_values)
+            viewmats.append(v_camera.viewmat)
+            intrinsics.append(_matrix(v_camera.intrinsics))
+            plain = np.zeros((*v_image.shape[:2], run.channels))
+            shown = v_image[:, :, : run.channels] if "RGB" in run.render_mode else plain
+            backgrounds.append(((1 - run.alpha) * shown).sum(axis=(0, 1)))
+            means2d.append(download(v_splats.means2d))
+        v_features = np.stack(values)
+        return RasterGradients(
+            total["means"],
+            total["quats"],
+            _quotient(total["log_scales"], np.asarray(gaussians.scales, np.float64)),
+            _quotient(total["logit_opacities"], gaussians.opacities * (1 - gaussians.opacities)),
+            total["sh"] if sh_degree is not None else v_features.sum(axis=0) if shared_colors else v_features,
+            np.stack(viewmats),
+            np.stack(intrinsics),
+            np.stack(backgrounds),
+            np.stack(means2d),
+        )
+
+
+def _to_splats(
+    renderer: Renderer, run: RasterPass, v_image: Array, v_alpha: Array, harmonics: bool
+) -> tuple[SplatGrads, Array]:
+    """Gradients with respect to the splats with RGB and depth, and to the values (N, D) that were composited."""
+    v_image, v_cover = v_image.copy(), v_alpha[:, :, 0].copy()
+    if "ED" in run.render_mode:  # the accumulated depth over alpha
+        alpha = run.alpha[:, :, 0].astype(np.float64)
+        v_image[:, :, -1] = np.divide(v_image[:, :, -1], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+        v_cover -= v_image[:, :, -1] * run.render[:, :, -1]
+    image = Image(renderer.upload("v_image", v_image), renderer.upload("v_alpha", v_cover))
+    v = renderer.stages.composite_bwd(run.colored, run.bins, run.image, image)
+    v_colors = download(v.colors).astype(np.float64)
+    deep = "D" in run.render_mode
+    v_values = v_colors[:, : run.channels] if "RGB" in run.render_mode else np.zeros((len(v_colors), run.channels))
+    onward = np.zeros((len(v_colors), 4))
+    if harmonics:
+        onward[:, :3] = v_values
+    if deep:
+        onward[:, 3] = v_colors[:, -1]
+    return v._replace(colors=renderer.upload("v_colors", onward)), v_values
+
+
+def _matrix(intrinsics: Array) -> Array:
+    """The gradient of fx, fy, cx, cy as that of K (3, 3)."""
+    fx, fy, cx, cy = intrinsics
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 0]])
+
+
+def _quotient(x: Array, y: Array) -> Array:
+    return np.divide(x, y, out=np.zeros_like(x), where=y > 0)
+
+
+def _checked(name: str, array: Any, expected: tuple[int, ...]) -> Array:
+    array = np.asarray(array, np.float64)
+    if array.shape != expected:
+        raise InputError(f"{name}: expected shape {expected}, found {array.shape}")
+    return array

@@ -1,0 +1,132 @@
+"""Inputs of the viewer for pictures and videos, which the browser downloads."""
+
+import io
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.show.camera_paths import Viewpoint, around, through
+from clsplat.show.viewer_panel import Panel
+
+FRAMES_PER_SECOND = 30
+"""Frames per second of a video."""
+
+SECONDS_MAX = 60
+"""Longest video, s."""
+
+VIDEO_EDGE = 1280
+"""Longer edge of a video, px."""
+
+
+class Recording:
+    """Makes the inputs, and renders on the thread that owns the device.
+
+    Parameters
+    ----------
+    panel : Panel
+    start : Viewpoint
+        Without views, a video circles its focus.
+    pose_of : callable
+        Camera of a browser by its identifier; None if it has left.
+    later : callable
+        Takes a function of the Gaussians that the owner of the device calls.
+    frame_of : callable
+        Renders a camera's frame of Gaussians as the panel asks for it; returns it with its legend.
+    """
+
+    def __init__(
+        self,
+        panel: Panel,
+        start: Viewpoint,
+        pose_of: Callable[[int], Camera | None],
+        later: Callable[[Any], None],
+        frame_of: Callable[[Camera, Gaussians], tuple[NDArray[np.uint8], str]],
+    ):
+        self._start, self._pose_of, self._later, self._frame_of = start, pose_of, later, frame_of
+        self._path: list[Camera] = []
+        panel.button("Screenshot", self._screenshot)
+        panel.button("Add view to path", self._add)
+        panel.button("Clear path", lambda _: self._clear())
+        self._seconds = panel.slider("Seconds", (1, SECONDS_MAX), 1, 6)
+        self._closed = panel.checkbox("Closed path", False)
+        panel.button("Record video", self._record)
+        self._text = panel.gui.add_markdown("")
+        self._clear()
+
+    def _clear(self) -> None:
+        self._path.clear()
+        self._text.content = "0 views: the video circles the scene"
+
+    def _add(self, event: Any) -> None:
+        camera = self._pose_of(event.client_id)
+        if camera is not None:
+            self._path.append(camera)
+            self._text.content = f"{len(self._path)} view{'s' * (len(self._path) > 1)}"
+
+    def _screenshot(self, event: Any) -> None:
+        camera = self._pose_of(event.client_id)
+        if camera is None:
+            return
+
+        def task(gaussians: Gaussians) -> None:
+            file = io.BytesIO()
+            Image.fromarray(self._frame_of(camera, gaussians)[0]).save(file, "PNG")
+            event.client.send_file_download("clsplat.png", file.getvalue(), save_immediately=True)
+
+        self._later(task)
+
+    def _record(self, event: Any) -> None:
+        window = self._pose_of(event.client_id)
+        if window is None:
+            return
+        count = round(self._seconds.value * FRAMES_PER_SECOND)
+
+        def task(gaussians: Gaussians) -> Iterator[None]:
+            frames = []
+            cameras = self._cameras(window, count)
+            for number, camera in enumerate(cameras, start=1):
+                frames.append(self._frame_of(camera, gaussians)[0])
+                self._text.content = f"frame {number} of {count}"
+                yield
+            event.client.send_file_download("clsplat.mp4", video(frames), save_immediately=True)
+            self._text.content = f"{count} frames recorded"
+
+        self._later(task)
+
+    def _cameras(self, window: Camera, count: int) -> list[Camera]:
+        """The path, at a size with even edges, which H.264 needs."""
+        scale = min(1.0, VIDEO_EDGE / max(window.width, window.height))
+        width, height = (max(2, 2 * round(scale * edge / 2)) for edge in (window.width, window.height))
+        path = [camera.resized(width, height) for camera in self._path]
+        if len(path) > 1:
+            return through(path, count, closed=self._closed.value)
+        return around(window.resized(width, height), self._start.focus, self._start.up, count)
+
+
+def video(frames: list[NDArray[np.uint8]]) -> bytes:
+    """Encode frames (H, W, 3) uint8 with even edges as MP4, H.264.
+
+    Raises
+    ------
+    InputError
+        If the package av is missing.
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise InputError("cannot write a video: the package av is missing; pip install 'clsplat[video]'") from error
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("h264", rate=FRAMES_PER_SECOND, options={"crf": "18"})
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    return file.getvalue()

@@ -1,0 +1,103 @@
+"""Pictures of the viewer: normals, comparison with a photo, a page that waits, videos."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_scenes import cameras
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.renderer import Renderer
+from clsplat.show.frames import MODES, Look, normals, picture, splash
+from clsplat.show.viewer_photos import blended
+from clsplat.show.viewer_recording import video
+
+
+def plane(camera, normal, distance):
+    """Depth map of the plane with points p where normal . p = distance, in camera coordinates."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    return distance / (normal[0] * x + normal[1] * y[:, None] + normal[2])
+
+
+@pytest.mark.parametrize("normal", [(0, 0, -1), (0.6, 0, -0.8), (0, -0.6, -0.8)])
+def test_normals_of_planes_point_to_the_camera(normal):
+    camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 100, 40, 30)
+    found = normals(plane(camera, normal, -5.0), camera)
+    np.testing.assert_allclose(found, np.broadcast_to(normal, found.shape), atol=1e-9)
+
+
+def test_a_surface_to_the_camera_is_blue(device):
+    gaussians, (camera, *_) = cameras()
+    gaussians.means[:, 2] *= 0.001
+    gaussians.log_scales[:] = np.log(0.3)
+    gaussians.logit_opacities[:] = 5
+    frame, legend = picture(Renderer(device), gaussians, camera, Look("normals"))
+    middle = frame[100:140, 140:180].reshape(-1, 3).mean(axis=0)
+    assert middle[2] > 200 and "blue to the camera" in legend
+    assert normals(np.ones((1, 5)), camera).shape == (1, 5, 3)
+
+
+def test_background_and_degree_change_the_render(device):
+    gaussians, (camera, *_) = cameras()
+    renderer = Renderer(device, background=(0.0, 0.0, 0.0))
+    plain = picture(renderer, gaussians, camera)[0]
+    assert (
+        np.abs(plain.astype(int) - picture(renderer, gaussians, camera, Look(MODES[0], (0.0, 1.0, 0.0)))[0]).max()
+        > 100
+    )
+    assert gaussians.sh_degree > 0
+    assert (plain != picture(renderer, gaussians, camera, Look(sh_degree=0))[0]).any()
+    np.testing.assert_array_equal(plain, picture(renderer, gaussians, camera, Look(sh_degree=9))[0])
+
+
+class TestComparison:
+    """A photo of 200x100 in a window of 300x300 with twice the focal length of the photo."""
+
+    photo = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 100, 200, 100)
+    window = replace(photo, fx=200, fy=200, cx=150, cy=150, width=300, height=300)
+
+    def test_each_pixel_shows_what_is_in_its_direction(self):
+        rng = np.random.default_rng(1)
+        smooth = np.kron(rng.integers(0, 255, (5, 10, 3)), np.ones((20, 20, 1))).astype(np.uint8)
+        found = blended(np.zeros((300, 300, 3), np.uint8), self.window, smooth, self.photo, "overlay", 1.0)
+        for u, v in ((10, 140), (290, 60), (150, 150), (77, 222)):
+            x = (u + 0.5 - 150) / 200 * 100 + 100
+            y = (v + 0.5 - 150) / 200 * 100 + 50
+            if 10 < x % 20 < 15 and 10 < y % 20 < 15:
+                np.testing.assert_allclose(found[v, u], smooth[int(y), int(x)], atol=1)
+        # The photo covers 100 px of height of 50 at twice the scale: rows 50 to 250.
+        assert not found[:49].any() and not found[251:].any() and found[60:240].any(axis=(1, 2)).all()
+
+    def test_overlay_mixes_and_beside_divides(self):
+        white, black = np.full((100, 200, 3), 255, np.uint8), np.zeros((300, 300, 3), np.uint8)
+        mixed = blended(black, self.window, white, self.photo, "overlay", 0.4)
+        assert (mixed[60:240] == 102).all() and not mixed[:49].any()
+        beside = blended(black, self.window, white, self.photo, "beside", 0.5)
+        assert (beside[60:240, :149] == 255).all() and not beside[60:240, 152:].any()
+        assert (beside[:, 149:151] == 255).all(), "a line between the two"
+
+
+def test_a_page_that_waits_shows_a_sentence():
+    frame = splash("compiling kernels", 4000, 1000)
+    assert frame.shape == (320, 1280, 3)
+    text = np.argwhere(frame[:, :, 0] > 120)
+    assert 100 < len(text) and np.abs(text.mean(axis=0) - (160, 640)).max() < 20
+    assert splash("x", 1, 3).shape == (3, 1, 3)
+
+
+def test_a_video_has_its_frames():
+    av = pytest.importorskip("av", reason="PyAV, the extra `video`, is missing")
+    frames = [np.full((32, 48, 3), 60 * k, np.uint8) for k in range(4)]
+    with av.open(io.BytesIO(video(frames))) as container:
+        found = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert [f.shape for f in found] == [(32, 48, 3)] * 4
+    np.testing.assert_allclose([f.mean() for f in found], [0, 60, 120, 180], atol=4)
+
+
+def test_without_av_a_video_is_a_sentence(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    with pytest.raises(InputError, match=r"pip install 'clsplat\[video\]'"):
+        video([np.zeros((2, 2, 3), np.uint8)])
