@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from device_opening import open_device
 from hypothesis import HealthCheck, settings
 
 from clsplat.device import Device
-from clsplat.errors import DeviceError
 
 # No clock and no chance in the default run: the same cases each time, however slow the machine. `make fuzz-cases`
 # draws new ones.
@@ -24,16 +24,6 @@ PROJECT = Path(__file__).resolve().parents[1]
 def device():
     """The device in float32, as users run it."""
     return Device()
-
-
-def open_device(real):
-    """A new device in a precision; what needs double precision is skipped on a device without it."""
-    try:
-        return Device(real=real)
-    except DeviceError as error:
-        if "double precision" not in str(error):
-            raise
-        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import open_device
+from device_opening import open_device
 from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference

@@ -5,7 +5,7 @@ What both variants share is tested in test_composite.py.
 
 import numpy as np
 import pytest
-from conftest import open_device
+from device_opening import open_device
 from tolerances import DOUBLE
 
 from clsplat import ops, reference

@@ -1,5 +1,7 @@
 """The variant of the stage composite that sorts each pixel: twin, equation and central differences."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from test_composite import (
@@ -16,6 +18,8 @@ from tolerances import DOUBLE, FLOAT
 from clsplat import ops, reference
 from clsplat.config import RenderConfig
 from clsplat.constants import ALPHA_MAX, TRANSMITTANCE_MIN
+from clsplat.device import Device
+from clsplat.errors import DeviceError
 from clsplat.ops import composite
 from clsplat.render import render
 from clsplat.stages import Image, SplatGrads, Splats
@@ -200,3 +204,13 @@ def test_render_sorts_pixels(device64, mode):
     expected, found = (r.backward(v_rgb, v_depth=v_depth[:, :, 0]).gaussians for r in (expected, found))
     for name, array in expected.arrays().items():
         assert_matches(f"v_{name}", found.arrays()[name], array, DOUBLE)
+
+
+def test_a_gpu_without_memory_for_the_windows_is_refused():
+    """Its driver reserves the private memory of all work-items that it keeps at a time, or fails without a reason."""
+    for is_cpu, limit, refused in ((False, 30 << 20, True), (False, None, False), (True, 30 << 20, False)):
+        device = Device(memory_limit=limit)
+        device.is_cpu = is_cpu  # shadows the cached property
+        gaussians, camera = synthetic_scene(5, width=16, height=16)
+        with pytest.raises(DeviceError, match=r"--sort pixel: .* would reserve .* GiB") if refused else nullcontext():
+            render(gaussians, camera, RenderConfig(sort="pixel"), device)

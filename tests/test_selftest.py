@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 import pytest
-from conftest import open_device
+from device_opening import open_device
 
 from clsplat import ops, selftest
 from clsplat.stages import FUNCTIONS

@@ -3,7 +3,7 @@
 from typing import Any
 
 from clsplat.device import Device
-from clsplat.errors import InputError
+from clsplat.errors import DeviceError, InputError
 from clsplat.stages import Bins, Image, SplatGrads, Splats
 
 # Number of splats per batch of the GPU variant without subgroups. Each is a work-item of the backward kernel. Known
@@ -12,6 +12,21 @@ GPU_BATCH = 64
 
 # Number of splats that a pixel composites in one round if pixels are sorted. It changes the speed, not the image.
 WINDOW = 32
+
+# Largest number of work-items that a compute unit of a GPU keeps at a time. Drivers reserve private memory for all.
+RESIDENT = 2048
+
+
+def check_private(device: Device, tile_size: int, channels: int) -> None:
+    """Raise a DeviceError if a GPU has no memory for the windows of sorted pixels, which are private memory."""
+    values = tile_size**2 * (3 * WINDOW + channels + 4)  # cl/composite_sorted.cl: Pixels
+    reserved = values * device.real.itemsize * device.cl_device.max_compute_units * RESIDENT
+    left = device.memory_limit - device.memory
+    if not device.is_cpu and reserved > left:
+        raise DeviceError(
+            f"--sort pixel: {device.label} would reserve {reserved / 2**30:.1f} GiB for windows of sorted pixels, "
+            f"but {left / 2**30:.1f} GiB are left; use --sort global, --tile-size 8 or a CPU"
+        )
 
 
 def gpu_batch(device: Device) -> int:
@@ -104,6 +119,8 @@ def composite_fwd(
         device.empty("alpha", (bins.height, bins.width)),
     )
     stage = variant(device, compositor, disparities)
+    if stage == "composite_sorted":
+        check_private(device, bins.tile_size, channels)
     arguments = [packed(device, splats, bins, stage), device.constant("background", background), *result]
     arguments += [] if disparities is None else [disparities]
     _launch(device, stage, "composite_fwd", bins, channels, arguments)
