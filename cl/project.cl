@@ -51,6 +51,14 @@
 #define COEFFICIENTS 8
 #define CHUNKS       (3 * COEFFICIENTS / LANES)
 
+// For compilers that put several work-items into one vector: these kernels use vectors already. Vectors of 64 Gaussians
+// would take Intel's compiler half a minute.
+#if LANES == 8
+#define VECTORS __attribute__((vec_type_hint(reals)))
+#else
+#define VECTORS
+#endif
+
 // Scales and opacities after their activations.
 typedef struct {
     reals3 scales; // world units
@@ -205,11 +213,12 @@ static inline int coefficients_of(int sh_degree) {
     return (sh_degree + 1) * (sh_degree + 1);
 }
 
-__kernel void project_fwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
-                          const __global real *means, const __global real *log_scales, const __global real *quats,
-                          const __global real *logit_opacities, const __global real *sh, __global real *means2d,
-                          __global real *conics, __global real *depths, __global real *extents,
-                          __global real *opacities, __global real *colors) {
+__kernel VECTORS void project_fwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
+                                  const __global real *means, const __global real *log_scales,
+                                  const __global real *quats, const __global real *logit_opacities,
+                                  const __global real *sh, __global real *means2d, __global real *conics,
+                                  __global real *depths, __global real *extents, __global real *opacities,
+                                  __global real *colors) {
     const size_t i = LANES * get_global_id(0);
     if (i >= n)
         return;
@@ -267,10 +276,10 @@ __kernel void project_fwd(const uint n, const Camera camera, const int sh_stride
 //   z + g.d,   g = cov2d^-1 (J W Sigma W^T e_z).
 // The disparity 1/z of a plane is affine in the image. 1/z - (g/z^2).d has the same value and slope at the centre, and
 // is exact for discs (cf. Radl et al. 2024, "StopThePop", equation 10, for the Gaussian without blur).
-__kernel void project_disparities(const uint n, const Camera camera, const __global real *means,
-                                  const __global real *log_scales, const __global real *quats,
-                                  const __global real *conics, const __global real *extents,
-                                  __global real *disparities) {
+__kernel VECTORS void project_disparities(const uint n, const Camera camera, const __global real *means,
+                                          const __global real *log_scales, const __global real *quats,
+                                          const __global real *conics, const __global real *extents,
+                                          __global real *disparities) {
     const size_t i = LANES * get_global_id(0);
     if (i >= n)
         return;
@@ -407,16 +416,17 @@ static inline void coefficients_grad(const reals *basis, reals3 v_color, int fir
         transpose(values + LANES * k);
 }
 
-__kernel void project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
-                          const __global real *means, const __global real *log_scales, const __global real *quats,
-                          const __global real *logit_opacities, const __global real *sh, const __global real *conics,
-                          const __global real *extents, const __global real *colors, const __global real *v_means2d,
-                          const __global real *v_conics, const __global real *v_opacities,
-                          const __global real *v_colors, __global real *v_means, __global real *v_log_scales,
-                          __global real *v_quats, __global real *v_logit_opacities, __global real *v_sh
+__kernel VECTORS void project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
+                                  const __global real *means, const __global real *log_scales,
+                                  const __global real *quats, const __global real *logit_opacities,
+                                  const __global real *sh, const __global real *conics, const __global real *extents,
+                                  const __global real *colors, const __global real *v_means2d,
+                                  const __global real *v_conics, const __global real *v_opacities,
+                                  const __global real *v_colors, __global real *v_means, __global real *v_log_scales,
+                                  __global real *v_quats, __global real *v_logit_opacities, __global real *v_sh
 #if CAMERA_GRAD
-                          ,
-                          __global real *v_camera
+                                  ,
+                                  __global real *v_camera
 #endif
 ) {
     const size_t i = LANES * get_global_id(0);
@@ -482,18 +492,18 @@ static inline void update_vectors3(const Adam *adam, real rate, reals3 g, size_t
 }
 
 // project_bwd and the step of Adam (adam.cl) in one pass, with the gradients in registers.
-__kernel void project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
-                               const Adam adam, __global real *means, __global real *log_scales, __global real *quats,
-                               __global real *logit_opacities, __global real *sh, __global real *means_1,
-                               __global real *log_scales_1, __global real *quats_1, __global real *logit_opacities_1,
-                               __global real *sh_1, __global real *means_2, __global real *log_scales_2,
-                               __global real *quats_2, __global real *logit_opacities_2, __global real *sh_2,
-                               const __global real *conics, const __global real *extents, const __global real *colors,
-                               const __global real *v_means2d, const __global real *v_conics,
-                               const __global real *v_opacities, const __global real *v_colors
+__kernel VECTORS void
+project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const int sh_degree, const Adam adam,
+                 __global real *means, __global real *log_scales, __global real *quats,
+                 __global real *logit_opacities, __global real *sh, __global real *means_1,
+                 __global real *log_scales_1, __global real *quats_1, __global real *logit_opacities_1,
+                 __global real *sh_1, __global real *means_2, __global real *log_scales_2, __global real *quats_2,
+                 __global real *logit_opacities_2, __global real *sh_2, const __global real *conics,
+                 const __global real *extents, const __global real *colors, const __global real *v_means2d,
+                 const __global real *v_conics, const __global real *v_opacities, const __global real *v_colors
 #if CAMERA_GRAD
-                               ,
-                               __global real *v_camera
+                 ,
+                 __global real *v_camera
 #endif
 ) {
     const size_t i = LANES * get_global_id(0);
