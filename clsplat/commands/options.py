@@ -1,7 +1,7 @@
 """Settings that commands share: parts of configurations that have an effect on a command, and those of the viewer."""
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -29,14 +29,14 @@ class CameraOptions(PhotoOptions):
 class ViewOptions(CameraOptions):
     """Settings of a view of a scene, which shows training photos and held-out ones alike."""
 
-    test_every: tyro.conf.Fixed[int] = 8
+    test_every: tyro.conf.Fixed[Annotated[int, within(least=0)]] = 8
 
 
 @dataclass(frozen=True)
 class PageOptions(ViewOptions):
     """Settings of a web page, which has no photos."""
 
-    downscale: tyro.conf.Fixed[int] = 1  # type: ignore[assignment]
+    downscale: tyro.conf.Fixed[Literal[1, 2, 4, 8]] = 1
 
 
 @dataclass(frozen=True)
