@@ -16,8 +16,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
 from clsplat.show.camera_paths import around
 from clsplat.show.frames import picture
-from clsplat.show.pacing import Client
-from clsplat.show.viewer import JPEG_QUALITY
+from clsplat.show.pacing import JPEG_QUALITY, Client
 
 SHARES = (1.0, 0.5, 0.25)
 """Resolutions that are timed, as fractions of the window's edges."""

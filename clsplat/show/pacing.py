@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 from clsplat.camera import Camera
@@ -19,6 +20,14 @@ and sorting the Gaussians takes most of the time (docs/howto/viewer.md), and fra
 
 TRAINING_SHARE = 0.1
 """Largest fraction of a training's time that frames take while the camera stands still, 0 to 1."""
+
+
+JPEG_QUALITY = 90
+"""JPEG quality of frames. viser's default of 75 shows blocks in smooth depths."""
+
+VISER_RACE = "deque mutated during iteration"
+"""Error of viser if a browser's task begins to wait for messages while another thread hands one over: viser sets an
+asyncio.Event, which is not made for threads. The message is in its buffer, and leaves with the next one."""
 
 
 class Shown(NamedTuple):
@@ -50,6 +59,16 @@ class Client:
     shown: Shown | None = None
     outlines: dict[int, Any] = field(default_factory=dict)
     """Handles of the cameras' outlines, by the index of the view."""
+
+    def send(self, frame: Any) -> None:
+        """Send a frame (H, W, 3) in 8 bits to the browser."""
+        show = partial(self.handle.scene.set_background_image, frame, format="jpeg", jpeg_quality=JPEG_QUALITY)
+        try:
+            show()
+        except RuntimeError as error:
+            if str(error) != VISER_RACE:
+                raise
+            show()  # takes the first one along
 
     def share_due(self, now: float, settings: int, version: int) -> float:
         """Resolution of the next frame, as a fraction of the window's edges; 0 if no frame is due."""

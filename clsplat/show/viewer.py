@@ -24,7 +24,7 @@ from clsplat.renderer import Renderer, download
 from clsplat.show.browser_cameras import client_camera, whole_view
 from clsplat.show.camera_paths import Viewpoint
 from clsplat.show.frames import Look, picture, splash
-from clsplat.show.pacing import STILL_AFTER, Client, Shown
+from clsplat.show.pacing import STILL_AFTER, VISER_RACE, Client, Shown
 from clsplat.show.viewer_editing import Editing, Save
 from clsplat.show.viewer_look import LookInputs
 from clsplat.show.viewer_panel import Panel
@@ -35,9 +35,6 @@ from clsplat.show.viewer_tasks import Task, Tasks
 
 if TYPE_CHECKING:
     from clsplat.scene import View
-
-JPEG_QUALITY = 90
-"""JPEG quality of frames. viser's default of 75 shows blocks in smooth depths."""
 
 TEXT_EVERY = 0.25
 """Time between two updates of the panel's text, s."""
@@ -244,7 +241,7 @@ class Viewer:
         try:
             yield
         except Exception as error:
-            if not self._failed:
+            if not self._failed and str(error) != VISER_RACE:
                 self._failed = True
                 warnings.warn(f"the viewer failed: {_reason(error)}; its frames may be missing or old", stacklevel=3)
 
@@ -269,7 +266,7 @@ class Viewer:
         if not any(c is client for c in list(self._clients.values())):
             return  # the browser was closed in the meantime
         with self._harmless():
-            client.handle.scene.set_background_image(frame, format="jpeg", jpeg_quality=JPEG_QUALITY)
+            client.send(frame)
             if self._photos:
                 self._photos.fade(client.outlines, camera)
         now = time.perf_counter()

@@ -24,7 +24,7 @@ from clsplat.renderer import Renderer
 from clsplat.show.browser_cameras import client_camera, whole_view, wxyz_of
 from clsplat.show.camera_paths import first_photo
 from clsplat.show.frames import MODES, Look, picture
-from clsplat.show.pacing import FRAME_TIME, STILL_AFTER, Client
+from clsplat.show.pacing import FRAME_TIME, STILL_AFTER, VISER_RACE, Client
 from clsplat.show.viewer import Viewer
 from clsplat.show.viewer_statistics import POINTS_MAX
 from clsplat.show.viewer_tasks import TASKS_MAX
@@ -135,6 +135,22 @@ class TestResolution:
         assert [f.shape[1] for f in client.frames] == sorted({f.shape[1] for f in client.frames})
         np.testing.assert_array_equal(client.frames[-1], to_uint8(render(gaussians, cams[1], device=device).rgb))
         assert not viewer.draw(gaussians), "and nothing more"
+
+    def test_a_race_in_viser_loses_no_frame(self, viewer, clock, recwarn):
+        client = FakeClient(viewer, cameras()[1][0])
+        show = client.state.handle.scene.set_background_image
+
+        calls = []
+
+        def racing(frame, **options):
+            calls.append(frame)
+            if len(calls) == 1:
+                raise RuntimeError(VISER_RACE)
+            show(frame, **options)
+
+        client.state.handle.scene.set_background_image = racing
+        assert viewer.draw(cameras()[0])
+        assert len(client.frames) == 1 and not recwarn.list
 
     def test_a_movement_is_drawn_at_once_and_in_time(self, viewer, monkeypatch, clock):
         """If the time of a frame is proportional to its pixels, frames converge to FRAME_TIME."""
