@@ -42,7 +42,7 @@ class Gradients(NamedTuple):
 class Pass:
     """Results of a forward pass that its gradients need. Arrays are where the stages ran.
 
-    splats: those of the Gaussians. drawn: all that were composited, first those of the Gaussians and then those of the
+    splats: those of the Gaussians. drawn: all that were composited, those of the Gaussians before those of the
     backdrop, if there is one. disparities: those of all, where each pixel sorts them; otherwise None.
     """
 

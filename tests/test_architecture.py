@@ -34,7 +34,7 @@ LAYERS = """
     render dataset demo raster_gradients
     rasterization pruning
     training show
-    evaluate
+    evaluate blocks
     bench
     commands
     cli

@@ -74,8 +74,9 @@ def join_rows(device: Device, first: Any, second: Any) -> Any:
     """
     result = device.empty(f"joined rows of {first.shape[1:]}", (first.shape[0] + second.shape[0], *first.shape[1:]))
     # Blocks of the pool are larger than their arrays.
-    cl.enqueue_copy(device.queue, result.data, first.data, byte_count=first.nbytes)
-    cl.enqueue_copy(device.queue, result.data, second.data, byte_count=second.nbytes, dst_offset=first.nbytes)
+    data: Any = result.data
+    cl.enqueue_copy(device.queue, data, first.data, byte_count=first.nbytes)
+    cl.enqueue_copy(device.queue, data, second.data, byte_count=second.nbytes, dst_offset=first.nbytes)
     return result
 
 
