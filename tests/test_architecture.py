@@ -59,6 +59,7 @@ ONLY_IN = {
     "pyopencl": {"device", "programs", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
+    "distributed": {"blocks"},
     "av": {"dataset", "show"},
     "pillow_heif": {"dataset"},
     "sqlite3": set(),  # with pycolmap in the same process it causes a bus error, see COUNT_ROWS in matching.py

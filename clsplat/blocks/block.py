@@ -10,6 +10,7 @@ import numpy as np
 
 from clsplat.atomic import replacing
 from clsplat.blocks.jobs import Job, digest_of, read_job
+from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.survey import seen_by_block
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset import load_scene
@@ -53,13 +54,13 @@ def train_block(
 ) -> Path:
     """Train a block, unless its result exists; continue where an interrupted run has left a checkpoint.
 
-    The Gaussians of the coarse scene in the block and its margin train; the others that its photos show are drawn and
-    stay as they are. What lies in the block after the training is its result.
+    The Gaussians of the scene in the block and its margin train; the others that its photos show are drawn and stay
+    as they are. What lies in the block after the training is its result.
 
     Parameters
     ----------
     job_file : Path or str
-        As `clsplat.blocks.jobs.Job.write` wrote it, with the coarse scene beside it.
+        As `clsplat.blocks.jobs.Job.write` wrote it, with the scenes that it names beside it.
     loaded : list of View, optional
         The photos of the dataset. Default: they are read.
     device : Device, optional
@@ -83,12 +84,12 @@ def train_block(
     if result.exists():
         return result
     job = read_job(job_file)
-    coarse = read_coarse(job_file.with_name(job.coarse), job.config)
+    start = _start(job_file, job)
     views = job.views(load_scene(job.data, job.config.data).train if loaded is None else loaded)
     device = device or open_device(job.config)
     with held(work):
         if not result.exists():
-            gaussians = _trained(job, coarse, views, device, work, progress)
+            gaussians = _trained(job, start, views, device, work, progress)
             with replacing(log_of(job_file)) as file:
                 file.write((work / LOG).read_bytes())
             save_gaussians(result, gaussians, job.config.render.mode)
@@ -96,8 +97,18 @@ def train_block(
     return result
 
 
-def read_coarse(path: Path, config: TrainConfig) -> Gaussians:
-    """Read a coarse scene, whose file has its digest as its name, with all bands of the spherical harmonics.
+def _start(job_file: Path, job: Job) -> Gaussians:
+    """The Gaussians from which a block starts and those around it."""
+    scene = read_scene(job_file.with_name(job.scene), job.config)
+    scene = scene.take(job.near.contains(scene.means))
+    if job.near == EVERYWHERE:
+        return scene
+    far = read_scene(job_file.with_name(job.far), job.config)
+    return Gaussians.concatenate([scene, far.take(~job.near.contains(far.means))])
+
+
+def read_scene(path: Path, config: TrainConfig) -> Gaussians:
+    """Read a scene, whose file has its digest as its name, with all bands of the spherical harmonics.
 
     Raises
     ------
@@ -106,26 +117,26 @@ def read_coarse(path: Path, config: TrainConfig) -> Gaussians:
     """
     gaussians = load_gaussians(path)[0]
     if digest_of(path.read_bytes()) != path.stem:
-        raise InputError(f"{path}: expected the coarse scene as it was written, found a changed file")
+        raise InputError(f"{path}: expected a scene as it was written, found a changed file")
     missing = (config.init.sh_degree + 1) ** 2 - gaussians.sh.shape[1]
     return replace(gaussians, sh=np.pad(gaussians.sh, ((0, 0), (0, max(0, missing)), (0, 0))))
 
 
 def _trained(
-    job: Job, coarse: Gaussians, views: list[View], device: "Device", work: Path, progress: Progress
+    job: Job, start: Gaussians, views: list[View], device: "Device", work: Path, progress: Progress
 ) -> Gaussians:
     """Train the block in a folder that is held, and return what lies in it."""
     config = job.config
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
-    trains = job.wide.contains(coarse.means)
-    seen, shown = seen_by_block(renderer, coarse, trains, views)
+    trains = job.wide.contains(start.means)
+    seen, shown = seen_by_block(renderer, start, trains, views)
     scene = Scene(seen, [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     inputs = Inputs.of(scene, device)
     if (work / CHECKPOINT).exists():
         state = load_state(work / CHECKPOINT, scene.extent, config, inputs)
     else:
-        state = replace(initial_state(scene, config, coarse.take(trains)), inputs=inputs)
-    training = Training(scene, config, device, state, coarse.take(shown & ~trains))
+        state = replace(initial_state(scene, config, start.take(trains)), inputs=inputs)
+    training = Training(scene, config, device, state, start.take(shown & ~trains))
     gaussians = complete(training, work, progress=progress)
     inside = job.box.contains(gaussians.means)
     if not inside.any():

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from clsplat.atomic import replacing
-from clsplat.blocks.partition import Box
+from clsplat.blocks.partition import EVERYWHERE, Box
+from clsplat.blocks.plan import Block
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
@@ -17,6 +18,9 @@ from clsplat.scene import View
 from clsplat.training.checkpoint import FREE
 from clsplat.training.inputs import DIGEST_BYTES, Photo, named, photos_of
 from clsplat.training.presets import with_settings
+
+BOXES = ("near", "box", "wide")
+"""Boxes of a job."""
 
 FORMAT = 1
 """Version of the files of jobs."""
@@ -26,13 +30,16 @@ FORMAT = 1
 class Job:
     """How a block is trained.
 
-    data: folder of the dataset; coarse: name of the coarse scene's file, beside that of the job, which contains its
-    digest; box, wide: what the block keeps and trains; photos: digests of pixels and mask, by name; cameras: as the
-    scene has them, by name; config: settings of the block.
+    data: folder of the dataset; scene: name of the file, beside that of the job, of the Gaussians from which the
+    block starts and that surround it, named by its digest; near: where these are used; far: the file of those
+    elsewhere; box, wide: what the block keeps and trains; photos: digests of pixels and mask, by name; cameras: as
+    the scene has them, by name; config: settings of the block.
     """
 
     data: str
-    coarse: str
+    scene: str
+    near: Box
+    far: str
     box: Box
     wide: Box
     photos: dict[str, Photo]
@@ -53,9 +60,9 @@ class Job:
         return {
             "format": FORMAT,
             "data": self.data,
-            "coarse": self.coarse,
-            "box": [_face(side) for side in self.box],
-            "wide": [_face(side) for side in self.wide],
+            "scene": self.scene,
+            "far": self.far,
+            **{name: [_face(side) for side in getattr(self, name)] for name in BOXES},
             "photos": {
                 name: {"pixels": photo.pixels, "mask": photo.mask, "camera": self.cameras[name]}
                 for name, photo in self.photos.items()
@@ -96,12 +103,13 @@ class Job:
 
 
 def make_job(
-    data: Path, coarse: str, box: Box, wide: Box, views: list[View], photos: dict[str, Photo], config: TrainConfig
+    data: Path, scene: str, block: Block, views: list[View], photos: dict[str, Photo], config: TrainConfig
 ) -> Job:
-    """Make the job of a block from its photos and their digests."""
+    """Make the job of a block in a scene's file from its photos, the digests of all photos, and its settings."""
     names = [view.name for view in views]
     cameras = {view.name: asdict(view.camera) | {"viewmat": view.camera.viewmat.tolist()} for view in views}
-    return Job(str(data), coarse, box, wide, {name: photos[name] for name in names}, cameras, config)
+    own = {name: photos[name] for name in names}
+    return Job(str(data), scene, EVERYWHERE, scene, block.box, block.wide, own, cameras, config)
 
 
 def read_job(path: Path) -> Job:
@@ -116,11 +124,12 @@ def read_job(path: Path) -> Job:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT:
             raise InputError(f"{path}: expected a job of format {FORMAT}, found {content['format']!r}")
-        box, wide = (Box(_corner(content[name][0], -1), _corner(content[name][1], 1)) for name in ("box", "wide"))
+        boxes: dict[str, Any] = {n: Box(_corner(content[n][0], -1), _corner(content[n][1], 1)) for n in BOXES}
+        scenes: dict[str, Any] = {name: str(content[name]) for name in ("data", "scene", "far")}
         photos = {name: Photo(str(p["pixels"]), str(p["mask"]), []) for name, p in content["photos"].items()}
         cameras = {name: dict(p["camera"]) for name, p in content["photos"].items()}
         config = with_settings(TrainConfig(), content["config"], str(path))
-        job = Job(str(content["data"]), str(content["coarse"]), box, wide, photos, cameras, config)
+        job = Job(**scenes, **boxes, photos=photos, cameras=cameras, config=config)
         digest = job.digest
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error

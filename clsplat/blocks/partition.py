@@ -26,10 +26,10 @@ class Box(NamedTuple):
         """Whether points (N, 3) are in the box, (N,)."""
         return np.asarray(((points >= self.low) & (points < self.high)).all(axis=1))
 
-    def widened(self, points: Array) -> "Box":
-        """The box with its margin, which follows the extent of those of the points (N, 3) that are in it."""
+    def widened(self, points: Array, by: float) -> "Box":
+        """The box with a margin of the width `by`, in extents of those of the points (N, 3) that are in it."""
         inside = points[self.contains(points)]
-        margins = MARGIN * _extent(inside) if len(inside) else np.zeros(3)
+        margins = by * _extent(inside) if len(inside) else np.zeros(3)
         low, high = np.asarray(self.low) - margins, np.asarray(self.high) + margins  # infinity stays infinite
         return Box(tuple(low.tolist()), tuple(high.tolist()))
 

@@ -1,12 +1,12 @@
 """The numbers of a training in blocks: the coarse run, how many blocks, their photos, Gaussians and memory."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.blocks.partition import Box, cut
+from clsplat.blocks.partition import EVERYWHERE, MARGIN, Box, cut
 from clsplat.blocks.survey import block_weights, chosen_photos
 from clsplat.config import CoarseConfig, TrainConfig
 from clsplat.errors import InputError
@@ -14,6 +14,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene
 from clsplat.training.autosize.validation import FEWEST_PHOTOS
+from clsplat.training.densify import STRATEGIES
 from clsplat.training.memory import Footprint, bytes_text
 from clsplat.training.outcome import FEWEST_GAUSSIANS
 from clsplat.training.run_length import with_iterations
@@ -30,6 +31,17 @@ COARSE_LENGTH = 1 / 3
 COARSE_SHARE = 1 / COARSE_FACTOR**2
 """Gaussians of the coarse run, as a fraction of those of the whole scene: as many per pixel."""
 
+REFINING_LENGTH = 1 / 2
+"""Iterations of a block's second training, among the trained blocks, as a fraction of those of its first one."""
+
+REFINING_RATE = 1 / 10
+"""Factor on the first learning rate of the means in the second training, which so is that in the middle of a training,
+whose rate falls by a factor of 100."""
+
+NEAR = 0.25
+"""Width of the surroundings that the second training draws as they were trained, where memory is too small for all of
+them, as a fraction of the block's extent. Beyond, the coarse scene is drawn."""
+
 COARSE_MEMORY = 1 / 4
 """Fraction of the memory's limit that the Gaussians of the coarse run may take: each block draws them too."""
 
@@ -37,12 +49,14 @@ COARSE_MEMORY = 1 / 4
 class Block(NamedTuple):
     """A part of the scene.
 
-    box: what it keeps; wide: what it trains, with the margin; photos: indices of training photos; gaussians: expected
-    number, margin included; backdrop: most Gaussians of the coarse scene around it.
+    box: what it keeps; wide: what it trains, with the margin; near: what its second training draws as it was trained;
+    photos: indices of training photos; gaussians: expected number, margin included; backdrop: expected Gaussians
+    around it in either training.
     """
 
     box: Box
     wide: Box
+    near: Box
     photos: NDArray[np.intp]
     gaussians: int
     backdrop: int
@@ -60,6 +74,7 @@ class Plan(NamedTuple):
         photos = [len(block.photos) for block in self.blocks]
         bytes_of = [sum(scene.train[i].image.nbytes for i in block.photos) for block in self.blocks]
         steps = sum(block_config(config, scene, block).iterations for block in self.blocks)
+        steps += round(REFINING_LENGTH * steps)
         largest = max(block.gaussians for block in self.blocks)
         return (
             f"blocks: {len(self.blocks)}, each with {min(photos)} to {max(photos)} of {len(scene.train)} photos "
@@ -119,6 +134,20 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
     )
 
 
+def refining_config(config: TrainConfig, gaussians: int) -> TrainConfig:
+    """The configuration of a block's second training, of the Gaussians that it has."""
+    still: dict[str, Any] = {name: replace(getattr(config, name), stop_fraction=0.0) for name in STRATEGIES}
+    return replace(
+        config,
+        **still,
+        size="fixed",
+        max_gaussians=gaussians,
+        iterations=max(1, round(REFINING_LENGTH * config.iterations)),
+        optim=replace(config.optim, means_lr=REFINING_RATE * config.optim.means_lr),
+        coarse=CoarseConfig(),
+    )
+
+
 def expected_total(config: TrainConfig, coarse: int) -> int:
     """Expected number of Gaussians of the whole scene, by the configuration or by those of the coarse run."""
     return round(coarse / COARSE_SHARE) if config.max_gaussians is None else config.max_gaussians
@@ -171,18 +200,23 @@ def make_plan(coarse: Gaussians, scene: Scene, config: TrainConfig, renderer: Re
             )
         blocks = _cut(coarse, count, config)
         memory = _memory(blocks, need)
+    among_all = _cut(coarse, count, config, everything_near=True)
+    if _memory(among_all, need) <= limit:
+        blocks, memory = among_all, _memory(among_all, need)
     total = expected_total(config, len(coarse))
     return Plan(_with_photos(blocks, coarse, scene, config, renderer), total, memory)
 
 
-def _cut(coarse: Gaussians, count: int, config: TrainConfig) -> list[Block]:
+def _cut(coarse: Gaussians, count: int, config: TrainConfig, everything_near: bool = False) -> list[Block]:
     means, total = coarse.means, expected_total(config, len(coarse))
     blocks = []
     for box in cut(means, count):
-        wide = box.widened(means)
-        trains = int(wide.contains(means).sum())
-        size = max(1, round(total * trains / len(coarse)))
-        blocks.append(Block(box, wide, np.zeros(0, np.intp), size, len(coarse) - trains))
+        wide = box.widened(means, MARGIN)
+        near = EVERYWHERE if everything_near else box.widened(means, MARGIN + NEAR)
+        trains, drawn = (wide.contains(means), near.contains(means))
+        size = max(1, round(total * trains.mean()))
+        backdrop = round(total * (drawn & ~trains).mean()) + int((~drawn).sum())
+        blocks.append(Block(box, wide, near, np.zeros(0, np.intp), size, max(backdrop, int((~trains).sum()))))
     return blocks
 
 

@@ -1,4 +1,4 @@
-"""What the coarse scene shows in photos: the weights of its Gaussians, by which blocks choose photos and pixels."""
+"""What a scene shows in photos: the weights of its Gaussians, by which blocks choose photos and share pixels."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -98,7 +98,7 @@ def seen_by_block(
 ) -> tuple[list[View], NDArray[np.bool_]]:
     """Make the photos as a block should see them, and find the Gaussians that they show.
 
-    Let C be the coarse scene's image, P the photo, and m the block's share in the weights of a pixel. The image is
+    Let C be the scene's image, P the photo, and m the block's share in the weights of a pixel. The image is
     linear in the weights, so the block's part in the difference P - C is m (P - C), and what the block trains on is
     C + m (P - C). Where only its surroundings are visible, it finds the image that they make, and no error to mend.
 
@@ -106,7 +106,7 @@ def seen_by_block(
     ----------
     renderer : Renderer
     gaussians : Gaussians of N >= 1 rows
-        The coarse scene, on the host.
+        The scene, on the host.
     trains : (N,) bool
         The Gaussians that the block trains.
     views : iterable of View
@@ -118,12 +118,12 @@ def seen_by_block(
     shown : (N,) bool
         The Gaussians that have a weight in any of them.
     """
-    coarse, marks = renderer.place(gaussians), renderer.place(_marked(gaussians, trains))
+    placed, marks = renderer.place(gaussians), renderer.place(_marked(gaussians, trains))
     black = Renderer(renderer.device or "reference", renderer.config)
     shown = np.zeros(len(gaussians), bool)
     result = []
     for view in views:
-        run = renderer.forward(coarse, view.camera)
+        run = renderer.forward(placed, view.camera)
         shown |= _weights(renderer, run) > 0
         image = np.clip(download(run.image.rgb), 0, 1, dtype=np.float64)
         marked = black.forward(marks, view.camera, gradients=False).image

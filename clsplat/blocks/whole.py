@@ -4,16 +4,26 @@ import json
 import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from clsplat.atomic import replacing
-from clsplat.blocks.block import Progress, log_of, read_coarse, result_of, train_block
+from clsplat.blocks.block import Progress, log_of, read_scene, result_of, train_block
 from clsplat.blocks.jobs import digest_of, make_job, read_job
-from clsplat.blocks.plan import COARSE_FACTOR, block_config, check_blocks, coarse_config, make_plan, one_fits
+from clsplat.blocks.plan import (
+    COARSE_FACTOR,
+    Block,
+    block_config,
+    check_blocks,
+    coarse_config,
+    make_plan,
+    one_fits,
+    refining_config,
+)
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.formats import load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
@@ -43,7 +53,7 @@ def plan_blocks(
     out: Path,
     watch: Watch,
     tell: Callable[[str], None],
-) -> list[Path]:
+) -> tuple[list[Path], list[Block]]:
     """Train the coarse scene, cut it into blocks, and write a job for each.
 
     What an interrupted run has finished is not done again.
@@ -64,8 +74,9 @@ def plan_blocks(
 
     Returns
     -------
-    list of Path
-        The files of the jobs, in the order of the blocks; empty if one block is enough.
+    jobs : list of Path
+        Their files, in the order of the blocks; empty if one block is enough.
+    blocks : list of Block
 
     Raises
     ------
@@ -75,24 +86,61 @@ def plan_blocks(
     check_blocks(config)
     if one_fits(scene, config, device):
         tell(f"blocks: one is enough for {config.max_gaussians} Gaussians")
-        return []
+        return [], []
     folder = out / BLOCKS
     folder.mkdir(parents=True, exist_ok=True)
     photos = photos_of(scene.train, scene.offset)
     file, seconds = _coarse(scene, config, device, folder, json.dumps(photos), watch)
-    coarse = read_coarse(file, config)
+    coarse = read_scene(file, config)
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     plan = make_plan(coarse, scene, config, renderer)
     if len(plan.blocks) == 1:
         tell(f"blocks: one is enough for about {plan.total} Gaussians")
-        return []
+        return [], []
     tell(plan.describe(config, scene, seconds * COARSE_FACTOR**2))
     jobs = []
     for block in plan.blocks:
         views = [scene.train[i] for i in block.photos]
         settings = block_config(config, scene, block)
-        jobs.append(make_job(data.resolve(), file.name, block.box, block.wide, views, photos, settings).write(folder))
-    return jobs
+        jobs.append(make_job(data.resolve(), file.name, block, views, photos, settings).write(folder))
+    return jobs, plan.blocks
+
+
+def plan_refinement(jobs: list[Path], blocks: list[Block]) -> list[Path]:
+    """Write the jobs of the second trainings, in which each block has the trained ones around it.
+
+    In the first trainings each block is surrounded by the coarse scene. Together, the blocks are therefore worse than
+    a scene that has been trained as a whole.
+
+    Parameters
+    ----------
+    jobs : list of Path
+        Those of the first trainings, all of which have results.
+    blocks : list of Block
+        As `plan_blocks` returned them.
+
+    Returns
+    -------
+    list of Path
+        The files of the jobs, in the order of the blocks.
+    """
+    scene, first = merge(jobs), [read_job(job) for job in jobs]
+    name = _save(scene, jobs[0].parent, first[0].config)
+    refined = []
+    for job, block in zip(first, blocks, strict=True):
+        settings = refining_config(job.config, int(block.wide.contains(scene.means).sum()))
+        refined.append(replace(job, scene=name, near=block.near, config=settings).write(jobs[0].parent))
+    return refined
+
+
+def _save(gaussians: Gaussians, folder: Path, config: TrainConfig) -> str:
+    """Write a scene to a file that is named by its digest; return the name."""
+    with TemporaryDirectory(dir=folder) as beside:
+        file = Path(beside) / "scene.ply"
+        save_gaussians(file, gaussians, config.render.mode)
+        name = f"{digest_of(file.read_bytes())}.ply"
+        file.replace(folder / name)
+    return name
 
 
 def _coarse(
@@ -107,16 +155,17 @@ def _coarse(
         with watch("coarse run", settings) as progress:
             resume = (work / CHECKPOINT).exists()
             gaussians = train(scene, settings, work, device, resume=resume, progress=progress)
-        save_gaussians(folder / "coarse.ply", gaussians, settings.render.mode)
-        name = f"{digest_of((folder / 'coarse.ply').read_bytes())}.ply"
-        (folder / "coarse.ply").replace(folder / name)
-        log = [json.loads(line) for line in (work / LOG).read_text().splitlines()]
-        record = {"scene": name, "log": log}
+        seconds = read_log(work / LOG)[-1]["seconds"] / settings.iterations
         with replacing(done) as file:
-            file.write(json.dumps(record).encode())
+            file.write(json.dumps({"scene": _save(gaussians, folder, settings), "seconds": seconds}).encode())
         shutil.rmtree(work, ignore_errors=True)
     record = json.loads(done.read_text())
-    return folder / record["scene"], record["log"][-1]["seconds"] / settings.iterations
+    return folder / record["scene"], record["seconds"]
+
+
+def unfinished(jobs: list[Path]) -> list[Path]:
+    """The jobs that have no result."""
+    return [job for job in jobs if not result_of(job).exists()]
 
 
 def run_here(jobs: list[Path], scene: Scene, device: "Device", watch: Watch) -> None:

@@ -1,5 +1,6 @@
 """Training in blocks from the command line: its progress, its clusters, and the command `block`."""
 
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,17 +13,36 @@ from clsplat.commands.console import say
 from clsplat.commands.progress import Progress
 
 if TYPE_CHECKING:
+    from clsplat.blocks.whole import Watch
     from clsplat.config import TrainConfig
+    from clsplat.device import Device
     from clsplat.gaussians import Gaussians
     from clsplat.renderer import Renderer
     from clsplat.scene import Scene
 
 
+@dataclass(frozen=True)
+class ClusterOptions:
+    """Settings of where blocks train."""
+
+    scheduler: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """Scheduler of dask whose workers train the blocks, such as tcp://host:8786; needs the extra `cluster`."""
+    print_jobs: bool = False
+    """Print the commands that train the blocks, for a batch system, and stop. When they have run, the same command
+    with --resume goes on: the first time it prints those of the second trainings, then it merges."""
+
+
 def train_in_blocks(
-    scene: "Scene", config: "TrainConfig", renderer: "Renderer", data: Path, out: Path
+    scene: "Scene", config: "TrainConfig", renderer: "Renderer", data: Path, out: Path, where: ClusterOptions
 ) -> "Gaussians | None":
-    """Train the blocks of a scene and merge them; None if one block is enough."""
-    from clsplat.blocks.whole import merge, plan_blocks, run_here, write_log
+    """Train the blocks of a scene and merge them; None if one block is enough.
+
+    Raises
+    ------
+    JobsPrinted
+        If `where` asks for commands, and blocks have to be trained.
+    """
+    from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
     from clsplat.evaluate import mean_metrics
 
     @contextmanager
@@ -33,14 +53,36 @@ def train_in_blocks(
             yield progress.after
 
     assert renderer.device
-    jobs = plan_blocks(scene, config, renderer.device, data, out, watch, say)
-    if not jobs:
+    first, blocks = plan_blocks(scene, config, renderer.device, data, out, watch, say)
+    if not first:
         return None
-    run_here(jobs, scene, renderer.device, watch)
-    gaussians = merge(jobs)
+    _run(first, scene, renderer.device, watch, where)
+    second = plan_refinement(first, blocks)
+    _run(second, scene, renderer.device, watch, where)
+    gaussians = merge(second)
     scores = mean_metrics(gaussians, scene.test, renderer) if scene.test else {}
-    write_log(out, jobs, {"num_gaussians": len(gaussians)} | scores)
+    write_log(out, [*first, *second], {"num_gaussians": len(gaussians)} | scores)
     return gaussians
+
+
+class JobsPrinted(Exception):
+    """The commands that train blocks have been printed, and are left to others."""
+
+
+def _run(jobs: list[Path], scene: "Scene", device: "Device", watch: "Watch", where: ClusterOptions) -> None:
+    """Train the blocks that have no result, where the options say."""
+    from clsplat.blocks.whole import run_here, unfinished
+
+    if where.print_jobs and unfinished(jobs):
+        for job in unfinished(jobs):
+            print(shlex.join(["clsplat", "block", str(job.resolve())]))
+        raise JobsPrinted
+    if where.scheduler is not None:
+        from clsplat.blocks.cluster import run_on_cluster
+
+        run_on_cluster(where.scheduler, jobs, say)
+    else:
+        run_here(jobs, scene, device, watch)
 
 
 @dataclass(frozen=True)

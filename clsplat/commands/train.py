@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from clsplat.commands import console
+from clsplat.commands.blockwise import ClusterOptions, JobsPrinted, train_in_blocks
 from clsplat.commands.console import (
     DeviceName,
     Out,
@@ -56,6 +57,7 @@ class Train:
     viewer: bool = False
     """Watch and pause the training in the browser, as --open does; needs the extra `viewer`."""
     server: Annotated[ServerOptions, tyro.conf.arg(name="")] = field(default_factory=ServerOptions)
+    cluster: Annotated[ClusterOptions, tyro.conf.arg(name="")] = field(default_factory=ClusterOptions)
     preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
     """Named settings to start from instead of the defaults; flags override them."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -83,7 +85,11 @@ class Train:
         if self.resume and not began(out):
             raise no_checkpoint(out)
         with held(out):
-            gaussians, viewer = self.trained(out, suffix)
+            try:
+                gaussians, viewer = self.trained(out, suffix)
+            except JobsPrinted:
+                say("when these commands have run, go on with the same one and --resume")
+                return
         if viewer:
             say(f"viewer: {viewer.address} stays open; Ctrl-C ends it")
             with suppress(KeyboardInterrupt):
@@ -120,17 +126,18 @@ class Train:
         self, scene: "Scene", config: TrainConfig, device: "Device", out: Path, viewer: "Viewer | None"
     ) -> "Gaussians":
         """Train in blocks, if the configuration asks for them and one is not enough; otherwise all at once."""
-        from clsplat.commands.blockwise import train_in_blocks
         from clsplat.renderer import Renderer
         from clsplat.training.checkpoint import CHECKPOINT
 
+        if config.blocks == 1 and self.cluster != ClusterOptions():
+            raise InputError("--scheduler, --print-jobs: expected with --blocks, found --blocks 1; add --blocks auto")
         if config.blocks != 1:
             if viewer:
                 raise InputError(
                     "--viewer: expected not with --blocks, which train apart from each other; leave out one"
                 )
             renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
-            gaussians = train_in_blocks(scene, config, renderer, self._photos(out), out)
+            gaussians = train_in_blocks(scene, config, renderer, self._photos(out), out, self.cluster)
             if gaussians is not None:
                 self._began(out)()
                 report(gaussians, scene, config, renderer, out)

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Planned, plan, unseen
 from PIL import Image
+from small_plan import Planned, plan, unseen
 
-from clsplat.blocks.block import result_of, train_block
+from clsplat.blocks.block import _start, read_scene, result_of, train_block
 from clsplat.blocks.jobs import read_job
+from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.survey import seen_by_block
-from clsplat.blocks.whole import merge, plan_blocks, write_log
+from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
@@ -144,11 +145,11 @@ def test_a_damaged_job_is_one_sentence(planned: Planned, case: str) -> None:
 
 
 def test_another_coarse_scene(planned: Planned, device: Device) -> None:
-    coarse = planned.jobs[0].with_name(read_job(planned.jobs[0]).coarse)
+    coarse = planned.jobs[0].with_name(read_job(planned.jobs[0]).scene)
     first, second = (bytearray(coarse.read_bytes()) for _ in range(2))
     second[-1] ^= 1
     coarse.write_bytes(second)
-    with pytest.raises(InputError, match="expected the coarse scene as it was written, found a changed file"):
+    with pytest.raises(InputError, match="expected a scene as it was written, found a changed file"):
         train_block(planned.jobs[0], planned.scene.train, device)
     assert first != second
 
@@ -156,5 +157,29 @@ def test_another_coarse_scene(planned: Planned, device: Device) -> None:
 def test_one_block_that_fits_needs_no_coarse_run(planned: Planned, device: Device, tmp_path: Path) -> None:
     told: list[str] = []
     config = replace(planned.config, blocks="auto")
-    assert plan_blocks(planned.scene, config, device, planned.data, tmp_path / "new", unseen, told.append) == []
-    assert told == ["blocks: one is enough for 160 Gaussians"] and not (tmp_path / "new").exists()
+    assert plan_blocks(planned.scene, config, device, planned.data, tmp_path / "new", unseen, told.append) == ([], [])
+    assert told == ["blocks: one is enough for 240 Gaussians"] and not (tmp_path / "new").exists()
+
+
+def test_a_second_training_is_surrounded_by_the_first_ones(planned: Planned, device: Device) -> None:
+    for job in planned.jobs:
+        train_block(job, planned.scene.train, device)
+    second = plan_refinement(planned.jobs, planned.blocks)
+    assert second == plan_refinement(planned.jobs, planned.blocks) and not set(second) & set(planned.jobs)
+    first = merge(planned.jobs)
+    job = read_job(second[0])
+    np.testing.assert_array_equal(read_scene(second[0].with_name(job.scene), job.config).means, first.means)
+    assert job.near == EVERYWHERE, "all fits"
+    counts = [len(load_gaussians(train_block(path, planned.scene.train, device))[0]) for path in second]
+    assert abs(sum(counts) - len(first)) <= 0.05 * len(first), "none are added; some move across the border"
+
+    # Where memory is small, what is farther away is coarse.
+    near = planned.blocks[0].wide
+    path = plan_refinement(planned.jobs, [block._replace(near=near) for block in planned.blocks])[0]
+    far = read_scene(path.with_name(job.far), job.config)
+    start = _start(path, read_job(path))
+    inside = near.contains(first.means)
+    np.testing.assert_array_equal(
+        start.means, np.concatenate([first.means[inside], far.means[~near.contains(far.means)]])
+    )
+    assert 0 < inside.sum() < len(first)

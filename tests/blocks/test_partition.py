@@ -30,11 +30,11 @@ def test_a_margin_surrounds_shared_faces() -> None:
     points = np.random.default_rng(0).uniform(size=(10_000, 3))
     points[:, 0] *= 2
     left, right = cut(points, 2)
-    wide = left.widened(points)
+    wide = left.widened(points, MARGIN)
     assert wide.low == (-np.inf,) * 3 and wide.high[1:] == (np.inf,) * 2
     # Nine tenths of the side of 1 lie between the quantiles.
     np.testing.assert_allclose(wide.high[0] - left.high[0], MARGIN * 0.9, rtol=0.02)
-    both = wide.contains(points) & right.widened(points).contains(points)
+    both = wide.contains(points) & right.widened(points, MARGIN).contains(points)
     assert 0.08 < both.mean() < 0.1
 
 
@@ -43,4 +43,4 @@ def test_fewer_points_than_boxes() -> None:
     assert len(boxes) == 4
     assert sum(int(box.contains(np.zeros((1, 3)))[0]) for box in boxes) == 1
     assert sum(int(box.contains(np.ones((1, 3)))[0]) for box in cut(np.zeros((0, 3)), 3)) == 1
-    assert Box((0, 0, 0), (1, 1, 1)).widened(np.zeros((0, 3))) == Box((0, 0, 0), (1, 1, 1))
+    assert Box((0, 0, 0), (1, 1, 1)).widened(np.zeros((0, 3)), 0.5) == Box((0, 0, 0), (1, 1, 1))

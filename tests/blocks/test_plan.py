@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import CONFIG
+from small_plan import CONFIG
 from small_run import known_scene
 
 from clsplat.blocks.partition import EVERYWHERE
-from clsplat.blocks.plan import Block, block_config, check_blocks, coarse_config, make_plan, one_fits
+from clsplat.blocks.plan import REFINING_LENGTH, Block, block_config, check_blocks, coarse_config, make_plan, one_fits
 from clsplat.config import TrainConfig
 from clsplat.device import Device
 from clsplat.errors import InputError
@@ -36,11 +36,12 @@ def test_auto_takes_the_fewest_blocks_that_fit() -> None:
     assert plan.memory <= device.memory_limit and plan.total == SIZE
     fewer = make_plan(coarse, scene, replace(config, blocks=count - 1), Renderer(device))
     assert fewer.memory > device.memory_limit
-    assert 3 <= count <= 6
+    assert 3 <= count <= 12
     assert sum(int(block.box.contains(coarse.means).sum()) for block in plan.blocks) == len(coarse)
     text = plan.describe(config, scene, 1.0)
-    assert text.startswith(f"blocks: {count}, each with 9 to 12 of 12 photos") or "of 12 photos" in text
-    assert f"about {SIZE} Gaussians in all, {count * 40} iterations, {max(1, round(count * 40 / 60))} minutes" in text
+    steps = count * 40 + round(count * 40 * REFINING_LENGTH)
+    assert text.startswith(f"blocks: {count}, each with 8 to ") and " of 12 photos" in text
+    assert f"about {SIZE} Gaussians in all, {steps} iterations, {round(steps / 60)} minutes" in text
 
 
 def test_nothing_fits() -> None:
@@ -77,7 +78,7 @@ def test_configurations(device: Device) -> None:
     config = replace(CONFIG, iterations=9000, max_gaussians=1000)
     coarse = coarse_config(config, scene, device)
     assert (coarse.iterations, coarse.max_gaussians, coarse.coarse.factor) == (3000, 250, 2)
-    block = Block(EVERYWHERE, EVERYWHERE, np.arange(3), 300, 0)
+    block = Block(EVERYWHERE, EVERYWHERE, EVERYWHERE, np.arange(3), 300, 0)
     settings = block_config(config, scene, block)
     # Three photos alone would train for 3000 iterations; a quarter of all photos' visits are 2250.
     assert (settings.iterations, settings.max_gaussians, settings.optim.sh_degree_every) == (3000, 300, 1)
