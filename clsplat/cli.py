@@ -54,7 +54,7 @@ DESCRIPTION = """3D Gaussian Splatting on any OpenCL device. COMMAND --help show
 --help-all shows all. Every command accepts -q (--quiet: only warnings and errors) and -v (--verbose: also messages of
 structure from motion and of the driver's compiler, and tracebacks of errors). --version prints the version."""
 
-COMMANDS = Train | Block | View | Export | Render | Eval | Compact | Info | Frames | Sfm | Devices | Demo | Bench
+COMMANDS = Train | View | Export | Render | Eval | Compact | Info | Frames | Sfm | Block | Devices | Demo | Bench
 
 
 def set_loudness(arguments: list[str]) -> list[str]:

@@ -35,8 +35,8 @@ REFINING_LENGTH = 1 / 2
 """Iterations of a block's second training, among the trained blocks, as a fraction of those of its first one."""
 
 REFINING_RATE = 1 / 10
-"""Factor on the first learning rate of the means in the second training, which so is that in the middle of a training,
-whose rate falls by a factor of 100."""
+"""Factor on the first learning rate of the means in the second training. It becomes that of the middle of a training,
+in which the rate falls by a factor of 100."""
 
 NEAR = 0.25
 """Width of the surroundings that the second training draws as they were trained, where memory is too small for all of

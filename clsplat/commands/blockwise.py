@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from clsplat.commands.console import say
+from clsplat.commands.options import ClusterOptions
 from clsplat.commands.progress import Progress
 
 if TYPE_CHECKING:
@@ -19,17 +20,6 @@ if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.renderer import Renderer
     from clsplat.scene import Scene
-
-
-@dataclass(frozen=True)
-class ClusterOptions:
-    """Settings of where blocks train."""
-
-    scheduler: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
-    """Scheduler of dask whose workers train the blocks, such as tcp://host:8786; needs the extra `cluster`."""
-    print_jobs: bool = False
-    """Print the commands that train the blocks, for a batch system, and stop. When they have run, the same command
-    with --resume goes on: the first time it prints those of the second trainings, then it merges."""
 
 
 def train_in_blocks(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from clsplat.commands import console
-from clsplat.commands.blockwise import ClusterOptions, JobsPrinted, train_in_blocks
+from clsplat.commands.blockwise import JobsPrinted, train_in_blocks
 from clsplat.commands.console import (
     DeviceName,
     Out,
@@ -25,7 +25,7 @@ from clsplat.commands.console import (
     warn,
     write_json,
 )
-from clsplat.commands.options import ServerOptions
+from clsplat.commands.options import ClusterOptions, ServerOptions
 from clsplat.commands.progress import train_with_progress
 from clsplat.commands.run_folders import CONFIG, FRAMES
 from clsplat.commands.viewing import open_viewer
