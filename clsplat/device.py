@@ -15,6 +15,7 @@ from numpy.typing import DTypeLike
 
 from clsplat import constants
 from clsplat.errors import DeviceError, InputError
+from clsplat.processors import name_processor, vector_width
 from clsplat.programs import Subgroups, ask, build, build_options, inline_includes, kernel_folder, probe_subgroups
 
 POCL_HINT = "install one, for example the embedded CPU driver: pip install 'clsplat[pocl]'"
@@ -137,6 +138,7 @@ class Device:
         self.real: np.dtype[Any] = np.dtype(real)
         if self.real == np.float64 and "cl_khr_fp64" not in self.cl_device.extensions:
             raise DeviceError(f"{self.label}: expected a device with double precision (cl_khr_fp64) for float64")
+        self._level = name_processor(self.cl_device)
         self.context = cl.Context([self.cl_device])
         self.queue = cl.CommandQueue(self.context)
         self.memory_limit = min(memory_limit or self.cl_device.global_mem_size, self.cl_device.global_mem_size)
@@ -192,13 +194,8 @@ class Device:
 
     @cached_property
     def vector_width(self) -> int:
-        """Number of floats in the vectors of kernels for CPUs: 16 if the compiler has registers for them, else 8.
-
-        PoCL 3.0 (LLVM 14) compiles for AMD's Zen 4, which has AVX-512, as for a Zen 3, which has not. No Zen that
-        LLVM knows under an earlier name has vectors of 16.
-        """
-        mismatched = "znver" in ask(self.cl_device, "version", "")
-        return 16 if ask(self.cl_device, "native_vector_width_float", 1) >= 16 and not mismatched else 8
+        """Number of floats in the vectors of kernels for CPUs: 8 or 16."""
+        return vector_width(self.cl_device, self._level)
 
     def _check_size(self, what: str, nbytes: int) -> None:
         limit = self.cl_device.max_mem_alloc_size
@@ -338,6 +335,8 @@ class Device:
         If a build with subgroups fails, a warning says so, and the device uses none. They change no result.
         """
         source, values = inline_includes(f"{stage}.cl", kernel_folder()), self.model | defines
+        if self._level:  # a key of PoCL's cache, which processors of other levels may share
+            values["PROCESSOR"] = self._level
         if values.get("SUBGROUPS") != 1:
             return build(self.context, source, build_options(self.real, values))
         try:

@@ -24,7 +24,7 @@ STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__i
 # A unit is a package or a module of the top level. It imports only from the rows above its own.
 LAYERS = """
     constants errors randomness display
-    ranges json_lines
+    ranges json_lines processors
     config atomic
     camera gaussians
     scene stages metrics panorama programs
