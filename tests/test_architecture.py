@@ -28,6 +28,7 @@ LAYERS = """
     config atomic
     camera gaussians
     scene stages metrics panorama programs
+    buffers
     structs reference device
     ops testing formats
     renderer selftest
@@ -56,7 +57,7 @@ BENCH_KERNELS = {"roof"}
 
 # The only units that may import certain third-party packages, which are optional or slow to import.
 ONLY_IN = {
-    "pyopencl": {"device", "programs", "ops"},
+    "pyopencl": {"buffers", "device", "programs", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
     "av": {"dataset", "show"},

@@ -151,10 +151,10 @@ class TestBuffers:
         def allocate(size):
             raise cl.MemoryError("clCreateBuffer failed: MEM_OBJECT_ALLOCATION_FAILURE")
 
-        pool = device._pool
+        pool = device.buffers.pool
         sizes = {"managed_bytes": 0, "bin_number": pool.bin_number, "alloc_size": pool.alloc_size}
         full = SimpleNamespace(**sizes, allocate=allocate, free_held=lambda: None)
-        monkeypatch.setattr(device, "_pool", full)
+        monkeypatch.setattr(device.buffers, "pool", full)
         with pytest.raises(DeviceError, match=r"splats: .* has no memory left for 4 MiB; use fewer Gaussians"):
             device.empty("splats", (1024, 1024))
 
