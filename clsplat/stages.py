@@ -118,6 +118,18 @@ class Removal(NamedTuple):
     pulls: Any
 
 
+class RayColors(NamedTuple):
+    """Result of compositing samples along R rays.
+
+    rgb (R, 3), background included; transmittances (S,): light that reaches each sample, 0 behind the end of its ray;
+    behind (R,): light that reaches the background.
+    """
+
+    rgb: Any
+    transmittances: Any
+    behind: Any
+
+
 class AdamStep(NamedTuple):
     """One step of the optimiser: its number, counted from 1, and its constants.
 
@@ -228,6 +240,17 @@ class Stages(Protocol):
         self, keys: Array, bits: int, method: str = "auto", *, values: Array = None
     ) -> tuple[Array, Array]: ...
     def argsort_segments(self, keys: Array, bits: int, ranges: Array, values: Array = None) -> Array: ...
+    def rays_fwd(self, sigmas: Array, colors: Array, deltas: Array, first: Array, background: Any) -> RayColors: ...
+    def rays_bwd(
+        self,
+        sigmas: Array,
+        colors: Array,
+        deltas: Array,
+        first: Array,
+        background: Any,
+        transmittances: Array,
+        v_rgb: Array,
+    ) -> tuple[Array, Array]: ...
 
 
 FUNCTIONS: tuple[str, ...] = tuple(name for name in vars(Stages) if not name.startswith("_"))

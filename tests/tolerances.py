@@ -50,6 +50,10 @@ DOUBLE = {
     "squares": _REORDERED,
     "pulls": _CANCELS,
     "moved means": _REORDERED,
+    "ray colours": _REORDERED,
+    "transmittances": _REORDERED,
+    "v_sigmas": _CANCELS,
+    "v_ray colours": _REORDERED,
     "moved world": Tolerance(1e-9, 1e-11, "float64: translations of 10 units and scales of 40 cost three digits"),
 }
 
@@ -73,6 +77,10 @@ FLOAT = {
     "loss": Tolerance(1e-6, 0, "float32: sums over 24 vectors of 64 rows, then a tree"),
     "v_image": Tolerance(1e-5, 3e-6, "float32: SSIM's variances cancel where the image is flat"),
     "v_affine": Tolerance(1e-4, 1e-5, _SUM),
+    "ray colours": Tolerance(1e-5, 1e-6, "float32: sixty products, each with an exp"),
+    "transmittances": Tolerance(3e-5, 1e-6, "float32: sixty products, each with an exp"),
+    "v_sigmas": Tolerance(1e-4, 5e-6, "float32: a colour less that behind it cancels"),
+    "v_ray colours": Tolerance(3e-5, 1e-6, "float32: as for transmittances"),
     "v_means2d": Tolerance(1e-4, 2e-5, _SUM),
     "v_conics": Tolerance(1e-4, 1e-5, _SUM),
     "v_opacities": Tolerance(1e-4, 2e-5, _SUM),

@@ -19,6 +19,7 @@ from clsplat.ops.loss import l1_ssim
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
 from clsplat.ops.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
+from clsplat.ops.rays import rays_bwd, rays_fwd
 from clsplat.ops.removal import removal
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
@@ -52,3 +53,5 @@ class Launches:
         self.exclusive_scan = partial(exclusive_scan, device)
         self.argsort = partial(argsort, device)
         self.argsort_segments = partial(argsort_segments, device)
+        self.rays_fwd = partial(rays_fwd, device)
+        self.rays_bwd = partial(rays_bwd, device)

@@ -16,6 +16,7 @@ from clsplat.reference.loss import l1_ssim
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
 from clsplat.reference.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
+from clsplat.reference.rays import rays_bwd, rays_fwd
 from clsplat.reference.removal import removal
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
