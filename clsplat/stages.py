@@ -5,6 +5,7 @@ containers. N Gaussians, M intersections of a splat with a tile, T tiles, C colo
 """
 
 from collections.abc import Iterable
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 if TYPE_CHECKING:
@@ -130,6 +131,26 @@ class RayColors(NamedTuple):
     behind: Any
 
 
+class HashLevels(NamedTuple):
+    """Levels of a hash grid, from coarse to fine.
+
+    resolutions: cells along an edge of each level; offsets: first entry of each level in the table, and the number of
+    all entries at the end. A level has an entry for each corner of its cells, unless that exceeds the largest size.
+    """
+
+    resolutions: tuple[int, ...]
+    offsets: tuple[int, ...]
+
+    @classmethod
+    def geometric(cls, count: int, coarsest: int, finest: int, entries: int) -> "HashLevels":
+        """Make `count` levels whose resolutions are a geometric sequence, of at most `entries` entries each (Müller
+        et al. 2022, equations 2 and 3)."""
+        growth = (finest / coarsest) ** (1 / max(count - 1, 1))
+        resolutions = tuple(round(coarsest * growth**level) for level in range(count))
+        sizes = (min((resolution + 1) ** 3, entries) for resolution in resolutions)
+        return cls(resolutions, tuple(accumulate(sizes, initial=0)))
+
+
 class AdamStep(NamedTuple):
     """One step of the optimiser: its number, counted from 1, and its constants.
 
@@ -251,6 +272,8 @@ class Stages(Protocol):
         transmittances: Array,
         v_rgb: Array,
     ) -> tuple[Array, Array]: ...
+    def hashgrid_fwd(self, positions: Array, table: Array, levels: HashLevels) -> Array: ...
+    def hashgrid_bwd(self, positions: Array, v_features: Array, levels: HashLevels) -> Array: ...
 
 
 FUNCTIONS: tuple[str, ...] = tuple(name for name in vars(Stages) if not name.startswith("_"))

@@ -215,6 +215,7 @@ DEFINES = {
     "composite_sorted": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "WINDOW": 2},
     "count": {"TILE": 16},
     "filter": {"FILTER_VARIANCE": 0.2, "LENS": "FISHEYE"},
+    "hashgrid": {"RESOLUTIONS": "4,8", "OFFSETS": "0,125,637"},
     "loss": {
         **{"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},

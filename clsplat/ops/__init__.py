@@ -15,6 +15,7 @@ from clsplat.ops.dropout import dropout_bwd, dropout_fwd
 from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.ops.finite import count_not_finite
+from clsplat.ops.hashgrid import hashgrid_bwd, hashgrid_fwd
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
@@ -55,3 +56,5 @@ class Launches:
         self.argsort_segments = partial(argsort_segments, device)
         self.rays_fwd = partial(rays_fwd, device)
         self.rays_bwd = partial(rays_bwd, device)
+        self.hashgrid_fwd = partial(hashgrid_fwd, device)
+        self.hashgrid_bwd = partial(hashgrid_bwd, device)

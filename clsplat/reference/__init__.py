@@ -12,6 +12,7 @@ from clsplat.reference.dropout import dropout_bwd, dropout_fwd
 from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.reference.finite import count_not_finite
+from clsplat.reference.hashgrid import hashgrid_bwd, hashgrid_fwd
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
