@@ -17,6 +17,7 @@ from clsplat.ops.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.ops.finite import count_not_finite
 from clsplat.ops.hashgrid import hashgrid_bwd, hashgrid_fwd
 from clsplat.ops.loss import l1_ssim
+from clsplat.ops.mlp import mlp_bwd, mlp_fwd
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
 from clsplat.ops.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
@@ -58,3 +59,5 @@ class Launches:
         self.rays_bwd = partial(rays_bwd, device)
         self.hashgrid_fwd = partial(hashgrid_fwd, device)
         self.hashgrid_bwd = partial(hashgrid_bwd, device)
+        self.mlp_fwd = partial(mlp_fwd, device)
+        self.mlp_bwd = partial(mlp_bwd, device)

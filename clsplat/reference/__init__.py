@@ -14,6 +14,7 @@ from clsplat.reference.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.reference.finite import count_not_finite
 from clsplat.reference.hashgrid import hashgrid_bwd, hashgrid_fwd
 from clsplat.reference.loss import l1_ssim
+from clsplat.reference.mlp import mlp_bwd, mlp_fwd
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
 from clsplat.reference.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
