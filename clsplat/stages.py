@@ -23,6 +23,10 @@ GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
 et al. 2024)."""
 
 
+EXPONENT_MAX = 15.0
+"""Largest exponent of a field's density, which is exp of a network's result (code of Müller et al. 2022)."""
+
+
 class Splats(NamedTuple):
     """Projected Gaussians; an invisible one has extents 0 and its other fields 0.
 
@@ -129,6 +133,33 @@ class RayColors(NamedTuple):
     rgb: Any
     transmittances: Any
     behind: Any
+
+
+class Marching(NamedTuple):
+    """How rays are sampled: every max(step, cone t) from t = near to t = far, lengths in the field's coordinates.
+
+    Without `contracted`, rays begin and end at the unit cube; with it, space is contracted to a ball of radius 2.
+    """
+
+    step: float
+    cone: float
+    near: float
+    far: float
+    contracted: bool
+
+
+class Samples(NamedTuple):
+    """Samples of R rays, S in all; a device array has at least one entry.
+
+    positions (S, 3) in the unit cube; deltas (S,), lengths that they stand for; rays_of (S,) uint32; first (R + 1,)
+    uint32: ray r has the samples first[r] to first[r + 1], front to back; total: S.
+    """
+
+    positions: Any
+    deltas: Any
+    rays_of: Any
+    first: Any
+    total: int
 
 
 class HashLevels(NamedTuple):
@@ -251,6 +282,17 @@ class Stages(Protocol):
         second: "Gaussians",
         step: AdamStep,
     ) -> None: ...
+    def adam_array(
+        self,
+        parameters: Array,
+        gradients: Array,
+        first: Array,
+        second: Array,
+        rate: float,
+        step: AdamStep,
+        *,
+        sparse: bool = False,
+    ) -> None: ...
     def add_noise(self, gaussians: "Gaussians", size: float, seed: int, iteration: int) -> None: ...
     def count_not_finite(self, values: Array) -> int: ...
     def pixel_sizes(self, gaussians: "Gaussians", cameras: Iterable["Camera"]) -> Array: ...
@@ -274,6 +316,13 @@ class Stages(Protocol):
     ) -> tuple[Array, Array]: ...
     def hashgrid_fwd(self, positions: Array, table: Array, levels: HashLevels) -> Array: ...
     def hashgrid_bwd(self, positions: Array, v_features: Array, levels: HashLevels) -> Array: ...
+    def march(
+        self, origins: Array, directions: Array, offsets: Array, occupied: Array, marching: Marching
+    ) -> Samples: ...
+    def heads_join(self, features: Array, directions: Array, rays_of: Array) -> Array: ...
+    def heads_fwd(self, features: Array, outputs: Array) -> tuple[Array, Array]: ...
+    def heads_bwd(self, colors: Array, v_colors: Array) -> Array: ...
+    def heads_join_bwd(self, v_inputs: Array, features: Array, sigmas: Array, v_sigmas: Array) -> Array: ...
     def mlp_fwd(self, inputs: Array, weights: Array, widths: tuple[int, ...]) -> tuple[Array, Array]: ...
     def mlp_bwd(
         self, inputs: Array, weights: Array, widths: tuple[int, ...], hidden: Array, v_outputs: Array

@@ -216,6 +216,8 @@ DEFINES = {
     "count": {"TILE": 16},
     "filter": {"FILTER_VARIANCE": 0.2, "LENS": "FISHEYE"},
     "hashgrid": {"RESOLUTIONS": "4,8", "OFFSETS": "0,125,637"},
+    "heads": {"EXPONENT_MAX": 15.0},
+    "march": {"CONTRACTED": 1},
     "loss": {
         **{"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
@@ -251,6 +253,7 @@ FORBIDDEN = [
     ("loss", "LANES", 8),
     ("loss", "VECTORS", 0),
     ("loss", "GROUP", 0),
+    ("march", "CONTRACTED", 2),
     ("mlp_cpu", "WIDEST", 272),
     ("mlp_cpu", "ROWS", 8),
     ("project", "CHANNELS", 5),

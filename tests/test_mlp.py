@@ -1,5 +1,7 @@
 """Stage mlp: in numbers, against the twin and central differences, and the same bits."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from tolerances import DOUBLE, FLOAT
@@ -16,7 +18,7 @@ ROWS = [1, 13, 96, 1000]
 
 def inputs(rows, widths):
     rng = np.random.default_rng(rows)
-    count = sum(a * b for a, b in zip(widths[:-1], widths[1:], strict=True))
+    count = sum(a * b for a, b in pairwise(widths))
     arrays = rng.normal(size=(rows, widths[0])), rng.normal(size=count) / 4, rng.normal(size=(rows, widths[-1]))
     return [a.astype(np.float32).astype(np.float64) for a in arrays]
 

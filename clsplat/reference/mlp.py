@@ -1,5 +1,6 @@
 """Twin of the stage mlp."""
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,9 @@ Array = NDArray[Any]
 
 def _matrices(weights: Array, widths: tuple[int, ...]) -> list[Array]:
     """The matrix of each layer, as a view."""
-    sizes = [a * b for a, b in zip(widths[:-1], widths[1:], strict=True)]
+    sizes = [a * b for a, b in pairwise(widths)]
     parts = np.split(weights, np.cumsum(sizes)[:-1])
-    return [part.reshape(a, b) for part, a, b in zip(parts, widths[:-1], widths[1:], strict=True)]
+    return [part.reshape(a, b) for part, (a, b) in zip(parts, pairwise(widths), strict=True)]
 
 
 def mlp_fwd(inputs: Array, weights: Array, widths: tuple[int, ...]) -> tuple[Array, Array]:
