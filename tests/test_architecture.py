@@ -31,7 +31,7 @@ LAYERS = """
     structs reference device
     ops testing formats
     renderer selftest
-    render dataset demo raster_gradients
+    render dataset demo raster_gradients fields
     rasterization pruning
     training show
     evaluate
@@ -47,6 +47,9 @@ APART = {
     "reference": {"device", "structs", "ops", "scene", "metrics", "config"},  # the equations alone
     "dataset": {"gaussians", "ops", "render", "pruning", "training"},
     "formats": {"scene", "camera", "ops", "render", "pruning", "training"},
+    # Nothing of the Gaussians knows of the fields, and nothing of the fields of Gaussians.
+    "fields": {"gaussians", "renderer", "formats", "testing"},
+    **{unit: {"fields"} for unit in ("rasterization", "pruning", "training", "show", "evaluate")},
     "demo": {"gaussians", "reference", "ops", "render", "training"},
 }
 

@@ -12,7 +12,8 @@ from test_cli import fails, run, write_dataset
 from clsplat.bench import measures, quality
 from clsplat.bench.captures import Capture
 from clsplat.bench.cells import Cell, differences, make_cells, parse_budget, parse_method, parse_source
-from clsplat.bench.quality import run_cell, run_cells, sample_iterations
+from clsplat.bench.measures import sample_iterations
+from clsplat.bench.quality import run_cell, run_cells
 from clsplat.bench.quality_summary import COSTS
 from clsplat.bench.results import append_record, read_records, write_records
 from clsplat.config import AdcConfig, DataConfig, InitConfig, TrainConfig
@@ -129,7 +130,7 @@ class TestCells:
     def test_samples_form_a_geometric_sequence(self):
         assert sample_iterations(7000)[0] == 140
         assert sample_iterations(7000)[-1] == 7000
-        assert len(sample_iterations(7000)) == quality.SAMPLES
+        assert len(sample_iterations(7000)) == measures.SAMPLES
         assert np.ptp(np.diff(np.log(sample_iterations(7000)))) < 0.01
         assert sample_iterations(1) == [1]
 
@@ -205,12 +206,12 @@ class TestOneTraining:
             clock.now += 1000
             return {"psnr": falling.pop()}
 
-        falling = list(np.arange(quality.SAMPLES, dtype=float))
+        falling = list(np.arange(measures.SAMPLES, dtype=float))
         monkeypatch.setattr(quality, "train", training)
         monkeypatch.setattr(quality, "measure", measured)
         records = []
         run_cell(cell.config, scene, device, records.append)
-        assert {r["best"] for r in records} == {quality.SAMPLES - 1.0}
+        assert {r["best"] for r in records} == {measures.SAMPLES - 1.0}
         assert [r["seconds"] for r in records] == [2 * r["iteration"] for r in records]
 
     def test_frames_per_second_is_of_the_median(self, trained, device, monkeypatch):
