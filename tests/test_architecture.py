@@ -24,10 +24,11 @@ STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__i
 # A unit is a package or a module of the top level. It imports only from the rows above its own.
 LAYERS = """
     constants errors randomness display
-    ranges json_lines
+    ranges json_lines processors
     config atomic
     camera gaussians
     scene stages metrics panorama programs
+    buffers
     structs reference device
     ops testing formats
     renderer selftest
@@ -59,7 +60,7 @@ BENCH_KERNELS = {"roof"}
 
 # The only units that may import certain third-party packages, which are optional or slow to import.
 ONLY_IN = {
-    "pyopencl": {"device", "programs", "ops"},
+    "pyopencl": {"buffers", "device", "programs", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
     "av": {"dataset", "show"},

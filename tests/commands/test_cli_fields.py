@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from cli_runs import fails, read_image, run
 from small_fields import SmallIngp
-from test_cli import fails, read_image, run, write_dataset
 
 from clsplat.bench.measures import sample_iterations
 from clsplat.bench.results import read_records
@@ -14,14 +14,6 @@ from clsplat.dataset import load_scene
 from clsplat.fields import METHODS
 from clsplat.fields.field_files import load_field
 from clsplat.metrics import to_uint8
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    """Nine photos, two of them held out."""
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    write_dataset(folder)
-    return folder
 
 
 @pytest.fixture(autouse=True)

@@ -43,15 +43,16 @@ WHOLE = (
 """Tests of the whole renderer and of training, for mutants that the tests of their file do not see."""
 
 PROJECT = ("tests/test_project.py", "tests/test_lens.py", "tests/test_project_degenerate.py")
-COMPOSITE = ("tests/test_composite.py", "tests/test_composite_gpu.py", "tests/test_composite_sorted.py")
+LIMITS = "tests/test_composite_limits.py"
+COMPOSITE = ("tests/test_composite.py", "tests/test_composite_gpu.py", "tests/test_composite_sorted.py", LIMITS)
 REMOVAL = ("tests/test_removal.py",)
 TESTS: dict[str, tuple[str, ...]] = {
     "common": ("tests/test_composite.py", *PROJECT),
     "composite": COMPOSITE,
     "composite_blocks": COMPOSITE,
-    "composite_cpu": COMPOSITE[:1],
-    "composite_gpu": COMPOSITE[1:2],
-    "composite_sorted": COMPOSITE[2:],
+    "composite_cpu": (COMPOSITE[0], LIMITS),
+    "composite_gpu": (*COMPOSITE[:2], LIMITS),
+    "composite_sorted": COMPOSITE[2:3],
     "composite_splats": COMPOSITE,
     "composite_tiles": (*COMPOSITE[:2], *REMOVAL),
     "ellipse": ("tests/test_bin.py", *COMPOSITE[:1]),
