@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from small_cells import SMALL
 
+from clsplat.bench import measures
 from clsplat.bench.captures import Capture
 from clsplat.bench.cells import differences, make_cells, parse_budget, parse_method, parse_source
 from clsplat.bench.measures import sample_iterations
