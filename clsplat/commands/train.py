@@ -30,7 +30,7 @@ from clsplat.commands.run_folders import CONFIG, FRAMES
 from clsplat.commands.viewing import open_viewer
 from clsplat.config import BACKGROUNDS, UINT32_MAX, TrainConfig
 from clsplat.errors import InputError
-from clsplat.ranges import within
+from clsplat.ranges import name_in, within
 from clsplat.training.presets import DATA_PATH, PRESETS, load_config, load_preset
 
 if TYPE_CHECKING:
@@ -51,6 +51,9 @@ class Train:
     out: Out
     """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians, such as scene.spz, which is
     written as well; its name without the suffix becomes the folder."""
+    method: Annotated[str, name_in("clsplat.fields:method_names")] = "gaussians"
+    """What is trained: Gaussians, or a radiance field to compare them with, for which only --iterations, --seed, the
+    settings of the photos, of evaluations and of checkpoints, --device and --memory-limit count."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
     viewer: bool = False
@@ -82,6 +85,9 @@ class Train:
             check_writable(self.out)
         if self.resume and not (out / CHECKPOINT).exists():
             raise no_checkpoint(out)
+        if self.method != "gaussians":
+            train_method(self, out, suffix)
+            return
         with held(out):
             gaussians, viewer = self.trained(out, suffix)
         if viewer:
@@ -95,10 +101,7 @@ class Train:
         from clsplat.formats import save_gaussians
         from clsplat.training.checkpoint import CHECKPOINT
 
-        if not self.resume and (out / CHECKPOINT).exists():
-            raise InputError(
-                f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
-            )
+        check_new(out, self.resume)
         try_folder(out)
         viewer = open_viewer(self.server) if self.viewer or self.server.open else None
         try:
@@ -164,6 +167,32 @@ class Train:
             write_json(out / CONFIG, {DATA_PATH: str(self.data.resolve()), **asdict(config)})
             say_cameras(data)
         return scene, config
+
+
+def check_new(out: Path, resume: bool) -> None:
+    """Raise an InputError if a folder holds a run and none resumes."""
+    from clsplat.training.checkpoint import CHECKPOINT
+
+    if not resume and (out / CHECKPOINT).exists():
+        raise InputError(
+            f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
+        )
+
+
+def train_method(command: Train, out: Path, suffix: str) -> None:
+    """Train a radiance field in a folder, and evaluate it."""
+    from clsplat.commands.fields import check_settings, train_and_evaluate
+    from clsplat.training.run_folder import held
+
+    if suffix or command.viewer or command.server.open:
+        found = f"-o {command.out}" if suffix else "--viewer or --open"
+        raise InputError(f"--method {command.method}: expected a folder after -o and no viewer, found {found}")
+    check_settings(command.method, command.settings)
+    with held(out):
+        check_new(out, command.resume)
+        try_folder(out)
+        device = open_and_name(command.settings)
+        train_and_evaluate(command.data, command.method, command.settings, device, out, command.resume)
 
 
 def open_and_name(config: TrainConfig) -> "Device":

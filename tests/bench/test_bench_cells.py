@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from small_cells import SMALL
 
-from clsplat.bench import quality
+from clsplat.bench import measures
 from clsplat.bench.captures import Capture
 from clsplat.bench.cells import differences, make_cells, parse_budget, parse_method, parse_source
-from clsplat.bench.quality import sample_iterations
+from clsplat.bench.measures import sample_iterations
 from clsplat.config import AdcConfig, DataConfig, InitConfig, TrainConfig
 from clsplat.errors import InputError
 from clsplat.training.presets import load_preset, with_settings
@@ -100,6 +100,6 @@ class TestCells:
     def test_samples_form_a_geometric_sequence(self):
         assert sample_iterations(7000)[0] == 140
         assert sample_iterations(7000)[-1] == 7000
-        assert len(sample_iterations(7000)) == quality.SAMPLES
+        assert len(sample_iterations(7000)) == measures.SAMPLES
         assert np.ptp(np.diff(np.log(sample_iterations(7000)))) < 0.01
         assert sample_iterations(1) == [1]

@@ -10,7 +10,8 @@ from small_cells import ITERATIONS, cells_of
 
 from clsplat.bench import measures, quality
 from clsplat.bench.cells import make_cells
-from clsplat.bench.quality import run_cell, run_cells, sample_iterations
+from clsplat.bench.measures import sample_iterations
+from clsplat.bench.quality import run_cell, run_cells
 from clsplat.bench.quality_summary import COSTS
 from clsplat.bench.results import append_record, read_records, write_records
 from clsplat.config import AdcConfig
@@ -94,12 +95,12 @@ class TestOneTraining:
             clock.now += 1000
             return {"psnr": falling.pop()}
 
-        falling = list(np.arange(quality.SAMPLES, dtype=float))
+        falling = list(np.arange(measures.SAMPLES, dtype=float))
         monkeypatch.setattr(quality, "train", training)
         monkeypatch.setattr(quality, "measure", measured)
         records = []
         run_cell(cell.config, scene, device, records.append)
-        assert {r["best"] for r in records} == {quality.SAMPLES - 1.0}
+        assert {r["best"] for r in records} == {measures.SAMPLES - 1.0}
         assert [r["seconds"] for r in records] == [2 * r["iteration"] for r in records]
 
     def test_frames_per_second_is_of_the_median(self, trained, device, monkeypatch):
