@@ -24,14 +24,15 @@ STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__i
 # A unit is a package or a module of the top level. It imports only from the rows above its own.
 LAYERS = """
     constants errors randomness display
-    ranges json_lines
+    ranges json_lines processors
     config atomic
     camera gaussians
     scene stages metrics panorama programs
+    buffers
     structs reference device
     ops testing formats
     renderer selftest
-    render dataset demo raster_gradients
+    render dataset demo raster_gradients fields
     rasterization pruning
     training show
     evaluate blocks
@@ -47,6 +48,9 @@ APART = {
     "reference": {"device", "structs", "ops", "scene", "metrics", "config"},  # the equations alone
     "dataset": {"gaussians", "ops", "render", "pruning", "training"},
     "formats": {"scene", "camera", "ops", "render", "pruning", "training"},
+    # Nothing of the Gaussians knows of the fields, and nothing of the fields of Gaussians.
+    "fields": {"gaussians", "renderer", "formats", "testing"},
+    **{unit: {"fields"} for unit in ("rasterization", "pruning", "training", "show", "evaluate")},
     "demo": {"gaussians", "reference", "ops", "render", "training"},
 }
 
@@ -56,7 +60,7 @@ BENCH_KERNELS = {"roof"}
 
 # The only units that may import certain third-party packages, which are optional or slow to import.
 ONLY_IN = {
-    "pyopencl": {"device", "programs", "ops"},
+    "pyopencl": {"buffers", "device", "programs", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
     "distributed": {"blocks"},
@@ -216,10 +220,14 @@ DEFINES = {
     "composite_sorted": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "WINDOW": 2},
     "count": {"TILE": 16},
     "filter": {"FILTER_VARIANCE": 0.2, "LENS": "FISHEYE"},
+    "hashgrid": {"RESOLUTIONS": "4,8", "OFFSETS": "0,125,637"},
+    "heads": {"EXPONENT_MAX": 15.0},
+    "march": {"CONTRACTED": 1},
     "loss": {
         **{"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
     },
+    "mlp_cpu": {"WIDTHS": "32,64,16", "WIDEST": 64, "ROWS": 6},
     "project": {"CHANNELS": 4, "ANTIALIASED": 1, "CAMERA_GRAD": 1, "GROUP": 32, "LENS": "FISHEYE", "LANES": 1},
     "removal_cpu": {"TILE": 8, "CHANNELS": 1, "LANES": 16},
     "removal_gpu": {"TILE": 8, "CHANNELS": 1, "STOP": 1e-6, "BATCH": 16, "SUBGROUPS": 0},
@@ -250,6 +258,9 @@ FORBIDDEN = [
     ("loss", "LANES", 8),
     ("loss", "VECTORS", 0),
     ("loss", "GROUP", 0),
+    ("march", "CONTRACTED", 2),
+    ("mlp_cpu", "WIDEST", 272),
+    ("mlp_cpu", "ROWS", 8),
     ("project", "CHANNELS", 5),
     ("project", "ANTIALIASED", 2),
     ("project", "CAMERA_GRAD", 2),

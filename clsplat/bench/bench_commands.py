@@ -187,7 +187,7 @@ class Quality:
     fern:downscale=2. So do options for a variant: thin=4 (every 4th training photo), arc=0.2 (the end of the path is
     held out), points=0.1 (a tenth of the sparse points)."""
     methods: tuple[str, ...] = ("paper-7k", "auto")
-    """Presets of `train`, or configuration files as for its --config."""
+    """Presets of `train`, configuration files as for its --config, or radiance fields as for its --method."""
     budgets: tuple[str, ...] = ("own",)
     """Caps on the number of Gaussians: "own" for the method's cap, a factor of it such as x0.5, or a number such as
     40000."""

@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +12,7 @@ import tyro
 from clsplat.commands.console import say
 from clsplat.commands.options import ClusterOptions
 from clsplat.commands.progress import Progress
+from clsplat.errors import InputError
 
 if TYPE_CHECKING:
     from clsplat.blocks.whole import Watch
@@ -73,6 +74,27 @@ def _run(jobs: list[Path], scene: "Scene", device: "Device", watch: "Watch", whe
         run_on_cluster(where.scheduler, jobs, say)
     else:
         run_here(jobs, scene, device, watch)
+
+
+def began(out: Path) -> bool:
+    """Whether a folder holds a run that can be resumed."""
+    from clsplat.blocks.whole import BLOCKS
+    from clsplat.training.checkpoint import CHECKPOINT
+
+    return (out / CHECKPOINT).is_file() or (out / BLOCKS).is_dir()
+
+
+def check_same(file: Path, config: "TrainConfig") -> None:
+    """Raise an InputError if a run in blocks would continue with another configuration than it began with."""
+    from clsplat.training.checkpoint import FREE
+    from clsplat.training.presets import load_config
+
+    free = {name: getattr(config, name) for name in FREE}
+    if replace(load_config(file), **free) != config:
+        raise InputError(
+            f"{file}: expected the configuration that the run began with, found another one; leave out other flags, "
+            "or start a new run in another folder"
+        )
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from clsplat.commands import console
-from clsplat.commands.blockwise import JobsPrinted, train_in_blocks
+from clsplat.commands.blockwise import JobsPrinted, began, check_same, train_in_blocks
 from clsplat.commands.console import (
     DeviceName,
     Out,
@@ -31,7 +31,7 @@ from clsplat.commands.run_folders import CONFIG, FRAMES
 from clsplat.commands.viewing import open_viewer
 from clsplat.config import BACKGROUNDS, UINT32_MAX, TrainConfig
 from clsplat.errors import InputError
-from clsplat.ranges import within
+from clsplat.ranges import name_in, within
 from clsplat.training.presets import DATA_PATH, PRESETS, load_config, load_preset
 
 if TYPE_CHECKING:
@@ -52,6 +52,9 @@ class Train:
     out: Out
     """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians, such as scene.spz, which is
     written as well; its name without the suffix becomes the folder."""
+    method: Annotated[str, name_in("clsplat.fields:method_names")] = "gaussians"
+    """What is trained: Gaussians, or a radiance field to compare them with, for which only --iterations, --seed, the
+    settings of the photos, of evaluations and of checkpoints, --device and --memory-limit count."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
     viewer: bool = False
@@ -84,6 +87,9 @@ class Train:
             check_writable(self.out)
         if self.resume and not began(out):
             raise no_checkpoint(out)
+        if self.method != "gaussians":
+            train_method(self, out, suffix)
+            return
         with held(out):
             try:
                 gaussians, viewer = self.trained(out, suffix)
@@ -100,10 +106,7 @@ class Train:
         """Train in a folder that is held, and write the file of Gaussians that a suffix asks for."""
         from clsplat.formats import save_gaussians
 
-        if not self.resume and began(out):
-            raise InputError(
-                f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
-            )
+        check_new(out, self.resume)
         try_folder(out)
         viewer = open_viewer(self.server) if self.viewer or self.server.open else None
         try:
@@ -197,24 +200,28 @@ class Train:
         return scene, config
 
 
-def began(out: Path) -> bool:
-    """Whether a folder holds a run that can be resumed."""
-    from clsplat.blocks.whole import BLOCKS
-    from clsplat.training.checkpoint import CHECKPOINT
-
-    return (out / CHECKPOINT).is_file() or (out / BLOCKS).is_dir()
-
-
-def check_same(file: Path, config: TrainConfig) -> None:
-    """Raise an InputError if a run in blocks would continue with another configuration than it began with."""
-    from clsplat.training.checkpoint import FREE
-
-    free = {name: getattr(config, name) for name in FREE}
-    if replace(load_config(file), **free) != config:
+def check_new(out: Path, resume: bool) -> None:
+    """Raise an InputError if a folder holds a run and none resumes."""
+    if not resume and began(out):
         raise InputError(
-            f"{file}: expected the configuration that the run began with, found another one; leave out other flags, "
-            "or start a new run in another folder"
+            f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
         )
+
+
+def train_method(command: Train, out: Path, suffix: str) -> None:
+    """Train a radiance field in a folder, and evaluate it."""
+    from clsplat.commands.fields import check_settings, train_and_evaluate
+    from clsplat.training.run_folder import held
+
+    if suffix or command.viewer or command.server.open:
+        found = f"-o {command.out}" if suffix else "--viewer or --open"
+        raise InputError(f"--method {command.method}: expected a folder after -o and no viewer, found {found}")
+    check_settings(command.method, command.settings)
+    with held(out):
+        check_new(out, command.resume)
+        try_folder(out)
+        device = open_and_name(command.settings)
+        train_and_evaluate(command.data, command.method, command.settings, device, out, command.resume)
 
 
 def open_and_name(config: TrainConfig) -> "Device":

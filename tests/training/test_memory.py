@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from every_strategy import with_rounds
 
+from clsplat.buffers import Buffers
 from clsplat.camera import Camera
 from clsplat.config import AdcConfig, OptimConfig, RenderConfig, TrainConfig
 from clsplat.device import Device
@@ -113,16 +114,16 @@ def test_the_steady_state_allocates_nothing(tmp_path: Path, monkeypatch: pytest.
     device = Device()
     done: list[int] = []
     new: list[int] = []
-    allocate = Device._allocate
+    allocate = Buffers.allocate
 
-    def counted(self: Device, what: str, nbytes: int) -> Any:
+    def counted(self: Buffers, what: str, nbytes: int) -> Any:
         before = self.memory
         block = allocate(self, what, nbytes)
         if self.memory != before:
             new.append(len(done))
         return block
 
-    monkeypatch.setattr(Device, "_allocate", counted)
+    monkeypatch.setattr(Buffers, "allocate", counted)
     still = OptimConfig(1e-9, 1e-9, log_scales_lr=0, quats_lr=0, logit_opacities_lr=0)  # lists stay as they are
     config = TrainConfig(strategy="adc", size="fixed", iterations=30, adc=FIXED_N, optim=still)
     train(make_scene(2000, 96, 64, 6), config, tmp_path, device, progress=lambda _: done.append(1))
@@ -195,15 +196,15 @@ def test_running_out_of_memory_leaves_the_checkpoint(tmp_path: Path, monkeypatch
     scene, device = make_scene(300, 48, 32), Device()
     config = TrainConfig(strategy="adc", size="fixed", iterations=12, checkpoint_every=5, adc=FIXED_N)
     done: list[int] = []
-    allocate = Device._allocate
+    allocate = Buffers.allocate
 
-    def full(self: Device, what: str, nbytes: int) -> Any:
+    def full(self: Buffers, what: str, nbytes: int) -> Any:
         if len(done) == 7:
             raise DeviceError(f"{what}: no memory left")
         return allocate(self, what, nbytes)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Device, "_allocate", full)
+        patch.setattr(Buffers, "allocate", full)
         with pytest.raises(
             DeviceError, match=r"^iteration 8: .*: no memory left; the last checkpoint in .* is intact"
         ):
