@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
+from cli_runs import write_dataset
 from small_plan import Planned, plan
-from test_cli import write_dataset
 
 from clsplat.device import Device
 

@@ -5,7 +5,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from test_cli import fails, run
+from cli_runs import fails, run
 
 from clsplat.formats import load_gaussians
 

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 from bounds import matched, random_gaussians
+from cli_runs import fails, run
 from foreign_code import splat_transform
-from test_cli import fails, run
 
 from clsplat.errors import InputError
 from clsplat.formats import anatomy_of, load_gaussians, save_gaussians
