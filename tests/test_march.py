@@ -5,8 +5,8 @@ import pytest
 from tolerances import DOUBLE
 
 from clsplat import ops, reference
+from clsplat.field_stages import Marching
 from clsplat.reference.march import contract
-from clsplat.stages import Marching
 from clsplat.testing import assert_matches
 
 CUBE = Marching(step=0.03, cone=0.0, near=0.0, far=10.0, contracted=False)

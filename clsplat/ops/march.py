@@ -4,8 +4,8 @@ import numpy as np
 from pyopencl.array import Array
 
 from clsplat.device import Device
+from clsplat.field_stages import Marching, Samples
 from clsplat.ops.scan import exclusive_scan
-from clsplat.stages import Marching, Samples
 
 
 def march(
