@@ -11,7 +11,15 @@ import clsplat.device
 import clsplat.programs
 from clsplat.device import Device
 from clsplat.errors import DeviceError
-from clsplat.programs import BASE_LANGUAGE, Subgroups, inline_includes, kernel_folder, probe_subgroups
+from clsplat.programs import (
+    BASE_LANGUAGE,
+    Subgroups,
+    build,
+    build_options,
+    inline_includes,
+    kernel_folder,
+    probe_subgroups,
+)
 
 
 class TestPrograms:
@@ -99,6 +107,15 @@ class TestPrograms:
         any_device.launch("constants", "read", (1,), [out])
         expected = [getattr(clsplat.constants, name) for name in names]
         np.testing.assert_array_equal(out.get(), np.array(expected, any_device.real))
+
+    @pytest.mark.parametrize("name", clsplat.device.MODEL_CONSTANTS)
+    def test_each_constant_is_required(self, device, name):
+        """Otherwise a driver might take one for 0, in an #if."""
+        source = inline_includes("common.h", kernel_folder()) + "\n__kernel void nothing(void) {}\n"
+        whole = build_options(np.float32, device.model)
+        build(device.context, source, whole)
+        with pytest.raises(cl.RuntimeError, match="must be passed as -D"):
+            build(device.context, source, [option for option in whole if not option.startswith(f"-D{name}=")])
 
     def test_a_build_that_fails_with_subgroups_is_repeated_without(self, monkeypatch):
         """OpenCL C 1.2 does not declare their functions. The warning comes once, and the device runs without them."""
