@@ -47,10 +47,11 @@ class Marching(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Samples of R rays, S in all; a device array has at least one entry.
+    """Samples of R rays, S in all.
 
     positions (S, 3) in the unit cube; deltas (S,), lengths that they stand for; rays_of (S,) uint32; first (R + 1,)
-    uint32: ray r has the samples first[r] to first[r + 1], front to back; total: S.
+    uint32: ray r has the samples first[r] to first[r + 1], front to back; total: S. Where
+    that is 0, arrays of the device have one entry, of no length, which belongs to no ray.
     """
 
     positions: Any

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -37,8 +37,7 @@ def train_field(
     device: "Device",
     *,
     resume: bool = False,
-    evaluate: Callable[[Field], dict[str, Any]] | None = None,
-    evaluate_after: Container[int] = (),
+    evaluate: Callable[[Field], dict[str, Any]] = lambda field: {},
     progress: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> Field:
     """Train a field on a scene's photos.
@@ -56,9 +55,8 @@ def train_field(
     device : Device
     resume : bool
         Continue from the checkpoint in `out`, to the same bits as a training that was never interrupted.
-    evaluate : callable, optional
-        Called with the field after the iterations in `evaluate_after`; what it returns is logged. Its time does not
-        count.
+    evaluate : callable
+        Called with the field after every iteration; what it returns, if anything, is logged. Its time does not count.
     progress : callable
         Called after every iteration with iteration, iterations, loss and rays. If it raises KeyboardInterrupt, a
         checkpoint is written.
@@ -89,8 +87,7 @@ def train_field(
             loss = _advance(field, pixels, config)
             with clock.stopped():
                 now = {"iteration": field.iteration, "seconds": clock.seconds, "loss": loss}
-                found = evaluate(field) if evaluate and field.iteration in evaluate_after else {}
-                log.record(now, found, last=field.iteration == config.iterations)
+                log.record(now, evaluate(field), last=field.iteration == config.iterations)
                 progress(now | {"iterations": config.iterations, "rays": field.rays})
                 if field.iteration % config.checkpoint_every == 0 and field.iteration < config.iterations:
                     save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)

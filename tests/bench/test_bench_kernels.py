@@ -283,7 +283,7 @@ class TestPage:
     """docs/benchmarks.md shows the content of docs/results: its tables are made from these files."""
 
     def test_results_are_complete(self, measured, results):
-        assert set(measured) == set(results)
+        assert set(measured) | {"networks"} == set(results)  # the page shows no networks
         assert set(measured["roof"]) == set(results["roof"])
         assert {w["name"] for w in measured["workloads"]} == {*DEFAULT, *scaling_names()}
         assert set(measured["workloads"][0]) == set(results["workloads"][0])
