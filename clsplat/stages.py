@@ -5,8 +5,9 @@ containers. N Gaussians, M intersections of a splat with a tile, T tiles, C colo
 """
 
 from collections.abc import Iterable
-from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from clsplat.field_stages import FieldStages
 
 if TYPE_CHECKING:
     from clsplat.camera import Camera
@@ -21,10 +22,6 @@ ERANK_SLACK = 1e-5
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
 """Slope and centre of the sigmoid of the opacity that fades out the noise on the means (original code of Kheradmand
 et al. 2024)."""
-
-
-EXPONENT_MAX = 15.0
-"""Largest exponent of a field's density, which is exp of a network's result (code of Müller et al. 2022)."""
 
 
 class Splats(NamedTuple):
@@ -123,65 +120,6 @@ class Removal(NamedTuple):
     pulls: Any
 
 
-class RayColors(NamedTuple):
-    """Result of compositing samples along R rays.
-
-    rgb (R, 3), background included; transmittances (S,): light that reaches each sample, 0 behind the end of its ray;
-    behind (R,): light that reaches the background.
-    """
-
-    rgb: Any
-    transmittances: Any
-    behind: Any
-
-
-class Marching(NamedTuple):
-    """How rays are sampled: every max(step, cone t) from t = near to t = far, lengths in the field's coordinates.
-
-    Without `contracted`, rays begin and end at the unit cube; with it, space is contracted to a ball of radius 2.
-    """
-
-    step: float
-    cone: float
-    near: float
-    far: float
-    contracted: bool
-
-
-class Samples(NamedTuple):
-    """Samples of R rays, S in all; a device array has at least one entry.
-
-    positions (S, 3) in the unit cube; deltas (S,), lengths that they stand for; rays_of (S,) uint32; first (R + 1,)
-    uint32: ray r has the samples first[r] to first[r + 1], front to back; total: S.
-    """
-
-    positions: Any
-    deltas: Any
-    rays_of: Any
-    first: Any
-    total: int
-
-
-class HashLevels(NamedTuple):
-    """Levels of a hash grid, from coarse to fine.
-
-    resolutions: cells along an edge of each level; offsets: first entry of each level in the table, and the number of
-    all entries at the end. A level has an entry for each corner of its cells, unless that exceeds the largest size.
-    """
-
-    resolutions: tuple[int, ...]
-    offsets: tuple[int, ...]
-
-    @classmethod
-    def geometric(cls, count: int, coarsest: int, finest: int, entries: int) -> "HashLevels":
-        """Make `count` levels whose resolutions are a geometric sequence, of at most `entries` entries each (Müller
-        et al. 2022, equations 2 and 3)."""
-        growth = (finest / coarsest) ** (1 / max(count - 1, 1))
-        resolutions = tuple(round(coarsest * growth**level) for level in range(count))
-        sizes = (min((resolution + 1) ** 3, entries) for resolution in resolutions)
-        return cls(resolutions, tuple(accumulate(sizes, initial=0)))
-
-
 class AdamStep(NamedTuple):
     """One step of the optimiser: its number, counted from 1, and its constants.
 
@@ -200,7 +138,7 @@ class AdamStep(NamedTuple):
     penalties: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-class Stages(Protocol):
+class Stages(FieldStages, Protocol):
     """The functions of all stages, on a device (`clsplat.ops.Launches`) or in NumPy (the module `clsplat.reference`).
 
     This is the only list of their names. Each function's docstring is with its launch in `clsplat.ops`.
@@ -304,31 +242,9 @@ class Stages(Protocol):
         self, keys: Array, bits: int, method: str = "auto", *, values: Array = None
     ) -> tuple[Array, Array]: ...
     def argsort_segments(self, keys: Array, bits: int, ranges: Array, values: Array = None) -> Array: ...
-    def rays_fwd(self, sigmas: Array, colors: Array, deltas: Array, first: Array, background: Any) -> RayColors: ...
-    def rays_bwd(
-        self,
-        sigmas: Array,
-        colors: Array,
-        deltas: Array,
-        first: Array,
-        background: Any,
-        transmittances: Array,
-        v_rgb: Array,
-    ) -> tuple[Array, Array]: ...
-    def hashgrid_fwd(self, positions: Array, table: Array, levels: HashLevels) -> Array: ...
-    def hashgrid_bwd(self, positions: Array, v_features: Array, levels: HashLevels) -> Array: ...
-    def march(
-        self, origins: Array, directions: Array, offsets: Array, occupied: Array, marching: Marching
-    ) -> Samples: ...
-    def heads_join(self, features: Array, directions: Array, rays_of: Array) -> Array: ...
-    def heads_fwd(self, features: Array, outputs: Array) -> tuple[Array, Array]: ...
-    def heads_bwd(self, colors: Array, v_colors: Array) -> Array: ...
-    def heads_join_bwd(self, v_inputs: Array, features: Array, sigmas: Array, v_sigmas: Array) -> Array: ...
-    def mlp_fwd(self, inputs: Array, weights: Array, widths: tuple[int, ...]) -> tuple[Array, Array]: ...
-    def mlp_bwd(
-        self, inputs: Array, weights: Array, widths: tuple[int, ...], hidden: Array, v_outputs: Array
-    ) -> tuple[Array, Array]: ...
 
 
-FUNCTIONS: tuple[str, ...] = tuple(name for name in vars(Stages) if not name.startswith("_"))
+FUNCTIONS: tuple[str, ...] = tuple(
+    name for part in (Stages, FieldStages) for name in vars(part) if not name.startswith("_")
+)
 """Names of the functions of `Stages`, in the order of the pipeline."""

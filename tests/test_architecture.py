@@ -26,7 +26,7 @@ LAYERS = """
     constants errors randomness display
     ranges json_lines processors
     config atomic
-    camera gaussians
+    camera gaussians field_stages
     scene stages metrics panorama programs
     buffers
     structs reference device
@@ -133,7 +133,7 @@ def test_imports_go_one_way(path):
 
 @pytest.mark.parametrize("path", [p for p in MODULES if unit_of(p) == "reference"], ids=lambda p: p.stem)
 def test_twins_import_numpy_only(path):
-    ours = {f"clsplat.{unit}" for unit in ("camera", "constants", "errors", "gaussians", "stages")}
+    ours = {f"clsplat.{unit}" for unit in ("camera", "constants", "errors", "field_stages", "gaussians", "stages")}
     for name in imports_of(path):
         allowed = name in ours or name.startswith("clsplat.reference.") or name.split(".")[0] == "numpy"
         assert allowed or name.split(".")[0] in sys.stdlib_module_names, name
@@ -221,6 +221,7 @@ DEFINES = {
     "count": {"TILE": 16},
     "filter": {"FILTER_VARIANCE": 0.2, "LENS": "FISHEYE"},
     "hashgrid": {"RESOLUTIONS": "4,8", "OFFSETS": "0,125,637"},
+    "voxels": {"FEATURES": 28, "TV_EPS": 1e-9},
     "heads": {"EXPONENT_MAX": 15.0},
     "march": {"CONTRACTED": 1},
     "loss": {
@@ -259,6 +260,7 @@ FORBIDDEN = [
     ("loss", "VECTORS", 0),
     ("loss", "GROUP", 0),
     ("march", "CONTRACTED", 2),
+    ("voxels", "FEATURES", 0),
     ("mlp_cpu", "WIDEST", 272),
     ("mlp_cpu", "ROWS", 8),
     ("project", "CHANNELS", 5),

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera, focus_point
+from clsplat.field_stages import Marching
 from clsplat.scene import View
-from clsplat.stages import Marching
 
 BOX_SHARE = 0.375
 """Half edge of the cube of a scene without a background, as a fraction of the cameras' mean distance from the point
