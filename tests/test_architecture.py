@@ -35,7 +35,7 @@ LAYERS = """
     render dataset demo raster_gradients fields
     rasterization pruning
     training show
-    evaluate
+    evaluate blocks
     bench
     commands
     cli
@@ -63,6 +63,7 @@ ONLY_IN = {
     "pyopencl": {"buffers", "device", "programs", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
+    "distributed": {"blocks"},
     "av": {"dataset", "show"},
     "pillow_heif": {"dataset"},
     "sqlite3": set(),  # with pycolmap in the same process it causes a bus error, see COUNT_ROWS in matching.py

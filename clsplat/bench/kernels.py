@@ -119,7 +119,7 @@ def bench_workload(workload: Workload, render: RenderConfig, device: Device, rep
     config = TrainConfig(strategy="adc", size="fixed", iterations=SHORT_RUN, render=render, optim=STILL)
     renderer = Renderer(device, render)
     run = renderer.forward(gaussians, view.camera)
-    pairs = renderer.stages.count_pairs(run.splats, run.bins)
+    pairs = renderer.stages.count_pairs(run.drawn, run.bins)
     evaluated, accepted = (int(a.get().sum(dtype=np.uint64)) for a in pairs)
     counts = {
         "visible": int((run.splats.extents.get()[:, 0] > 0).sum()),

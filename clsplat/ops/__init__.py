@@ -22,7 +22,7 @@ from clsplat.ops.march import march
 from clsplat.ops.mlp import mlp_bwd, mlp_fwd
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
-from clsplat.ops.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
+from clsplat.ops.project import join_rows, project_bwd, project_bwd_adam, project_disparities, project_fwd
 from clsplat.ops.rays import rays_bwd, rays_fwd
 from clsplat.ops.removal import removal
 from clsplat.ops.scan import exclusive_scan
@@ -35,6 +35,7 @@ class Launches:
 
     def __init__(self, device: Device) -> None:
         self.project_fwd = partial(project_fwd, device)
+        self.join_rows = partial(join_rows, device)
         self.project_disparities = partial(project_disparities, device)
         self.project_bwd = partial(project_bwd, device)
         self.project_bwd_adam = partial(project_bwd_adam, device)

@@ -19,7 +19,7 @@ from clsplat.reference.march import march
 from clsplat.reference.mlp import mlp_bwd, mlp_fwd
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
-from clsplat.reference.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
+from clsplat.reference.project import join_rows, project_bwd, project_bwd_adam, project_disparities, project_fwd
 from clsplat.reference.rays import rays_bwd, rays_fwd
 from clsplat.reference.removal import removal
 from clsplat.reference.scan import exclusive_scan

@@ -110,6 +110,11 @@ def project_fwd(
     return Splats(*(np.where(visible.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in splats))
 
 
+def join_rows(first: Array, second: Array) -> Array:
+    """Append rows to others. Arguments and result as for `clsplat.ops.join_rows`."""
+    return np.concatenate([first, second])
+
+
 def project_disparities(gaussians: Gaussians, camera: Camera, splats: Splats) -> Array:
     """Disparity along the rays of pixels. Arguments and result as for `clsplat.ops.project_disparities`.
 

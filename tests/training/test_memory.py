@@ -21,8 +21,10 @@ from clsplat.render import render_views
 from clsplat.scene import Scene, View
 from clsplat.training.checkpoint import load_state
 from clsplat.training.densify import STRATEGIES
-from clsplat.training.loop import train
+from clsplat.training.loop import complete, train
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
+from clsplat.training.session import Training
+from clsplat.training.state import initial_state
 
 FIXED_N = AdcConfig(stop_fraction=0)
 """No densification."""
@@ -84,6 +86,22 @@ def test_what_is_predicted_is_allocated(
     photos = sum(view.image.nbytes for view in scene.train)
     predicted = Footprint.of(scene, config, device).total(n, met) + photos
     assert device.memory_peak <= predicted <= 1.2 * device.memory_peak
+
+
+def test_a_backdrop_is_predicted(tmp_path: Path) -> None:
+    scene, device = make_scene(5000, 160, 120), Device()
+    config = TrainConfig(strategy="adc", size="fixed", iterations=6, adc=FIXED_N)
+    state = initial_state(scene, config)
+    training = Training(scene, config, device, state, backdrop=initial_state(scene, config).gaussians)
+    complete(training, tmp_path)
+    photos = sum(view.image.nbytes for view in scene.train)
+    need = training.need
+    assert need.backdrop == 5000
+    predicted = need.total(5000, training.state.intersections) + photos
+    assert device.memory_peak <= predicted <= 1.2 * device.memory_peak
+    # Without the backdrop's bytes the prediction would be too low.
+    assert replace(need, backdrop=0).total(5000, training.state.intersections) + photos < device.memory_peak
+    assert abs(need.most_gaussians(need.total(5000)) - 5000) <= 1
 
 
 def test_a_million_gaussians_fit_4_gb() -> None:
