@@ -14,7 +14,7 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.ranges import check
 from clsplat.scene import Color
-from clsplat.stages import Bins, Dropout, Image, SplatGrads, Splats, Stages
+from clsplat.stages import AnyGrads, AnySplats, Bins, Dropout, Image, Stages
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -48,7 +48,7 @@ class Pass:
     gaussians: Gaussians
     camera: Camera
     sh_degree: int
-    splats: Splats
+    splats: AnySplats
     bins: Bins
     image: Image
     disparities: Any = None
@@ -90,6 +90,11 @@ class Renderer:
         background: Color = BLACK,
     ):
         check(config)
+        if config.projection == "ray" and config.sort == "pixel":
+            raise InputError(
+                "sort: expected auto, global or per_tile for the projection along rays, found pixel; it needs the "
+                "affine projection"
+            )
         check_color("background", background)
         self.config, self.background = config, background
         self.device: Device | None = None
@@ -153,7 +158,7 @@ class Renderer:
         gaussians : Gaussians of N >= 1 rows
             On the host or where the stages run.
         camera : Camera
-            Of a model that kernels project to: not equirectangular.
+            An equirectangular one needs the projection along rays.
         sh_degree : int, optional
             Highest degree of the spherical harmonics evaluated; default: all that are stored.
         background : (3,) floats, optional
@@ -174,8 +179,8 @@ class Renderer:
         if config.near is not None:
             camera = replace(camera, near=config.near)
         behind = np.array([*(self.background if background is None else background), *[0.0] * depth])
-        antialiased = config.mode == "antialiased"
-        splats = self.stages.project_fwd(gaussians, camera, degree, antialiased=antialiased, channels=len(behind))
+        options = {"antialiased": config.mode == "antialiased", "rays": along_rays(config, camera)}
+        splats = self.stages.project_fwd(gaussians, camera, degree, channels=len(behind), **options)
         if dropout:
             self.stages.dropout_fwd(splats, dropout)
         # The reference works splat by splat and gains nothing from tiles.
@@ -189,7 +194,7 @@ class Renderer:
         image = self.stages.composite_fwd(splats, bins, behind, compositor=config.compositor, disparities=disparities)
         return Pass(gaussians, camera, degree, splats, bins, image, disparities, dropout)
 
-    def backward_to_splats(self, run: Pass, v_image: Image) -> SplatGrads:
+    def backward_to_splats(self, run: Pass, v_image: Image) -> AnyGrads:
         """Gradients with respect to the splats: the first half of `backward`."""
         v_splats = self.stages.composite_bwd(
             run.splats, run.bins, run.image, v_image, compositor=self.config.compositor, disparities=run.disparities
@@ -220,6 +225,11 @@ class Renderer:
             camera_grad=camera_grad,
         )
         return Gradients(v_gaussians, v_splats.means2d, *(v_camera or (None, None)))
+
+
+def along_rays(config: RenderConfig, camera: Camera) -> bool:
+    """Whether Gaussians are evaluated along rays. For an orthographic camera, the affine projection is exact."""
+    return config.projection == "ray" and camera.model != "orthographic"
 
 
 def check_color(name: str, color: Any) -> None:
