@@ -15,6 +15,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.renderer import BLACK, Gradients, Pass, Renderer, along_rays, download, fetch
 from clsplat.scene import Color
 from clsplat.stages import Image, RaySplats
+from clsplat.surface import Surface, surface_of
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -45,6 +46,23 @@ class Rendering:
 
     def _repr_png_(self) -> bytes:
         return display.png(self.rgb)
+
+    def surface(self) -> Surface:
+        """Find the surface in the image: median depths and normals. They have no gradient.
+
+        Raises
+        ------
+        InputError
+            As `backward`, which needs the same parts of the rendering.
+        """
+        if self._run is None:
+            self._check(None, None, None, False)
+            height, width = self.alpha.shape
+            ids, zeros = np.full((height, width), -1, np.int32), np.zeros((height, width, 4))
+            return Surface(ids, zeros[:, :, 0], zeros[:, :, 1:])
+        run = self._run
+        ids = download(self._renderer.stages.median_splats(run.splats, run.bins))
+        return surface_of(fetch(self._gaussians), run.camera, ids)
 
     def backward(
         self,

@@ -29,10 +29,10 @@ LAYERS = """
     camera gaussians
     scene stages metrics panorama programs
     structs reference device
-    ops testing formats
+    ops testing formats surface
     renderer selftest
     render dataset demo raster_gradients
-    rasterization pruning
+    rasterization pruning meshing
     training show
     evaluate
     bench
@@ -219,6 +219,7 @@ DEFINES = {
         **{"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
     },
+    "median": {"TILE": 16, "CHANNELS": 3, "RAYS": 1},
     "project": {
         **{"CHANNELS": 4, "ANTIALIASED": 1, "CAMERA_GRAD": 1, "GROUP": 32},
         **{"LENS": "FISHEYE", "RAYS": 0, "LANES": 1},
@@ -253,6 +254,9 @@ FORBIDDEN = [
     ("loss", "LANES", 8),
     ("loss", "VECTORS", 0),
     ("loss", "GROUP", 0),
+    ("median", "TILE", 0),
+    ("median", "CHANNELS", 0),
+    ("median", "RAYS", 3),
     ("project", "CHANNELS", 5),
     ("project", "ANTIALIASED", 2),
     ("project", "CAMERA_GRAD", 2),

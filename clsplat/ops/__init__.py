@@ -16,6 +16,7 @@ from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.ops.finite import count_not_finite
 from clsplat.ops.loss import l1_ssim
+from clsplat.ops.median import median_splats
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
 from clsplat.ops.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
@@ -38,6 +39,7 @@ class Launches:
         self.composite_fwd = partial(composite_fwd, device)
         self.composite_bwd = partial(composite_bwd, device)
         self.count_pairs = partial(count_pairs, device)
+        self.median_splats = partial(median_splats, device)
         self.removal = partial(removal, device)
         self.exposure_fwd = partial(exposure_fwd, device)
         self.exposure_bwd = partial(exposure_bwd, device)

@@ -13,6 +13,7 @@ from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.reference.finite import count_not_finite
 from clsplat.reference.loss import l1_ssim
+from clsplat.reference.median import median_splats
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
 from clsplat.reference.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
