@@ -294,6 +294,9 @@ class TrainConfig:
     exposure: bool = False
     """Learn an affine map of the colours of each training photo, for photos with different exposure or white
     balance."""
+    response: bool = False
+    """With --exposure, also learn a curve of each photo's response, and the vignetting that all photos share: for
+    cameras that change contrast, and for lenses that darken the corners."""
     filter_3d: bool = False
     """Keep every Gaussian at least as thick as the photos resolve (Mip-Splatting's 3D filter), for scenes that will
     be seen from closer or at a larger size than they were photographed, and with --mode antialiased also from farther

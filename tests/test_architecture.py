@@ -214,6 +214,7 @@ DEFINES = {
     "composite_gpu": {"TILE": 8, "CHANNELS": 1, "ITEMS": 32, "BATCH": 16, "RAYS": 1, "SUBGROUPS": 0},
     "composite_sorted": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "WINDOW": 2},
     "count": {"TILE": 16},
+    "exposure": {"RESPONSE": 1},
     "filter": {"FILTER_VARIANCE": 0.2, "LENS": "FISHEYE"},
     "loss": {
         **{"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
@@ -249,6 +250,7 @@ FORBIDDEN = [
     ("composite_sorted", "CHANNELS", 0),
     ("composite_sorted", "WINDOW", 0),
     ("count", "TILE", 0),
+    ("exposure", "RESPONSE", 2),
     ("filter", "LENS", 5),
     ("loss", "RADIUS", 0),
     ("loss", "LANES", 8),

@@ -11,6 +11,9 @@ from clsplat.commands.run_folders import dataset_of, scene_file, with_run
 from clsplat.errors import InputError
 from clsplat.ranges import within
 
+COORDINATE_MAX = 1e18
+"""Largest coordinate of a box: its square is finite in single precision."""
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -24,9 +27,9 @@ class Mesh:
     """Dataset, as for `train`, whose training photos' cameras see the scene. Default: the dataset of the run."""
     resolution: Annotated[int, within(least=8, most=2048)] = 256
     """Voxels along the longest edge of the box. Memory and time grow with the cube of it."""
-    box: Annotated[tuple[float, ...], tyro.conf.arg(metavar="X Y Z X Y Z")] = ()
-    """Smallest and largest coordinates of the mesh, in the scene's units. Default: all that the cameras see but a
-    fiftieth on each side."""
+    box: Annotated[tuple[float, ...], within(least=-COORDINATE_MAX, most=COORDINATE_MAX)] = ()
+    """Smallest and largest x, y and z of the mesh, in the scene's units: six numbers. Default: all that the cameras
+    see but a fiftieth on each side."""
     device: DeviceName = None
     """Part of the name of the platform or device."""
     data_config: Annotated[CameraOptions, tyro.conf.arg(name="")] = field(default_factory=CameraOptions)
