@@ -1,4 +1,4 @@
-// The exponent of a Gaussian along the ray of a pixel (rays.h), for composite.h:
+// The exponent of a Gaussian along the ray of a pixel (gaussian_rays.h), for composite.h:
 //
 //   sigma = q/(2 (lambda^2 + k q)),   q = a dx^2 + 2 b dx dy + c dy^2,   lambda = along + l_x dx + l_y dy
 // With RAYS = 1 the chart is the image: dx and dy count from the centre, and along = 1. With RAYS = 2 the splat has

@@ -10,7 +10,7 @@
 #define CLSPLAT_COMPOSITE_SPLATS_H
 
 #if RAYS
-// Of a row of rays: RAY_REALS in rays.h.
+// Of a row of rays: RAY_REALS in gaussian_rays.h.
 #define ROW_REALS (RAYS == 2 ? 17 : 8)
 
 // The outline as in ellipse_of (ellipse.h); r2 in the unit of 2 sigma.

@@ -6,7 +6,7 @@
 //   FISHEYE       u = fx s x + cx, s = theta_d/rho, rho^2 = x^2 + y^2, theta = atan2(rho, z),
 //                 theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)   (Kannala and Brandt 2006,
 //                 equation 6, with the odd powers that OpenCV and COLMAP keep)
-//   EQUIRECTANGULAR  u = fx atan2(x, z) + cx, v = fy atan2(y, |(x, z)|) + cy; only without the Jacobian, for rays.h
+//   EQUIRECTANGULAR  u = fx atan2(x, z) + cx, v = fy atan2(y, |(x, z)|) + cy; only without the Jacobian, for gaussian_rays.h
 // v accordingly. The depth is z, except for FISHEYE and EQUIRECTANGULAR, which see beyond 90 degrees: there it is the
 // distance |p|. docs/stages/project.md derives the second derivatives of FISHEYE; clsplat/reference/lens.py is the
 // twin.

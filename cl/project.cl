@@ -6,7 +6,7 @@
 //   cov2d = J W Sigma W^T J^T + BLUR I,  Sigma = R S S^T R^T          (Kerbl et al. 2023, equations 5 and 6)
 //   colour = max(SH(direction) + 1/2, 0)                               (original code)
 //   antialiased: opacity * sqrt(det(cov2d - BLUR I)/det(cov2d))        (Yu et al. 2024, "Mip-Splatting", equation 10)
-// With RAYS, the covariance is that of rays.h, and the shape is not approximated.
+// With RAYS, the covariance is that of gaussian_rays.h, and the shape is not approximated.
 // If each pixel is sorted, also the disparity 1/z at which the ray of a pixel meets it (project_disparities).
 // docs/stages/project.md derives the gradients; clsplat/reference/project.py is the float64 twin.
 //
@@ -17,7 +17,7 @@
 //   out  means2d[N,2] px, conics[N,3] px^-2 (xx, xy, yy), depths[N] world, extents[N,2] px, opacities[N],
 //        colors[N,C] (RGB, then the depth if C is 4)
 //        An invisible Gaussian has extents 0 and all its other outputs 0.
-//   out  rays[N,RAY_REALS], the terms along rays (rays.h), with RAYS; means2d, conics and extents are then the outline
+//   out  rays[N,RAY_REALS], the terms along rays (gaussian_rays.h), with RAYS; means2d, conics and extents are then the outline
 //   out  disparities[N,3] of project_disparities: 1/z at the centre in 1/world, and its derivatives by x and y per px
 //   v_x  is the gradient with respect to x; v_camera[groups,16] holds a partial sum per work-group of the gradient
 //        with respect to rotation (9, row-major), translation (3) and fx, fy, cx, cy.
@@ -97,7 +97,7 @@ static inline reals3 conic_vjp(reals3 q, reals3 v) {
 }
 
 #if RAYS
-#include "rays.h"
+#include "gaussian_rays.h"
 #else
 
 // Intermediate values for the forward and the backward pass.

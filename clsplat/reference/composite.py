@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from clsplat.reference.rays import chart_offsets, ray_exponents, ray_exponents_bwd
+from clsplat.reference.gaussian_rays import chart_offsets, ray_exponents, ray_exponents_bwd
 from clsplat.stages import AnyGrads, AnySplats, Bins, Image, RayGrads, RaySplats, SplatGrads
 
 Array = NDArray[np.float64]

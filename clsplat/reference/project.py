@@ -19,8 +19,8 @@ from clsplat.constants import (
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, sigmoid
 from clsplat.reference.adam import adam_step
+from clsplat.reference.gaussian_rays import ShapeGrads, ray_bwd, ray_outlines, ray_shape, ray_terms
 from clsplat.reference.lens import lens
-from clsplat.reference.rays import ShapeGrads, ray_bwd, ray_outlines, ray_shape, ray_terms
 from clsplat.reference.sh import sh_basis, sh_basis_jacobian
 from clsplat.stages import AdamStep, AnyGrads, AnySplats, CameraGrads, RaySplats, Splats
 

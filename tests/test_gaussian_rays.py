@@ -17,9 +17,9 @@ from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, sigmoid
 from clsplat.pruning.prices import price
+from clsplat.reference.gaussian_rays import chart_offsets, ray_exponents
 from clsplat.reference.lens import lens
 from clsplat.reference.project import rotations
-from clsplat.reference.rays import chart_offsets, ray_exponents
 from clsplat.render import render
 from clsplat.renderer import Renderer
 from clsplat.scene import View

@@ -1,6 +1,6 @@
-"""Gaussians along rays in float64: twin of cl/rays.h and cl/composite_rays.h.
+"""Gaussians along rays in float64: twin of cl/gaussian_rays.h and cl/composite_rays.h.
 
-The squared distance of a ray from a Gaussian's centre, in standard deviations, is q/(lambda^2 + k q), as cl/rays.h
+The squared distance of a ray from a Gaussian's centre, in standard deviations, is q/(lambda^2 + k q), as cl/gaussian_rays.h
 says. Here the three vectors b_i are the rows of a matrix B, and B B^T is the covariance of (dx, dy, depth/z).
 """
 
@@ -15,7 +15,7 @@ from clsplat.constants import BLUR
 Array = NDArray[np.float64]
 
 OPEN_MIN, BORDER, WIDE_COS = 0.05, 8, 0.825
-"""As in cl/rays.h."""
+"""As in cl/gaussian_rays.h."""
 
 
 def axes_around(n: Array) -> Array:
@@ -107,7 +107,7 @@ def ray_outlines(f: dict[str, Any], shape: dict[str, Any], camera: Camera, r2: A
 
 
 def _boxes(f: dict[str, Any], shape: dict[str, Any], camera: Camera, r2: Array) -> tuple[Array, Array, Array]:
-    """Boxes around the images of points on the border of the cone of rays with D^2 <= r2; see cl/rays.h."""
+    """Boxes around the images of points on the border of the cone of rays with D^2 <= r2; see cl/gaussian_rays.h."""
     view, n = camera.viewmat[:3, :3], len(r2)
     whiten = np.swapaxes(view @ f["rotation"], 1, 2) / shape["wide"][:, :, None]
     w = np.einsum("nij,nj->ni", whiten, f["p"])

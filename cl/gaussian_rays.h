@@ -8,7 +8,7 @@
 // disparity over the plane in which the Gaussian is largest, with the covariance c of (dx, dy) and depth/z. The variance
 // along the ray to the centre is k = var(depth/z) - c^T Q c = 1/|w|^2. All three follow from three vectors,
 //   b_i = S R^T W^T j_i,   C = (b_0.b_0, b_0.b_1, b_1.b_1),   c = (b_0.b_2, b_1.b_2),   var(depth/z) = b_2.b_2.
-// docs/stages/project.md derives them; clsplat/reference/rays.py is the twin.
+// docs/stages/project.md derives them; clsplat/reference/gaussian_rays.py is the twin.
 //
 // The chart of a PINHOLE is its image, with d = (.., .., 1) and along = 1. For other lenses, each Gaussian has a chart
 // of its own: the image of a pinhole that looks at it, with the axes `frame` and the focal length sqrt(fx fy). d has the
@@ -16,8 +16,8 @@
 // gradient with respect to `frame`.
 //
 // The blur is in three dimensions, so that edge-on discs stay thin Gaussians: S^2 = scales^2 + BLUR depth^2/(fx fy).
-#ifndef CLSPLAT_RAYS_H
-#define CLSPLAT_RAYS_H
+#ifndef CLSPLAT_GAUSSIAN_RAYS_H
+#define CLSPLAT_GAUSSIAN_RAYS_H
 
 // Terms of a Gaussian along rays: centre in the chart (0 for a chart of its own), Q (xx, xy, yy), l, k; and, for a chart
 // of its own, the three axes, with dx = d.axis0, dy = d.axis1 and along = d.axis2.
