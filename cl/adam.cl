@@ -9,6 +9,9 @@
 // to the gradients of its logarithm. The third penalty depends on the effective ranks (adam.h). For it, runs of
 // ln(scales) consist of whole rows. Each penalty is 0 for the other fields.
 //
+// adam_array takes a step on an array of any parameters, in runs of `run` values. With `sparse`, parameters without a
+// gradient stay as they are, and so do their moments (Müller et al. 2022, section 4).
+//
 // Buffers, `total` values each: in and out parameters; in gradients; in and out first (m), second (v).
 #include "common.h"
 #include "adam.h"
@@ -64,5 +67,31 @@ __kernel void adam_step(const uint total, const uint stride, const uint width, c
             ((real *)&g)[k + 2] += v.z;
         }
         adam_update_some(&adam, rates, count, g, parameters + i, first + i, second + i);
+    }
+}
+
+__kernel void adam_array(const uint total, const uint run, const int sparse, const real rate, const Adam adam,
+                         __global real *parameters, const __global real *gradients, __global real *first,
+                         __global real *second) {
+    const size_t begin = get_global_id(0) * run, end = LESSER(begin + run, (size_t)total);
+    for (size_t i = begin; i < end; i += 16) {
+        if (end - i < 16) {
+            for (size_t k = i; k < end; ++k) {
+                const real16 g = gradients[k];
+                if (!sparse || g.s0 != 0)
+                    adam_update_some(&adam, rate, 1, g, parameters + k, first + k, second + k);
+            }
+            continue;
+        }
+        const real16 g = load16(gradients + i);
+        const mask16 moved = g != 0, kept = moved || (mask16)(!sparse);
+        if (sparse && !(any(moved.lo.lo) || any(moved.lo.hi) || any(moved.hi.lo) || any(moved.hi.hi)))
+            continue;
+        real16 m = load16(first + i), v = load16(second + i);
+        const real16 p = load16(parameters + i), old_m = m, old_v = v;
+        const real16 next = adam_update16(&adam, rate, p, g, &m, &v);
+        store16(parameters + i, kept ? next : p);
+        store16(first + i, kept ? m : old_m);
+        store16(second + i, kept ? v : old_v);
     }
 }

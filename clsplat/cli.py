@@ -15,6 +15,7 @@ import tyro
 from clsplat.bench.bench_commands import Captures, Chart, Kernels, Knobs, Quality, Stability, Viewer
 from clsplat.commands import console
 from clsplat.commands.arguments import parsed, unknown
+from clsplat.commands.blockwise import Block
 from clsplat.commands.compact import Compact
 from clsplat.commands.console import warn
 from clsplat.commands.files import Export, Frames, Sfm
@@ -54,7 +55,9 @@ DESCRIPTION = """3D Gaussian Splatting on any OpenCL device. COMMAND --help show
 --help-all shows all. Every command accepts -q (--quiet: only warnings and errors) and -v (--verbose: also messages of
 structure from motion and of the driver's compiler, and tracebacks of errors). --version prints the version."""
 
-COMMANDS = Train | View | Export | Render | Mesh | Eval | Compact | Info | Frames | Sfm | Devices | Demo | Bench
+COMMANDS = (
+    Train | View | Export | Render | Mesh | Eval | Compact | Info | Frames | Sfm | Block | Devices | Demo | Bench
+)
 
 
 def set_loudness(arguments: list[str]) -> list[str]:

@@ -289,6 +289,9 @@ class TrainConfig:
     max_gaussians: Annotated[int | None, within(least=1, most=UINT32_MAX)] = None
     """Largest number of Gaussians in any iteration. A larger start is reduced to it. The strategies mcmc and error
     grow to it and need it with --size fixed."""
+    blocks: Annotated[int | Literal["auto"], within(least=1)] = 1
+    """Number of parts in which the scene trains; auto: the fewest that fit the memory limit. Without --scheduler they
+    train one after the other. Iterations are those of a part."""
     dropout: PartialFraction = 0.0
     """Fraction of the splats left out of each image at the end of the training; it rises from 0."""
     exposure: bool = False

@@ -1,4 +1,4 @@
-"""OpenCL devices: context, kernels and buffers. Only this module, programs and ops import pyopencl."""
+"""OpenCL devices: context, kernels and buffers. Only this module, buffers, programs and ops import pyopencl."""
 
 import os
 import warnings
@@ -14,7 +14,9 @@ import pyopencl.array
 from numpy.typing import DTypeLike
 
 from clsplat import constants
+from clsplat.buffers import Buffers
 from clsplat.errors import DeviceError, InputError
+from clsplat.processors import name_processor, vector_width
 from clsplat.programs import Subgroups, ask, build, build_options, inline_includes, kernel_folder, probe_subgroups
 
 POCL_HINT = "install one, for example the embedded CPU driver: pip install 'clsplat[pocl]'"
@@ -37,9 +39,6 @@ MODEL_CONSTANTS = (
 # Work-group size of kernels that require no particular one. A driver would choose it by the range's divisors, and
 # PoCL compiles a kernel again for each size, that is, whenever the number of Gaussians changes.
 GROUP = 64
-
-# Largest ratio of the sizes of two buffers of one name that are allocated with the same size.
-SAME_ORDER = 4
 
 # Variable that selects the variants of all stages, as --compositor does for one: auto (those for the device's type),
 # cpu or gpu. Both compute the same on every device.
@@ -115,8 +114,8 @@ class Device:
         As above.
     model : dict
         Values of the constants of the rendering model.
-    memory_peak : int
-        Largest total size of all buffers so far, bytes.
+    buffers : Buffers
+        Its memory.
     """
 
     def __init__(
@@ -137,12 +136,11 @@ class Device:
         self.real: np.dtype[Any] = np.dtype(real)
         if self.real == np.float64 and "cl_khr_fp64" not in self.cl_device.extensions:
             raise DeviceError(f"{self.label}: expected a device with double precision (cl_khr_fp64) for float64")
+        self._level = name_processor(self.cl_device)
         self.context = cl.Context([self.cl_device])
         self.queue = cl.CommandQueue(self.context)
         self.memory_limit = min(memory_limit or self.cl_device.global_mem_size, self.cl_device.global_mem_size)
-        self.memory_peak = 0
-        self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self.queue))
-        self._largest: dict[str, int] = {}
+        self.buffers = Buffers(self.queue, self.label, self.memory_limit)
         self._constants: dict[str, tuple[bytes, cl.array.Array]] = {}
         self._kernels: dict[tuple[str, tuple[Any, ...]], cl.Kernel] = {}
         self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}
@@ -156,7 +154,12 @@ class Device:
     @property
     def memory(self) -> int:
         """Current total size of all buffers, bytes, including those kept for reuse."""
-        return int(self._pool.managed_bytes)
+        return self.buffers.memory
+
+    @property
+    def memory_peak(self) -> int:
+        """Largest total size of all buffers so far, bytes."""
+        return self.buffers.peak
 
     @cached_property
     def is_cpu(self) -> bool:
@@ -192,60 +195,8 @@ class Device:
 
     @cached_property
     def vector_width(self) -> int:
-        """Number of floats in the vectors of kernels for CPUs: 16 if the compiler has registers for them, else 8.
-
-        PoCL 3.0 (LLVM 14) compiles for AMD's Zen 4, which has AVX-512, as for a Zen 3, which has not. No Zen that
-        LLVM knows under an earlier name has vectors of 16.
-        """
-        mismatched = "znver" in ask(self.cl_device, "version", "")
-        return 16 if ask(self.cl_device, "native_vector_width_float", 1) >= 16 and not mismatched else 8
-
-    def _check_size(self, what: str, nbytes: int) -> None:
-        limit = self.cl_device.max_mem_alloc_size
-        if nbytes > limit:
-            raise DeviceError(
-                f"{what}: needs a buffer of {nbytes / 2**20:.0f} MiB, but {self.label} allows at most "
-                f"{limit / 2**20:.0f} MiB per buffer; use fewer Gaussians or a smaller image (--downscale)"
-            )
-
-    def _block(self, nbytes: int) -> int:
-        """Bytes that the pool allocates for a buffer of `nbytes`: it rounds up to a size class."""
-        return int(self._pool.alloc_size(self._pool.bin_number(nbytes)))
-
-    def _capacity(self, what: str, nbytes: int) -> int:
-        """Bytes to allocate for `nbytes`: the largest size of this name so far, if within `SAME_ORDER`.
-
-        Lists of intersections differ in length from image to image. Blocks of one size can be reused.
-        """
-        largest = self._largest.get(what, 0)
-        if largest / SAME_ORDER <= nbytes <= largest:
-            return largest
-        if nbytes > largest:
-            self._largest[what] = nbytes
-            if largest and self._block(nbytes) > self._block(largest):
-                self._pool.free_held()  # the smaller blocks
-        return nbytes
-
-    def _allocate(self, what: str, nbytes: int) -> cl.MemoryObjectHolder:
-        capacity = self._capacity(what, nbytes)
-        if self.memory + self._block(capacity) > self.memory_limit:
-            self._pool.free_held()
-            capacity = nbytes
-        if self.memory + self._block(capacity) > self.memory_limit:
-            raise DeviceError(
-                f"{what}: needs {nbytes / 2**20:.0f} MiB in addition to {self.memory / 2**20:.0f} MiB in use, "
-                f"but the limit is {self.memory_limit / 2**20:.0f} MiB (--memory-limit); use fewer Gaussians or a "
-                "smaller image (--downscale)"
-            )
-        try:
-            block = self._pool.allocate(capacity)
-        except cl.MemoryError as error:
-            raise DeviceError(
-                f"{what}: {self.label} has no memory left for {nbytes / 2**20:.0f} MiB; use fewer Gaussians or a "
-                "smaller image (--downscale)"
-            ) from error
-        self.memory_peak = max(self.memory_peak, self.memory)
-        return block
+        """Number of floats in the vectors of kernels for CPUs: 8 or 16."""
+        return vector_width(self.cl_device, self._level)
 
     def empty(self, what: str, shape: tuple[int, ...] | int, dtype: DTypeLike | None = None) -> cl.array.Array:
         """Uninitialised array of `dtype` (default: real). `what` names it in errors.
@@ -255,11 +206,8 @@ class Device:
         DeviceError
             If the array exceeds the device's largest buffer, its memory, or the limit.
         """
-        dtype = self.real if dtype is None else np.dtype(dtype)
-        nbytes = int(np.prod(shape)) * dtype.itemsize
-        self._check_size(what, nbytes)
-        data = self._allocate(what, nbytes) if nbytes else None
-        return cl.array.Array(self.queue, shape, dtype, data=data)
+        shape = shape if isinstance(shape, tuple) else (int(shape),)
+        return self.buffers.empty(what, shape, self.real if dtype is None else np.dtype(dtype))
 
     def scratch(self, what: str, size: int, layout: Any = None) -> cl.array.Array:
         """Flat array of `size` reals named `what`, kept between calls.
@@ -338,6 +286,8 @@ class Device:
         If a build with subgroups fails, a warning says so, and the device uses none. They change no result.
         """
         source, values = inline_includes(f"{stage}.cl", kernel_folder()), self.model | defines
+        if self._level:  # a key of PoCL's cache, which processors of other levels may share
+            values["PROCESSOR"] = self._level
         if values.get("SUBGROUPS") != 1:
             return build(self.context, source, build_options(self.real, values))
         try:

@@ -54,12 +54,17 @@ def driver_errors() -> Iterator[None]:
             raise
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         if getattr(error, "code", None) == cl.status_code.BUILD_PROGRAM_FAILURE:
-            raise BuildError(_unbuilt(reason)) from error
+            raise BuildError(_unbuilt(reason, log=str(error))) from error
         raise DeviceError(f"the OpenCL driver failed: {reason}") from error
 
 
-def _unbuilt(reason: str) -> str:
+def _unbuilt(reason: str, log: str) -> str:
     """Sentence about kernels that a driver could not build; its compiler needs space for files."""
+    if "unknown target CPU" in log:
+        return (
+            "cannot build the kernels: this processor is newer than the OpenCL driver, whose compiler does not know "
+            "it; install a newer driver (`conda install -c conda-forge pocl`, or the system's package)"
+        )
     caches = [os.environ.get(name) for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME")]
     for folder in (Path(gettempdir()), Path.home() / ".cache", *(Path(cache) for cache in caches if cache)):
         if folder.is_dir() and (problem := unwritable(folder)):

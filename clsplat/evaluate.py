@@ -4,7 +4,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -45,12 +45,20 @@ def mean_metrics(
     dict
         By the metrics' names: psnr in decibels, ssim, flip. None where a metric is not installed.
     """
+    views = list(views)
+    return mean_metrics_of(rendered(gaussians, views, renderer or Renderer()), views, metrics)
+
+
+def mean_metrics_of(
+    images: Iterable[NDArray[np.uint8]], views: list[View], metrics: Iterable[Metric] = (psnr, ssim)
+) -> dict[str, Any]:
+    """Mean metrics of images, one per view. Metrics and result as for `mean_metrics`."""
     metrics = list(metrics)
 
     def compare(_: int, view: View, image: NDArray[np.uint8]) -> list[float | None]:
         return [metric(image, view.image, view.mask) for metric in metrics]
 
-    figures = zip(*compared(compare, gaussians, list(views), renderer or Renderer()), strict=True)
+    figures = zip(*compared(compare, views, images), strict=True)
     return {m.__name__: _mean(values) for m, values in zip(metrics, figures, strict=True)}
 
 
@@ -86,6 +94,30 @@ def evaluate(
     InputError
         If there is no view, a view's photo is not of its camera's size, or `out` cannot be written.
     """
+    views, renderer = list(views), renderer or Renderer()
+    about = {
+        "num_gaussians": len(gaussians),
+        "sh_degree": gaussians.sh_degree,
+        "mode": renderer.config.mode,
+    }
+    return evaluate_images(rendered(gaussians, views, renderer), views, out, about, renderer.label)
+
+
+def evaluate_images(
+    images: Iterable[NDArray[np.uint8]], views: list[View], out: Path | str, about: dict[str, Any], device: str
+) -> dict[str, Any]:
+    """Compare images, one per view, with the photos, as `evaluate` does.
+
+    Parameters
+    ----------
+    images : iterable of (H, W, 3) uint8
+    views, out
+        As given to `evaluate`.
+    about : dict
+        What made the images, for the result; for a field: method and model_bytes.
+    device : str
+        Name of the device.
+    """
     kinds = ("truth", "render", "difference")
     out = Path(out)
     try:
@@ -93,7 +125,6 @@ def evaluate(
             (out / kind).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot create {out}: {error.strerror}") from error
-    views, renderer = list(views), renderer or Renderer()
     names = _file_names(views)
 
     def compare(index: int, view: View, image: NDArray[np.uint8]) -> dict[str, Any]:
@@ -109,15 +140,13 @@ def evaluate(
         size = {"width": view.camera.width, "height": view.camera.height}
         return {"name": view.name, **metrics, **size, **files}
 
-    records = compared(compare, gaussians, views, renderer)
+    records = compared(compare, views, images)
 
     result = {
         "mean": {metric: _mean([r[metric] for r in records]) for metric in ("psnr", "psnr_fitted", "ssim", "flip")},
-        "num_gaussians": len(gaussians),
-        "sh_degree": gaussians.sh_degree,
-        "mode": renderer.config.mode,
+        **about,
         "resolution": ", ".join(sorted({f"{r['width']}x{r['height']}" for r in records})),
-        "device": renderer.label,
+        "device": device,
         "views": records,
     }
     with replacing(out / "metrics.json") as file:
@@ -126,13 +155,18 @@ def evaluate(
     return result
 
 
+def rendered(gaussians: Gaussians, views: list[View], renderer: Renderer) -> Iterator[NDArray[np.uint8]]:
+    """Render views in 8 bits, one after the other."""
+    for rendering in renderings(renderer, gaussians, [view.camera for view in views]):
+        yield to_uint8(rendering.rgb)
+
+
 def compared(
     compare: Callable[[int, View, NDArray[np.uint8]], Result],
-    gaussians: Gaussians,
     views: list[View],
-    renderer: Renderer,
+    images: Iterable[NDArray[np.uint8]],
 ) -> list[Result]:
-    """Call `compare` for each view, with its index, the view and its render in 8 bits, on threads; list the results.
+    """Call `compare` for each view, with its index, the view and its image in 8 bits, on threads; list the results.
 
     Raises
     ------
@@ -145,8 +179,6 @@ def compared(
         shape = view.camera.height, view.camera.width, 3
         if view.image.shape != shape:
             raise InputError(f"{view.name}: expected a photo of its camera's size, {shape}, found {view.image.shape}")
-    cameras = [view.camera for view in views]
-    images = (to_uint8(rendering.rgb) for rendering in renderings(renderer, gaussians, cameras))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(compare, range(len(views)), views, images))
 

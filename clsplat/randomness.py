@@ -15,6 +15,10 @@ PURPOSES = (
     "surveyed views",
     "backgrounds",
     "points between points",
+    "parameters of a field",
+    "pixels of a batch",
+    "offsets of samples",
+    "points of the grid",
 )
 """Uses of random numbers. The index is part of the stream: new purposes are added at the end."""
 

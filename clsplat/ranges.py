@@ -193,7 +193,7 @@ def _one(value: Any, kinds: tuple[Any, ...], rule: Rule | None, name: str) -> An
     for kind in kinds:
         if _is_of(value, kind):
             result = float(value) if kind is float else value
-            if value is None or rule is None or rule.holds(result):
+            if value is None or rule is None or get_origin(kind) is Literal or rule.holds(result):
                 return result
     expected = " or ".join(_words(kind) for kind in kinds if kind is not NoneType)
     if rule is not None:

@@ -61,8 +61,8 @@ class Rendering:
             ids, zeros = np.full((height, width), -1, np.int32), np.zeros((height, width, 4))
             return Surface(ids, zeros[:, :, 0], zeros[:, :, 1:])
         run = self._run
-        ids = download(self._renderer.stages.median_splats(run.splats, run.bins))
-        return surface_of(fetch(self._gaussians), run.camera, ids)
+        ids = download(self._renderer.stages.median_splats(run.drawn, run.bins))
+        return surface_of(fetch(self._gaussians), run.camera, np.where(ids < len(self._gaussians), ids, -1))
 
     def backward(
         self,

@@ -42,13 +42,15 @@ class Gradients(NamedTuple):
 class Pass:
     """Results of a forward pass that its gradients need. Arrays are where the stages ran.
 
-    disparities: those of the splats, where each pixel sorts them; otherwise None.
+    splats: those of the Gaussians. drawn: all that were composited, those of the Gaussians before those of the
+    backdrop, if there is one. disparities: those of all, where each pixel sorts them; otherwise None.
     """
 
     gaussians: Gaussians
     camera: Camera
     sh_degree: int
     splats: AnySplats
+    drawn: AnySplats
     bins: Bins
     image: Image
     disparities: Any = None
@@ -65,6 +67,9 @@ class Renderer:
     config : RenderConfig
     background : (3,) floats
         RGB behind the Gaussians.
+    backdrop : Gaussians, optional
+        Gaussians that are drawn in every image in addition to those that are rendered, with all their spherical
+        harmonics; they have no gradients.
 
     Attributes
     ----------
@@ -72,6 +77,8 @@ class Renderer:
         None for the reference.
     config, background
         As given.
+    backdrop : Gaussians or None
+        Where the stages run.
     stages : Stages
         The functions of the stages that it runs.
 
@@ -88,6 +95,7 @@ class Renderer:
         device: "Device | Literal['reference'] | None" = None,
         config: RenderConfig = RenderConfig(),
         background: Color = BLACK,
+        backdrop: Gaussians | None = None,
     ):
         check(config)
         if config.projection == "ray" and config.sort == "pixel":
@@ -107,6 +115,7 @@ class Renderer:
 
             self.device = device or default_device()
             self.stages = Launches(self.device)
+        self.backdrop = None if backdrop is None or not len(backdrop) else self.place(backdrop)
 
     @property
     def label(self) -> str:
@@ -179,26 +188,44 @@ class Renderer:
         if config.near is not None:
             camera = replace(camera, near=config.near)
         behind = np.array([*(self.background if background is None else background), *[0.0] * depth])
-        options = {"antialiased": config.mode == "antialiased", "rays": along_rays(config, camera)}
-        splats = self.stages.project_fwd(gaussians, camera, degree, channels=len(behind), **options)
+        splats = self._project(gaussians, camera, degree, len(behind))
         if dropout:
             self.stages.dropout_fwd(splats, dropout)
+        drawn = splats
+        if self.backdrop is not None:
+            others = self._project(self.backdrop, camera, self.backdrop.sh_degree, len(behind))
+            drawn = self._joined(splats, others)
         # The reference works splat by splat and gains nothing from tiles.
         tile_size = max(camera.width, camera.height) if self.device is None else config.tile_size
         by_pixel = config.sort == "pixel"
         scheme = "auto" if by_pixel else config.sort
         bins = self.stages.bin_splats(
-            splats, camera.width, camera.height, tile_size, gradients=gradients, scheme=scheme
+            drawn, camera.width, camera.height, tile_size, gradients=gradients, scheme=scheme
         )
         disparities = self.stages.project_disparities(gaussians, camera, splats) if by_pixel else None
-        image = self.stages.composite_fwd(splats, bins, behind, compositor=config.compositor, disparities=disparities)
-        return Pass(gaussians, camera, degree, splats, bins, image, disparities, dropout)
+        if by_pixel and self.backdrop is not None:
+            more = self.stages.project_disparities(self.backdrop, camera, others)
+            disparities = self.stages.join_rows(disparities, more)
+        image = self.stages.composite_fwd(drawn, bins, behind, compositor=config.compositor, disparities=disparities)
+        return Pass(gaussians, camera, degree, splats, drawn, bins, image, disparities, dropout)
+
+    def _project(self, gaussians: Gaussians, camera: Camera, sh_degree: int, channels: int) -> AnySplats:
+        options = {"antialiased": self.config.mode == "antialiased", "rays": along_rays(self.config, camera)}
+        return self.stages.project_fwd(gaussians, camera, sh_degree, channels=channels, **options)
+
+    def _joined(self, splats: AnySplats, others: AnySplats) -> AnySplats:
+        """Splats of two scenes. The directions of rays belong to the camera, not to a splat."""
+        rows = zip(splats._asdict().items(), others, strict=True)
+        joined = {name: a if name == "directions" else self.stages.join_rows(a, b) for (name, a), b in rows}
+        return type(splats)(**joined)
 
     def backward_to_splats(self, run: Pass, v_image: Image) -> AnyGrads:
         """Gradients with respect to the splats: the first half of `backward`."""
         v_splats = self.stages.composite_bwd(
-            run.splats, run.bins, run.image, v_image, compositor=self.config.compositor, disparities=run.disparities
+            run.drawn, run.bins, run.image, v_image, compositor=self.config.compositor, disparities=run.disparities
         )
+        if run.drawn is not run.splats:
+            v_splats = type(v_splats)(*(v[: len(run.gaussians)] for v in v_splats))
         if run.dropout:
             self.stages.dropout_bwd(v_splats, run.dropout)
         return v_splats

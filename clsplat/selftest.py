@@ -197,6 +197,7 @@ def test_project(b: Bench) -> Found:
     splats = b.up(b.splats)
     arguments: tuple[Gaussians, Camera] = b.up(b.gaussians), b.camera
     yield from pairs(b.stages.project_fwd(*arguments, 3), reference.project_fwd(b.gaussians, b.camera, 3))
+    yield from pairs([b.stages.join_rows(splats.conics, splats.conics)], [np.concatenate([b.splats.conics] * 2)])
     found, v_camera = b.stages.project_bwd(*arguments, 3, splats, b.up(b.v_splats), camera_grad=True)
     expected, v_expected = reference.project_bwd(b.gaussians, b.camera, 3, b.splats, b.v_splats, camera_grad=True)
     yield from pairs(found, expected)

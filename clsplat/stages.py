@@ -7,6 +7,8 @@ containers. N Gaussians, M intersections of a splat with a tile, T tiles, C colo
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
+from clsplat.field_stages import FieldStages
+
 if TYPE_CHECKING:
     from clsplat.camera import Camera
     from clsplat.gaussians import Gaussians
@@ -42,8 +44,8 @@ class RaySplats(NamedTuple):
     """Gaussians projected for evaluation along rays; the first six fields are those of `Splats`.
 
     means2d, conics and extents are the outline, outside of which alpha < ALPHA_MIN: an ellipse, or where the conic is
-    0 the box of the extents. rays (N, 8 or 17): the terms of the exponent (cl/gaussian_rays.h): the centre in a chart, Q
-    (xx, xy, yy), the slopes of lambda and k; 17 with the axes of a chart of its own. directions (H, W, 3): unit
+    0 the box of the extents. rays (N, 8 or 17): the terms of the exponent (cl/gaussian_rays.h): the centre in a chart,
+    Q (xx, xy, yy), the slopes of lambda and k; 17 with the axes of a chart of its own. directions (H, W, 3): unit
     vectors of the pixels' rays in the camera's frame, for such charts; otherwise (1, 1, 3) zeros.
     """
 
@@ -176,7 +178,7 @@ class AdamStep(NamedTuple):
     penalties: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-class Stages(Protocol):
+class Stages(FieldStages, Protocol):
     """The functions of all stages, on a device (`clsplat.ops.Launches`) or in NumPy (the module `clsplat.reference`).
 
     This is the only list of their names. Each function's docstring is with its launch in `clsplat.ops`.
@@ -192,6 +194,7 @@ class Stages(Protocol):
         channels: int = 3,
         rays: bool = False,
     ) -> AnySplats: ...
+    def join_rows(self, first: Array, second: Array) -> Array: ...
     def project_disparities(self, gaussians: "Gaussians", camera: "Camera", splats: AnySplats) -> Array: ...
     def project_bwd(
         self,
@@ -266,6 +269,17 @@ class Stages(Protocol):
         second: "Gaussians",
         step: AdamStep,
     ) -> None: ...
+    def adam_array(
+        self,
+        parameters: Array,
+        gradients: Array,
+        first: Array,
+        second: Array,
+        rate: float,
+        step: AdamStep,
+        *,
+        sparse: bool = False,
+    ) -> None: ...
     def add_noise(self, gaussians: "Gaussians", size: float, seed: int, iteration: int) -> None: ...
     def count_not_finite(self, values: Array) -> int: ...
     def pixel_sizes(self, gaussians: "Gaussians", cameras: Iterable["Camera"]) -> Array: ...
@@ -278,5 +292,7 @@ class Stages(Protocol):
     def argsort_segments(self, keys: Array, bits: int, ranges: Array, values: Array = None) -> Array: ...
 
 
-FUNCTIONS: tuple[str, ...] = tuple(name for name in vars(Stages) if not name.startswith("_"))
+FUNCTIONS: tuple[str, ...] = tuple(
+    name for part in (Stages, FieldStages) for name in vars(part) if not name.startswith("_")
+)
 """Names of the functions of `Stages`, in the order of the pipeline."""

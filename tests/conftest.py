@@ -1,6 +1,8 @@
-"""Fixtures: OpenCL devices of both precisions, one that poses as a GPU, and the data beside the project."""
+"""Fixtures: OpenCL devices of both precisions, one that poses as a GPU, variants of compositing, a folder of kernels,
+and the data beside the project."""
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +10,10 @@ import pytest
 from device_opening import open_device
 from hypothesis import HealthCheck, settings
 
+import clsplat.device
+import clsplat.programs
 from clsplat.device import Device
+from clsplat.programs import kernel_folder
 
 # No clock and no chance in the default run: the same cases each time, however slow the machine. `make fuzz-cases`
 # draws new ones.
@@ -60,3 +65,17 @@ def shared():
     if not folder.is_dir():
         pytest.skip("../shared, the scenes and gold renders beside the project, is missing")
     return folder
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def compositor(request):
+    """Kernel variant; each runs on every device."""
+    return request.param
+
+
+@pytest.fixture
+def kernels(tmp_path, monkeypatch):
+    """A folder of sources of our own in the place of cl/."""
+    shutil.copytree(kernel_folder(), tmp_path / "cl")
+    monkeypatch.setattr(clsplat.device, "kernel_folder", lambda: tmp_path / "cl")
+    return tmp_path / "cl"

@@ -221,3 +221,28 @@ def test_same_bits_twice(configured_device):
     state, rng = start_of(1000), np.random.default_rng(0)
     gradients = [random_like(state[0], rng) for _ in range(3)]
     assert_same_bits(*(by_kernel(configured_device, state, gradients, 2) for _ in range(2)))
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize("size", [1, 16, 100, 5000])
+def test_an_array_matches_twin(any_device, configured_device, size, sparse):
+    """Gradients with zeros, alone and in whole vectors; with `sparse` nothing moves there."""
+    for device in (any_device, configured_device):
+        rng = np.random.default_rng(size)
+        start = [rng.normal(size=size) for _ in range(2)] + [rng.uniform(size=size)]
+        p, m, v = (a.astype(np.float32).astype(np.float64) for a in start)
+        twin = [a.copy() for a in (p, m, v)]
+        arrays = [device.upload("array", a) for a in (p, m, v)]
+        for iteration in range(1, 4):
+            g = rng.normal(size=size).astype(np.float32).astype(np.float64)
+            g[rng.uniform(size=size) < 0.5] = 0
+            g[size // 4 : size // 2] = 0
+            step = settings(iteration)
+            ops.adam_array(device, arrays[0], device.upload("g", g), *arrays[1:], 1e-2, step, sparse=sparse)
+            reference.adam_array(twin[0], g, *twin[1:], 1e-2, step, sparse=sparse)
+        tolerances = DOUBLE if device.real == np.float64 else FLOAT
+        for name, found, wanted in zip(("parameters", "first moments", "second moments"), arrays, twin, strict=True):
+            assert_matches(name, found.get(), wanted, tolerances)
+        if sparse:
+            still = slice(size // 4, size // 2)
+            np.testing.assert_array_equal(arrays[0].get()[still], p[still].astype(device.real))

@@ -24,17 +24,18 @@ STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__i
 # A unit is a package or a module of the top level. It imports only from the rows above its own.
 LAYERS = """
     constants errors randomness display
-    ranges json_lines
+    ranges json_lines processors
     config atomic
-    camera gaussians
+    camera gaussians field_stages
     scene stages metrics panorama programs
+    buffers
     structs reference device
     ops testing formats surface
     renderer selftest
-    render dataset demo raster_gradients
+    render dataset demo raster_gradients fields
     rasterization pruning meshing
     training show
-    evaluate
+    evaluate blocks
     bench
     commands
     cli
@@ -47,6 +48,9 @@ APART = {
     "reference": {"device", "structs", "ops", "scene", "metrics", "config"},  # the equations alone
     "dataset": {"gaussians", "ops", "render", "pruning", "training"},
     "formats": {"scene", "camera", "ops", "render", "pruning", "training"},
+    # Nothing of the Gaussians knows of the fields, and nothing of the fields of Gaussians.
+    "fields": {"gaussians", "renderer", "formats", "testing"},
+    **{unit: {"fields"} for unit in ("rasterization", "pruning", "training", "show", "evaluate")},
     "demo": {"gaussians", "reference", "ops", "render", "training"},
 }
 
@@ -56,9 +60,10 @@ BENCH_KERNELS = {"roof"}
 
 # The only units that may import certain third-party packages, which are optional or slow to import.
 ONLY_IN = {
-    "pyopencl": {"device", "programs", "ops"},
+    "pyopencl": {"buffers", "device", "programs", "ops"},
     "pycolmap": {"dataset"},
     "viser": {"show"},
+    "distributed": {"blocks"},
     "av": {"dataset", "show"},
     "pillow_heif": {"dataset"},
     "sqlite3": set(),  # with pycolmap in the same process it causes a bus error, see COUNT_ROWS in matching.py
@@ -128,7 +133,7 @@ def test_imports_go_one_way(path):
 
 @pytest.mark.parametrize("path", [p for p in MODULES if unit_of(p) == "reference"], ids=lambda p: p.stem)
 def test_twins_import_numpy_only(path):
-    ours = {f"clsplat.{unit}" for unit in ("camera", "constants", "errors", "gaussians", "stages")}
+    ours = {f"clsplat.{unit}" for unit in ("camera", "constants", "errors", "field_stages", "gaussians", "stages")}
     for name in imports_of(path):
         allowed = name in ours or name.startswith("clsplat.reference.") or name.split(".")[0] == "numpy"
         assert allowed or name.split(".")[0] in sys.stdlib_module_names, name
@@ -216,10 +221,15 @@ DEFINES = {
     "count": {"TILE": 16},
     "exposure": {"RESPONSE": 1},
     "filter": {"FILTER_VARIANCE": 0.2, "LENS": "FISHEYE"},
+    "hashgrid": {"RESOLUTIONS": "4,8", "OFFSETS": "0,125,637"},
+    "voxels": {"FEATURES": 28, "TV_EPS": 1e-9},
+    "heads": {"EXPONENT_MAX": 15.0},
+    "march": {"CONTRACTED": 1},
     "loss": {
         **{"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
     },
+    "mlp_cpu": {"WIDTHS": "32,64,16", "WIDEST": 64, "ROWS": 6},
     "median": {"TILE": 16, "CHANNELS": 3, "RAYS": 1},
     "project": {
         **{"CHANNELS": 4, "ANTIALIASED": 1, "CAMERA_GRAD": 1, "GROUP": 32},
@@ -259,6 +269,10 @@ FORBIDDEN = [
     ("median", "TILE", 0),
     ("median", "CHANNELS", 0),
     ("median", "RAYS", 3),
+    ("march", "CONTRACTED", 2),
+    ("voxels", "FEATURES", 0),
+    ("mlp_cpu", "WIDEST", 272),
+    ("mlp_cpu", "ROWS", 8),
     ("project", "CHANNELS", 5),
     ("project", "ANTIALIASED", 2),
     ("project", "CAMERA_GRAD", 2),

@@ -1,6 +1,7 @@
 """No kernel writes beyond the end of an array: numbers of rows that leave work-items over, and what follows them."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pyopencl as cl
@@ -27,9 +28,10 @@ class GuardedDevice(Device):
         super().__init__()
         self.is_cpu = is_cpu  # shadows the cached property
         self.guarded = []
+        self.buffers.allocate = partial(self._allocate, self.buffers.allocate)
 
-    def _allocate(self, what, nbytes):
-        block = super()._allocate(what, nbytes + GUARD)
+    def _allocate(self, allocate, what, nbytes):
+        block = allocate(what, nbytes + GUARD)
         value = np.uint8(1 + len(self.guarded) % PATTERNS)
         cl.enqueue_fill_buffer(self.queue, block, value, nbytes, GUARD)
         self.guarded.append((what, nbytes, block, value))  # also keeps the memory from being used again

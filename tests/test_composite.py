@@ -7,19 +7,12 @@ from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, EXTENT_SLACK, TRANSMITTANCE_MIN
-from clsplat.errors import InputError
 from clsplat.stages import Bins, Image, SplatGrads, Splats
 from clsplat.testing import ambiguous_pixels, assert_matches, gradcheck, synthetic_scene
 
 TILE_SIZES = pytest.mark.parametrize("tile_size", [8, 16])
 CHANNELS = pytest.mark.parametrize("channels", [3, 4])
 BACKGROUND = (0.3, 0.6, 0.1, 0.0)
-
-
-@pytest.fixture(params=["cpu", "gpu"])
-def compositor(request):
-    """Kernel variant; each runs on every device."""
-    return request.param
 
 
 def make_splats(n, seed=0, *, width=37, height=29, channels=4, margin=0.0):
@@ -241,123 +234,3 @@ def test_central_differences_where_pixels_stop(device64, compositor):
     image, v = check_gradients(device64, compositor, splats, width, height)
     assert (image.alpha > 1 - 2 * TRANSMITTANCE_MIN).any()
     assert (v.colors[30] == 0).all(), "the last splat lies wholly behind pixels that stopped"
-
-
-def test_stop_and_skip_in_numbers(any_device, compositor):
-    """By hand: 0.95 leaves T = 1.25e-4 after three splats; the next would undercut 1e-4 and ends the pixel.
-
-    The splat between them is centred 40 px away, where its alpha is 3e-4.
-    """
-    splats = handmade(
-        [(0.5, 0.5), (0.5, 0.5), (40.5, 0.5), (0.5, 0.5), (0.5, 0.5), (0.5, 0.5)],
-        np.eye(2) * 100,
-        [0.95, 0.95, 0.95, 0.95, 0.95, 0.01],
-        [[1, 0, 0], [0, 1, 0], [9, 9, 9], [0, 0, 1], [9, 9, 9], [9, 9, 9]],
-    )
-    order = np.arange(6)
-    bins = Bins(order, np.array([[0, 6]]), order, np.arange(7), order, 16, 1, 1)
-    image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
-    weights = 0.95 * np.array([1, 0.05, 0.0025])
-    np.testing.assert_allclose(image.rgb[0, 0], weights, rtol=1e-5)
-    np.testing.assert_allclose(image.alpha, 1 - 1.25e-4, rtol=1e-6)
-    ones = Image(np.ones((1, 1, 3)), np.zeros((1, 1)))
-    v = backward(any_device, compositor, splats, bins, image, ones)
-    np.testing.assert_allclose(v.colors[:, 0], [*weights[:2], 0, weights[2], 0, 0], rtol=1e-5)
-    assert (v.opacities[[2, 4, 5]] == 0).all() and (v.means2d[[2, 4, 5]] == 0).all()
-
-
-def test_alpha_is_clamped(any_device, compositor):
-    splats = handmade([(0.5, 0.5)], np.eye(2), [1.0], [[1, 1, 1]])
-    one = np.zeros(1)
-    bins = Bins(one, np.array([[0, 1]]), one, np.arange(2), one, 16, 1, 1)
-    image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
-    np.testing.assert_allclose(image.alpha, ALPHA_MAX, rtol=1e-6)
-
-
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (4099, 3), (3, 1025), (17, 16)])
-def test_image_sizes(device64, compositor, width, height):
-    rng = np.random.default_rng(0)
-    n = 60
-    splats = handmade(
-        rng.uniform(0, 1, (n, 2)) * [width, height],
-        [[9, 2], [2, 4]],
-        rng.uniform(0.2, 0.9, n),
-        rng.uniform(size=(n, 4)),
-    )
-    bins = reference.bin_splats(splats, width, height, 16)
-    expected = reference.composite_fwd(splats, bins, BACKGROUND)
-    image = forward(device64, compositor, splats, bins, BACKGROUND)
-    assert_matches("image", image.rgb, expected.rgb, DOUBLE)
-    v_image = random_grads(expected)
-    v_expected = reference.composite_bwd(splats, bins, expected, v_image)
-    v = backward(device64, compositor, splats, bins, expected, v_image)
-    for name, array in v_expected._asdict().items():
-        assert_matches(f"v_{name}", getattr(v, name), array, DOUBLE)
-
-
-def test_nothing_visible(any_device, compositor):
-    splats = Splats(*(np.zeros(s) for s in ((5, 2), (5, 3), (5,), (5, 2), (5,), (5, 4))))
-    uploaded = Splats(*(any_device.upload("splats", a) for a in splats))
-    bins = ops.bin_splats(any_device, uploaded, 20, 10, 16)
-    image = ops.composite_fwd(any_device, uploaded, bins, BACKGROUND, compositor=compositor)
-    np.testing.assert_array_equal(image.rgb.get(), np.tile(np.array(BACKGROUND, any_device.real), (10, 20, 1)))
-    np.testing.assert_array_equal(image.alpha.get(), np.zeros((10, 20)))
-    v = ops.composite_bwd(any_device, uploaded, bins, image, image, compositor=compositor)
-    for name, array in v._asdict().items():
-        assert (array.get() == 0).all(), name
-
-
-def test_negative_sigma_is_skipped(any_device, compositor):
-    """A conic that rounding made indefinite: exp(-sigma) would grow without bound along its axis."""
-    splats = handmade([(8.0, 8.0)], np.eye(2), [0.5], [[1, 1, 1]])._replace(conics=np.array([[1.0, 1.5, 1.0]]))
-    one = np.zeros(1)
-    bins = Bins(one, np.array([[0, 1]]), one, np.arange(2), one, 16, 16, 16)
-    image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
-    i, j = np.indices((16, 16)) + 0.5 - 8
-    assert (image.alpha[i * j < 0][np.abs(i + j)[i * j < 0] < 1] == 0).all()
-    assert 0 < image.alpha.max() <= 0.5
-    v = backward(any_device, compositor, splats, bins, image, random_grads(image))
-    assert all(np.isfinite(a).all() for a in v)
-
-
-def test_same_bits_twice_and_for_every_tiling(device, compositor):
-    """Centres on a grid of 1/256 px make every distance to a pixel exact, whichever tile it is counted from."""
-    splats, width, height = make_splats(200, 6)
-    splats = splats._replace(means2d=np.round(splats.means2d * 256) / 256)
-    bins = {t: reference.bin_splats(splats, width, height, t) for t in (8, 16)}
-    images = [forward(device, compositor, splats, bins[t], BACKGROUND) for t in (16, 16, 8)]
-    for image in images[1:]:
-        np.testing.assert_array_equal(image.rgb, images[0].rgb)
-        np.testing.assert_array_equal(image.alpha, images[0].alpha)
-    v_image = random_grads(images[0])
-    v = [backward(device, compositor, splats, bins[16], images[0], v_image) for _ in range(2)]
-    for name in SplatGrads._fields:
-        np.testing.assert_array_equal(getattr(v[0], name), getattr(v[1], name), err_msg=name)
-
-
-def test_what_overflows_has_no_gradient(any_device, compositor):
-    """Found by fuzzing: the gradient of one centre was NaN, and so would have been the statistics of densification.
-
-    Two splats beside each other: the brightness of one overflows.
-    """
-    bright = 3e38 if any_device.real == np.float32 else 1e308
-    colors = np.array([[bright] * 3, [0.5] * 3])
-    splats = handmade([(8, 8), (28, 8)], 2 * np.eye(2), [0.5, 0.5], colors)
-    width, height = 36, 16
-    bins = reference.bin_splats(splats, width, height, 16)
-    v_image = Image(np.full((height, width, 3), 100.0), np.zeros((height, width)))
-    image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
-    assert np.isfinite(image.rgb).all()
-    with np.errstate(all="ignore"):
-        twin = reference.composite_bwd(splats, bins, image, v_image)
-    for first, second in backward(any_device, compositor, splats, bins, image, v_image):
-        assert (first == 0).all() and np.isfinite(second).all()
-    assert all(np.isfinite(array).all() for array in twin) and twin.colors[1].min() > 0
-
-
-def test_lists_without_slots_have_no_gradients(device):
-    splats, width, height = make_splats(3)
-    bins = reference.bin_splats(splats, width, height, 16, gradients=False)
-    image = Image(np.zeros((height, width, 4)), np.zeros((height, width)))
-    with pytest.raises(InputError, match=r"^bins: expected lists made with gradients=True"):
-        ops.composite_bwd(device, splats, bins, image, image)

@@ -212,5 +212,8 @@ def test_a_gpu_without_memory_for_the_windows_is_refused():
         device = Device(memory_limit=limit)
         device.is_cpu = is_cpu  # shadows the cached property
         gaussians, camera = synthetic_scene(5, width=16, height=16)
-        with pytest.raises(DeviceError, match=r"--sort pixel: .* would reserve .* GiB") if refused else nullcontext():
+        # A pixel has 32 splats of three numbers in its window, three colours and four states; a unit 2048 items.
+        reserved = 16**2 * (3 * 32 + 3 + 4) * 4 * 2048 * device.cl_device.max_compute_units / 2**30
+        message = rf"--sort pixel: .* would reserve {reserved:.1f} GiB for .*, but 0\.0 GiB are left"
+        with pytest.raises(DeviceError, match=message) if refused else nullcontext():
             render(gaussians, camera, RenderConfig(sort="pixel"), device)

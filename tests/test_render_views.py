@@ -66,9 +66,9 @@ class TestForwardOnly:
     def test_nothing_stays_on_the_device(self, scene):
         device = Device()
         rendering = render(*scene, RenderConfig(), device, gradients=False)
-        assert device._pool.active_blocks == 1  # the background
+        assert device.buffers.pool.active_blocks == 1  # the background
         kept = render(*scene, RenderConfig(), device)
-        assert device._pool.active_blocks > 1
+        assert device.buffers.pool.active_blocks > 1
         np.testing.assert_array_equal(rendering.rgb, kept.rgb)
 
     def test_backward_refuses(self, device, scene, cameras):

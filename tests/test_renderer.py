@@ -5,10 +5,12 @@ import pytest
 
 import clsplat.device
 from clsplat import Renderer, render
+from clsplat.config import RenderConfig
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.render import renderings
-from clsplat.renderer import default_device, fetch
+from clsplat.renderer import default_device, download, fetch
+from clsplat.stages import Image
 from clsplat.testing import synthetic_scene
 
 
@@ -60,3 +62,30 @@ def test_what_is_on_the_device_is_not_uploaded_again(device, monkeypatch):
     assert not set(uploads) & set(Gaussians.__dataclass_fields__)
     for name, array in fetch(placed).arrays().items():
         np.testing.assert_array_equal(array, gaussians.astype(np.float32).arrays()[name])
+
+
+@pytest.mark.parametrize("sort", ["global", "pixel"])
+@pytest.mark.parametrize("where", ["device", "reference"])
+def test_a_backdrop_is_drawn_and_has_no_gradients(device, where, sort):
+    """As if its Gaussians were among the others, to the bit."""
+    gaussians, camera = synthetic_scene(60)
+    gaussians = gaussians.astype(np.float32)
+    own, others = gaussians.take(np.arange(25)), gaussians.take(np.arange(25, 60))
+    config = RenderConfig(sort=sort)
+    place = device if where == "device" else "reference"
+    v_image = np.random.default_rng(0).normal(size=(camera.height, camera.width, 4))
+    found = []
+    for renderer, shown in (
+        (Renderer(place, config), gaussians),
+        (Renderer(place, config, backdrop=others), own),
+        (Renderer(place, config), own),
+    ):
+        run = renderer.forward(shown, camera, depth=True)
+        v = Image(renderer.upload("v", v_image), renderer.upload("v", np.zeros(v_image.shape[:2])))
+        gradients = renderer.backward(run, v)
+        found.append((download(run.image.rgb), *fetch(gradients.gaussians).arrays().values(), gradients.means2d))
+    whole, split, alone = ([download(array) for array in arrays] for arrays in found)
+    np.testing.assert_array_equal(split[0], whole[0])
+    for a, b in zip(split[1:], whole[1:], strict=True):
+        np.testing.assert_array_equal(a, b[:25])
+    assert not np.array_equal(alone[0], whole[0])

@@ -58,7 +58,7 @@ class Kernels:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.bench.kernel_report import details, save_scaling_chart, summary
+        from clsplat.bench.kernel_report import details, networks, save_scaling_chart, summary
         from clsplat.bench.kernels import bench_kernels
         from clsplat.device import Device, select_device
 
@@ -71,7 +71,7 @@ class Kernels:
         if self.scaling is not None:
             save_scaling_chart(results, self.scaling)
             _say(f"chart: {self.scaling}")
-        print(summary(results))
+        print(f"{summary(results)}\n\n{networks(results)}")
         for workload in results["workloads"]:
             print(f"\n{details(workload)}")
 
@@ -187,7 +187,7 @@ class Quality:
     fern:downscale=2. So do options for a variant: thin=4 (every 4th training photo), arc=0.2 (the end of the path is
     held out), points=0.1 (a tenth of the sparse points)."""
     methods: tuple[str, ...] = ("paper-7k", "auto")
-    """Presets of `train`, or configuration files as for its --config."""
+    """Presets of `train`, configuration files as for its --config, or radiance fields as for its --method."""
     budgets: tuple[str, ...] = ("own",)
     """Caps on the number of Gaussians: "own" for the method's cap, a factor of it such as x0.5, or a number such as
     40000."""

@@ -12,6 +12,7 @@ from clsplat.bench.captures import STANDARD, Capture
 from clsplat.bench.results import Record
 from clsplat.config import DataConfig, TrainConfig
 from clsplat.errors import InputError
+from clsplat.fields import METHODS
 from clsplat.training.presets import YAML, load_config, load_preset, with_settings
 from clsplat.training.run_length import MOST_ITERATIONS
 
@@ -108,9 +109,11 @@ def _value(text: str) -> Any:
 
 
 def parse_method(text: str) -> tuple[str, TrainConfig]:
-    """Name and settings of a method: a preset, `AUTO`, or a configuration file as for ``train --config``."""
+    """Name and settings of a method: a preset, `AUTO`, a field, or a configuration file as for ``train --config``."""
     if text == AUTO:
         return text, TrainConfig()
+    if text in METHODS:
+        return text, TrainConfig(iterations=METHODS[text].iterations)
     if text.endswith((".json", *YAML)):
         return Path(text).stem, load_config(Path(text))
     return text, load_preset(text)
@@ -175,7 +178,7 @@ def make_cells(
             config = replace(
                 base,
                 iterations=number,
-                max_gaussians=parse_budget(budget, base.max_gaussians),
+                max_gaussians=None if method in METHODS else parse_budget(budget, base.max_gaussians),
                 seed=base.seed if seed is None else seed,
                 data=source.data,
                 # Checkpoints cost time: write one only at the end, which is not timed.

@@ -30,7 +30,8 @@ NOTES = {
     "cpu_seconds": "Processor time of the training on all cores of the host. Other work on the machine lengthens "
     "wall times, but hardly processor times. If a GPU trains, this is the host's part only.",
     "num_gaussians": "Number at the end of the training.",
-    "spz_bytes": "Size of the .spz file at the end of the training. A .ply file is up to ten times as large.",
+    "spz_bytes": "Size of the file at the end of the training: .spz for Gaussians, whose .ply is up to ten times as "
+    "large, and .npz for a radiance field.",
     "memory_bytes": "Peak of the buffers on the device during the training, photos included.",
     "fps": "Reciprocal of the median time from a held-out camera to its image in the host's memory.",
 }

@@ -2,20 +2,20 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.bench.results import Record
-from clsplat.evaluate import compared, mean_metrics
+from clsplat.evaluate import compared, mean_metrics, rendered
 from clsplat.formats import save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, ssim
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
-from clsplat.scene import View, evenly_spaced
+from clsplat.scene import Scene, View, evenly_spaced
 
 FRAMES = 5
 """Number of times that each held-out view is rendered for the rate of frames."""
@@ -24,7 +24,30 @@ TRAINING_PHOTOS = 24
 """Largest number of training photos that are measured. The standard error of their mean PSNR is then about a fifth of
 the spread over photos, while the measurement takes no longer than that of the held-out photos of a large scene."""
 
+SAMPLES = 8
+"""Number of samples of a training. Their iterations form a geometric sequence."""
+
+FIRST_SAMPLE = 1 / 50
+"""Position of the first sample, as a fraction of the iterations. Earlier renders show little."""
+
 Masks = list[NDArray[np.bool_]]
+
+
+def sample_iterations(iterations: int) -> list[int]:
+    """Iterations after which samples are taken: a geometric sequence that includes the last iteration."""
+    return sorted({int(i) for i in np.rint(np.geomspace(max(1, FIRST_SAMPLE * iterations), iterations, SAMPLES))})
+
+
+def facts_of(scene: Scene, rare: Masks | None) -> Record:
+    """Numbers of photos, their largest size, and the fraction of held-out pixels that are rare."""
+    views = scene.train + scene.test
+    return {
+        "train": len(scene.train),
+        "test": len(scene.test),
+        "width": max(view.camera.width for view in views),
+        "height": max(view.camera.height for view in views),
+        "rare": rare_share(scene.test, rare),
+    }
 
 
 def measure(
@@ -41,22 +64,28 @@ def measure(
     rare : list of (H, W) bool, optional
         Pixels of each view for `rare_psnr`, as from `clsplat.dataset.coverage.rare_pixels`.
     """
+    figures = quality_of(rendered(gaussians, views, renderer), views, rare)
+    sizes = {}
+    for suffix in ("ply", "spz"):
+        path = folder / f"sample.{suffix}"
+        save_gaussians(path, gaussians, renderer.config.mode)
+        sizes[f"{suffix}_bytes"] = path.stat().st_size
+    return {"num_gaussians": len(gaussians), "sh_degree": gaussians.sh_degree, **sizes, **figures}
+
+
+def quality_of(images: Iterable[NDArray[np.uint8]], views: list[View], rare: Masks | None = None) -> Record:
+    """Quality of images, one per held-out view; `views` and `rare` as for `measure`."""
     masks: Sequence[NDArray[np.bool_] | None] = rare or [None] * len(views)
 
     def compare(index: int, view: View, image: NDArray[np.uint8]) -> list[float | None]:
         figures = [metric(image, view.image, view.mask) for metric in (psnr, ssim, flip)]
         return [*figures, *_squared_error(image, view, masks[index])]
 
-    psnrs, ssims, flips, errors, numbers = zip(*compared(compare, gaussians, views, renderer), strict=True)
+    psnrs, ssims, flips, errors, numbers = zip(*compared(compare, views, images), strict=True)
     figures = {"psnr": _mean(psnrs), "ssim": _mean(ssims), "flip": _mean(flips), "worst": min(psnrs)}
     error, number = sum(errors), sum(numbers)
     figures["rare_psnr"] = -10 * math.log10(error / number) if error else None
-    sizes = {}
-    for suffix in ("ply", "spz"):
-        path = folder / f"sample.{suffix}"
-        save_gaussians(path, gaussians, renderer.config.mode)
-        sizes[f"{suffix}_bytes"] = path.stat().st_size
-    return {"num_gaussians": len(gaussians), "sh_degree": gaussians.sh_degree, **sizes, **_finite(figures)}
+    return _finite(figures)
 
 
 def _mean(values: tuple[float | None, ...]) -> float | None:

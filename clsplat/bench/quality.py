@@ -15,25 +15,28 @@ from tqdm import tqdm
 from clsplat.bench.captures import captured
 from clsplat.bench.cells import Cell, Source, differences
 from clsplat.bench.environment import describe
-from clsplat.bench.measures import Masks, frames_per_second, measure, rare_share, training_psnr
+from clsplat.bench.field_cells import run_field, source_of
+from clsplat.bench.measures import (
+    Masks,
+    facts_of,
+    frames_per_second,
+    measure,
+    sample_iterations,
+    training_psnr,
+)
 from clsplat.bench.results import KEYS, Record, append_record, read_records, write_records
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.dataset import load_scene
 from clsplat.dataset.coverage import rare_pixels
 from clsplat.device import Device
 from clsplat.errors import ClsplatError, InputError
+from clsplat.fields import METHODS
 from clsplat.gaussians import Gaussians
 from clsplat.ranges import parse_bytes
 from clsplat.renderer import Renderer, fetch
 from clsplat.scene import Scene
 from clsplat.training.loop import train
 from clsplat.training.preparation import prepare
-
-SAMPLES = 8
-"""Number of samples of a training. Their iterations form a geometric sequence."""
-
-FIRST_SAMPLE = 1 / 50
-"""Position of the first sample, as a fraction of the iterations. Earlier renders show little."""
 
 WARM_UP = 4
 """Number of iterations of a separate training before the clock starts. Drivers finish kernels at their first run."""
@@ -80,13 +83,18 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
             append_record(results, key | values | environment | {"date": now})
 
         try:
-            scene, rare = reader.read(cell.source)
-            start, config = prepare(cell.source.path, cell.config, device, scene=scene)
-            last = run_cell(config, start, device, record, rare)
+            scene, rare = reader.read(source_of(cell))
+            if cell.method in METHODS:
+                last = run_field(METHODS[cell.method], cell.config, scene, device, record, rare)
+            else:
+                start, config = prepare(cell.source.path, cell.config, device, scene=scene)
+                last = run_cell(config, start, device, record, rare)
             flips = "" if last["flip"] is None else f", FLIP {last['flip']:.3f}"
+            count = last["num_gaussians"]
+            size = f"{last['spz_bytes'] / 1e6:.3g} MB" if count is None else f"{count:,} Gaussians"
             say(
-                f"    {last['psnr']:.2f} dB, SSIM {last['ssim']:.3f}{flips}; {last['seconds']:.0f} s, "
-                f"{last['num_gaussians']:,} Gaussians, {last['fps']:.1f} frames/s"
+                f"    {last['psnr']:.2f} dB, SSIM {last['ssim']:.3f}{flips}; {last['seconds']:.0f} s, {size}, "
+                f"{last['fps']:.1f} frames/s"
             )
         except Exception as error:  # any error is the result of this cell
             reason = _reason(error, cell.source.path)
@@ -165,7 +173,7 @@ def run_cell(
         Pixels of each held-out photo whose PSNR is measured apart.
     """
     limit = None if config.memory_limit is None else parse_bytes(config.memory_limit, "--memory-limit")
-    facts = _facts(scene, rare)
+    facts = facts_of(scene, rare)
     at = sample_iterations(config.iterations)
     renderer = Renderer(evaluator, config.render, BACKGROUNDS[config.data.background])
     device = Device(evaluator.cl_device, memory_limit=limit)
@@ -211,20 +219,3 @@ def run_cell(
         values |= {"fps": frames_per_second(gaussians, scene.test, renderer)}
         record(values)
     return values
-
-
-def _facts(scene: Scene, rare: Masks | None) -> Record:
-    """Numbers of photos, their largest size, and the fraction of held-out pixels that are rare."""
-    views = scene.train + scene.test
-    return {
-        "train": len(scene.train),
-        "test": len(scene.test),
-        "width": max(view.camera.width for view in views),
-        "height": max(view.camera.height for view in views),
-        "rare": rare_share(scene.test, rare),
-    }
-
-
-def sample_iterations(iterations: int) -> list[int]:
-    """Iterations after which samples are taken: a geometric sequence that includes the last iteration."""
-    return sorted({int(i) for i in np.rint(np.geomspace(max(1, FIRST_SAMPLE * iterations), iterations, SAMPLES))})

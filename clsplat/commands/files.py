@@ -1,5 +1,6 @@
 """The commands `frames`, `sfm` and `export`."""
 
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -7,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from clsplat.commands import console
-from clsplat.commands.console import OptionalOut, Out, SceneOrRun, moved, picture_cameras, say, say_cameras
+from clsplat.commands.console import (
+    OptionalOut,
+    Out,
+    SceneOrRun,
+    moved,
+    new_folder,
+    picture_cameras,
+    say,
+    say_cameras,
+)
 from clsplat.commands.options import PageOptions
 from clsplat.commands.run_folders import scene_file, with_run
 from clsplat.config import Mode, SfmConfig
@@ -60,12 +70,13 @@ class Sfm:
 
 @dataclass(frozen=True)
 class Export:
-    """Convert a scene to another format, or to a web page that shows it in any browser."""
+    """Convert a scene to another format, to levels of detail, or to a web page that shows it in any browser."""
 
     scene: SceneOrRun
     """File of Gaussians, or the folder of a run."""
-    to: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FILE]")] = None
-    """File to write; its suffix determines the format; .html makes a web page."""
+    to: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FILE|FOLDER]")] = None
+    """File to write; its suffix determines the format; .html makes a web page. FOLDER/lod-meta.json writes a streamed
+    SOG and FOLDER/tileset.json 3D Tiles, in levels of detail; a name without a suffix is the folder of both."""
     out: OptionalOut = None
     """Alternative to the second argument."""
     spz_version: Version = 3
@@ -91,6 +102,7 @@ class Export:
             raise InputError("export: expected one file to write, as in: clsplat export scene.ply scene.spz")
         out = self.to or self.out
         assert out is not None
+        levels = out.name in ("lod-meta.json", "tileset.json") or not out.suffix
         scene = scene_file(self.scene)
         to_spz, from_spz = (suffix_of(path) == ".spz" for path in (out, scene))
         if self.spz_axes is not None and not (to_spz or from_spz):
@@ -99,6 +111,9 @@ class Export:
             gaussians, mode, offset = load_spz(scene, self.spz_axes)
         else:
             gaussians, mode, offset = load_gaussians(scene)
+        if levels:
+            self._levels(out, gaussians, mode, offset)
+            return
         if out.suffix.lower() == ".html":
             self._page(out, gaussians, mode, offset)
         elif to_spz:
@@ -107,6 +122,30 @@ class Export:
         else:
             save_gaussians(out, gaussians, mode, offset)
         say(f"{out}: {len(gaussians)} Gaussians, {out.stat().st_size / 1e6:.3g} MB")
+
+    def _levels(self, out: Path, gaussians: "Gaussians", mode: Mode, offset: Any) -> None:
+        """Write levels of detail."""
+        from clsplat.formats.streamed_sog import LOD_META, StreamedSogWriter
+        from clsplat.formats.tiles_3d import TILESET, TilesWriter
+        from clsplat.pruning.levels import detail_tree
+
+        folder = out.parent if out.suffix else out
+        new_folder(folder)
+        writers: list[StreamedSogWriter | TilesWriter] = []
+        if out.name != TILESET:
+            writers.append(StreamedSogWriter(folder, mode, offset))
+        if out.name != LOD_META:
+            writers.append(TilesWriter(folder, mode, offset))
+        counts: Counter[int] = Counter()
+        for node in detail_tree(gaussians):
+            counts[node.height] += len(node.gaussians)
+            for writer in writers:
+                writer.add(node)
+        for writer in writers:
+            writer.finish()
+        size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        of_levels = ", ".join(str(counts[height]) for height in sorted(counts))
+        say(f"{folder}: {len(counts)} levels of {of_levels} Gaussians, {size / 1e6:.3g} MB")
 
     def _page(self, out: Path, gaussians: "Gaussians", mode: Mode, offset: Any) -> None:
         from clsplat.dataset import load_scene

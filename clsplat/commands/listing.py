@@ -9,9 +9,8 @@ from clsplat.commands.console import say
 
 KNOWN_FAULTS = (
     (
-        r"PoCL (3\.0|3\.1) .*znver",
-        "on a Zen 4, built-in functions of vectors beyond 256 bits give wrong numbers or end the process (kernels of "
-        "clsplat call none)",
+        r"PoCL (3\.0|3\.1) .*(znver|generic)",
+        "takes a Zen 4 for a Zen 3 and does not know later processors (clsplat names their features on Linux)",
     ),
     (
         r"rusticl .*\b22\.",

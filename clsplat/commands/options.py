@@ -56,3 +56,14 @@ class ServerOptions:
     """Port that the viewer listens on; if it is in use, the next free one."""
     open: bool = False
     """Open the viewer in the browser of this machine."""
+
+
+@dataclass(frozen=True)
+class ClusterOptions:
+    """Settings of where blocks train."""
+
+    scheduler: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """Scheduler of dask whose workers train the blocks, such as tcp://host:8786; needs the extra `cluster`."""
+    print_jobs: bool = False
+    """Print the commands that train the blocks, for a batch system, and stop. When they have run, the same command
+    with --resume goes on: the first time it prints those of the second trainings, then it merges."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from clsplat.commands import console
+from clsplat.commands.blockwise import JobsPrinted, began, check_same, train_in_blocks
 from clsplat.commands.console import (
     DeviceName,
     Out,
@@ -24,13 +25,13 @@ from clsplat.commands.console import (
     warn,
     write_json,
 )
-from clsplat.commands.options import ServerOptions
+from clsplat.commands.options import ClusterOptions, ServerOptions
 from clsplat.commands.progress import train_with_progress
 from clsplat.commands.run_folders import CONFIG, FRAMES
 from clsplat.commands.viewing import open_viewer
 from clsplat.config import BACKGROUNDS, UINT32_MAX, TrainConfig
 from clsplat.errors import InputError
-from clsplat.ranges import within
+from clsplat.ranges import name_in, within
 from clsplat.training.presets import DATA_PATH, PRESETS, load_config, load_preset
 
 if TYPE_CHECKING:
@@ -51,11 +52,15 @@ class Train:
     out: Out
     """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians, such as scene.spz, which is
     written as well; its name without the suffix becomes the folder."""
+    method: Annotated[str, name_in("clsplat.fields:method_names")] = "gaussians"
+    """What is trained: Gaussians, or a radiance field to compare them with, for which only --iterations, --seed, the
+    settings of the photos, of evaluations and of checkpoints, --device and --memory-limit count."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
     viewer: bool = False
     """Watch and pause the training in the browser, as --open does; needs the extra `viewer`."""
     server: Annotated[ServerOptions, tyro.conf.arg(name="")] = field(default_factory=ServerOptions)
+    cluster: Annotated[ClusterOptions, tyro.conf.arg(name="")] = field(default_factory=ClusterOptions)
     preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
     """Named settings to start from instead of the defaults; flags override them."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -73,17 +78,24 @@ class Train:
     def run(self) -> None:
         """Run the command."""
         from clsplat.formats import check_writable, suffix_of
-        from clsplat.training.checkpoint import CHECKPOINT, no_checkpoint
+        from clsplat.training.checkpoint import no_checkpoint
         from clsplat.training.run_folder import held
 
         suffix = "" if self.out.is_dir() else suffix_of(self.out)
         out = self.out.with_name(self.out.name[: -len(suffix)]) if suffix else self.out
         if suffix:
             check_writable(self.out)
-        if self.resume and not (out / CHECKPOINT).exists():
+        if self.resume and not began(out):
             raise no_checkpoint(out)
+        if self.method != "gaussians":
+            train_method(self, out, suffix)
+            return
         with held(out):
-            gaussians, viewer = self.trained(out, suffix)
+            try:
+                gaussians, viewer = self.trained(out, suffix)
+            except JobsPrinted:
+                say("when these commands have run, go on with the same one and --resume")
+                return
         if viewer:
             say(f"viewer: {viewer.address} stays open; Ctrl-C ends it")
             with suppress(KeyboardInterrupt):
@@ -93,22 +105,18 @@ class Train:
     def trained(self, out: Path, suffix: str) -> "tuple[Gaussians, Viewer | None]":
         """Train in a folder that is held, and write the file of Gaussians that a suffix asks for."""
         from clsplat.formats import save_gaussians
-        from clsplat.training.checkpoint import CHECKPOINT
 
-        if not self.resume and (out / CHECKPOINT).exists():
-            raise InputError(
-                f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
-            )
+        check_new(out, self.resume)
         try_folder(out)
         viewer = open_viewer(self.server) if self.viewer or self.server.open else None
         try:
             device = open_and_name(self.settings)
             scene, config = self.prepared(out, device, viewer)
-            gaussians = train_and_report(scene, config, device, out, self.resume, viewer, self._began(out))
+            gaussians = self._trained(scene, config, device, out, viewer)
         except BaseException as error:
             if viewer:
                 viewer.close()
-            if isinstance(error, KeyboardInterrupt) and (out / CHECKPOINT).is_file():
+            if isinstance(error, KeyboardInterrupt) and began(out):
                 again = sys.argv[1:] + ([] if self.resume else ["--resume"])
                 warn(f"to continue: {shlex.join(['clsplat', *again])}")
             raise
@@ -116,6 +124,30 @@ class Train:
             save_gaussians(self.out, gaussians, config.render.mode, scene.offset)
             say(f"{self.out}: {self.out.stat().st_size / 1e6:.3g} MB")
         return gaussians, viewer
+
+    def _trained(
+        self, scene: "Scene", config: TrainConfig, device: "Device", out: Path, viewer: "Viewer | None"
+    ) -> "Gaussians":
+        """Train in blocks, if the configuration asks for them and one is not enough; otherwise all at once."""
+        from clsplat.renderer import Renderer
+        from clsplat.training.checkpoint import CHECKPOINT
+
+        if config.blocks == 1 and self.cluster != ClusterOptions():
+            raise InputError("--scheduler, --print-jobs: expected with --blocks, found --blocks 1; add --blocks auto")
+        if config.blocks != 1:
+            if viewer:
+                raise InputError(
+                    "--viewer: expected not with --blocks, which train apart from each other; leave out one"
+                )
+            renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
+            gaussians = train_in_blocks(scene, config, renderer, self._photos(out), out, self.cluster)
+            if gaussians is not None:
+                self._began(out)()
+                report(gaussians, scene, config, renderer, out)
+                return gaussians
+            config = replace(config, blocks=1)
+        resume = self.resume and (out / CHECKPOINT).exists()
+        return train_and_report(scene, config, device, out, resume, viewer, self._began(out))
 
     def _began(self, out: Path) -> Callable[[], None]:
         """What is left to do after the first step, for which a user waits: a picture of recovered cameras."""
@@ -155,15 +187,41 @@ class Train:
             data,
             self.settings,
             device,
-            resume=self.resume,
+            resume=self.resume and self.settings.blocks == 1,  # jobs of blocks depend on points
             verbose=console.loudness == "verbose",
             tell=tell,
         )
         check(scene, config)
+        if self.resume and config.blocks != 1:
+            check_same(out / CONFIG, config)
         if not self.resume:
             write_json(out / CONFIG, {DATA_PATH: str(self.data.resolve()), **asdict(config)})
             say_cameras(data)
         return scene, config
+
+
+def check_new(out: Path, resume: bool) -> None:
+    """Raise an InputError if a folder holds a run and none resumes."""
+    if not resume and began(out):
+        raise InputError(
+            f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
+        )
+
+
+def train_method(command: Train, out: Path, suffix: str) -> None:
+    """Train a radiance field in a folder, and evaluate it."""
+    from clsplat.commands.fields import check_settings, train_and_evaluate
+    from clsplat.training.run_folder import held
+
+    if suffix or command.viewer or command.server.open:
+        found = f"-o {command.out}" if suffix else "--viewer or --open"
+        raise InputError(f"--method {command.method}: expected a folder after -o and no viewer, found {found}")
+    check_settings(command.method, command.settings)
+    with held(out):
+        check_new(out, command.resume)
+        try_folder(out)
+        device = open_and_name(command.settings)
+        train_and_evaluate(command.data, command.method, command.settings, device, out, command.resume)
 
 
 def open_and_name(config: TrainConfig) -> "Device":
@@ -188,24 +246,30 @@ def train_and_report(
 
     `began` is called after the first step.
     """
-    from clsplat.formats import save_gaussians
     from clsplat.renderer import Renderer
-    from clsplat.show.training_curve import training_curve
-    from clsplat.training.outcome import failure
 
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     gaussians = train_with_progress(scene, config, renderer, out, resume, viewer, began)
+    report(gaussians, scene, config, renderer, out)
+    return gaussians
+
+
+def report(gaussians: "Gaussians", scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path) -> None:
+    """Write scene.ply, the evaluation and the training curve of a training that has ended to `out`."""
+    from clsplat.formats import save_gaussians
+    from clsplat.show.training_curve import training_curve
+    from clsplat.training.outcome import failure
+
     save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
     say(f"{out / 'scene.ply'}: {len(gaussians)} Gaussians")
     failed = failure(gaussians, scene.train, renderer)
     if failed:
         warn(failed)
     training_curve(out / "log.jsonl", out / "training_curve.png")
-    if config.size == "auto":
+    if config.size == "auto" and config.blocks == 1:  # each block has chosen its own
         say_size(scene, out)
     if scene.test:
         evaluate_held_out(gaussians, scene, config, renderer, out)
-    return gaussians
 
 
 def say_size(scene: "Scene", out: Path) -> None:

@@ -2,8 +2,8 @@
 
 Belongs here: one module per format, and what formats share: `validity` (all of them), `quantisation` and `codebook`
 (the compact ones), `axes` (those with other axes than PLY), containers (`ply_container`, `glb_container`,
-`spz_container`), `anatomy` (bytes by part). Does not belong here: photos, cameras
-and datasets (`clsplat.dataset`), and pruning a scene until it fits (`clsplat.pruning`).
+`spz_container`, `sog_images`), `detail_tree` (those with levels of detail), `anatomy` (bytes by part). Does not
+belong here: photos, cameras and datasets (`clsplat.dataset`), and pruning a scene until it fits (`clsplat.pruning`).
 """
 
 from collections.abc import Callable
@@ -25,6 +25,7 @@ from clsplat.formats.anatomy import (
     splat_anatomy,
     spz_anatomy,
     streamed_sog_anatomy,
+    tiles_anatomy,
 )
 from clsplat.formats.compressed_ply import load_compressed_ply, save_compressed_ply
 from clsplat.formats.csv_table import save_csv
@@ -35,6 +36,7 @@ from clsplat.formats.sog import META, load_sog, save_sog
 from clsplat.formats.splat import load_splat, save_splat
 from clsplat.formats.spz import load_spz, save_spz
 from clsplat.formats.streamed_sog import LOD_META, load_streamed_sog
+from clsplat.formats.tiles_3d import TILESET, load_tiles
 from clsplat.formats.usda import save_usda
 from clsplat.gaussians import Gaussians
 
@@ -71,6 +73,7 @@ WRITE_ONLY: dict[str, Saver] = {".usda": save_usda, ".csv": save_csv}
 FOLDERS: dict[str, tuple[Loader, Callable[[Path], Anatomy]]] = {
     META: (load_sog, sog_anatomy),
     LOD_META: (load_streamed_sog, streamed_sog_anatomy),
+    TILESET: (load_tiles, tiles_anatomy),
 }
 """Reader and anatomy of scenes of several files, by the name of the one that describes them."""
 
@@ -81,12 +84,12 @@ that of ``clsplat train``."""
 
 def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
     """Read Gaussians from a file in a format of `FORMATS` or `READ_ONLY`, chosen by its suffix, or from a folder with
-    an unpacked or streamed SOG.
+    an unpacked or streamed SOG or 3D Tiles.
 
     Parameters
     ----------
     path : str or Path
-        The file; for an unpacked or streamed SOG, its folder, or the meta.json or lod-meta.json in it.
+        The file; for a scene of several files, its folder, or the meta.json, lod-meta.json or tileset.json in it.
 
     Returns
     -------

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from clsplat.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, streamed_sog
+from clsplat.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, streamed_sog, tiles_3d
 from clsplat.formats.axes import RIGHT_UP_BACK, turned
 from clsplat.formats.glb_container import DTYPES, WIDTHS
 from clsplat.formats.ply_container import read_header
@@ -170,6 +170,14 @@ def streamed_sog_anatomy(path: Path) -> Anatomy:
             parts.update(sog_anatomy(folder / name).parts)
     levels = meta.get("lodLevels", "some")
     return Anatomy(f"streamed SOG (PlayCanvas), {levels} levels of detail", dict(parts))
+
+
+def tiles_anatomy(path: Path) -> Anatomy:
+    folder, names = tiles_3d.read_tileset(path)
+    parts: Counter[str] = Counter({tiles_3d.TILESET: (folder / tiles_3d.TILESET).stat().st_size})
+    for name in names:
+        parts.update(glb_anatomy(folder / name).parts)
+    return Anatomy("3D Tiles of .glb, KHR_gaussian_splatting, the finest tiles", dict(parts))
 
 
 def sog_anatomy(path: Path) -> Anatomy:

@@ -44,6 +44,7 @@ from clsplat.formats.quantisation import (
     opacity_bytes,
     smallest_three,
 )
+from clsplat.formats.sog_images import Images, webp
 from clsplat.formats.validity import LOGIT_MAX, check_finite, checked_offset, reading
 from clsplat.gaussians import Gaussians
 
@@ -58,9 +59,6 @@ ROW = 64
 
 QUAT_TAG = 252
 """Alpha of a quaternion whose largest component is w; 253 to 255 stand for x, y, z."""
-
-METHOD = 4
-"""Effort of the WebP encoder, 0 to 6. Measurement: docs/formats.md."""
 
 
 def load_sog(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
@@ -114,8 +112,39 @@ def save_sog(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
         If there is no Gaussian, a value is not finite as float32, or the file cannot be written.
     """
     g = checked(path, gaussians)
-    g = g.take(morton_order(g.means))
-    images = _Images(len(g))
+    images, meta = _encode(g.take(morton_order(g.means)), mode, offset)
+    # ZipInfo defaults to the earliest date of a ZIP, so that the same Gaussians give the same bytes.
+    with replacing(path) as out, zipfile.ZipFile(out, "w") as archive:
+        for name, image in images.items():
+            archive.writestr(zipfile.ZipInfo(name), webp(image))
+        archive.writestr(zipfile.ZipInfo(META), json.dumps(meta))
+
+
+def save_sog_folder(folder: Path, gaussians: Gaussians, mode: Mode, offset: ArrayLike | None) -> None:
+    """Write the files of a SOG scene to a folder, in the order of the Gaussians, with meta.json as the last one.
+
+    Parameters
+    ----------
+    folder : Path
+        Created if it is missing; its parent must exist.
+    gaussians, mode, offset
+        As given to `save_sog`, which has the errors too.
+    """
+    images, meta = _encode(checked(folder, gaussians), mode, offset)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot create {folder}: {error.strerror or error}") from error
+    for name, image in images.items():
+        with replacing(folder / name) as file:
+            file.write(webp(image))
+    with replacing(folder / META) as file:
+        file.write(json.dumps(meta).encode())
+
+
+def _encode(g: Gaussians, mode: Mode, offset: ArrayLike | None) -> tuple[dict[str, Array], dict[str, Any]]:
+    """The images of a scene by name, and the content of its meta.json."""
+    images = Images(len(g))
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": "clsplat"},
@@ -131,32 +160,10 @@ def save_sog(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
     shift = checked_offset(offset)
     if shift.any():
         meta["extras"] = {"clsplat": {"offset": shift.tolist()}}
-    # ZipInfo defaults to the earliest date of a ZIP, so that the same Gaussians give the same bytes.
-    with replacing(path) as out, zipfile.ZipFile(out, "w") as archive:
-        for name, image in images.files.items():
-            archive.writestr(zipfile.ZipInfo(name), _webp(image))
-        archive.writestr(zipfile.ZipInfo(META), json.dumps(meta))
+    return images.files, meta
 
 
-class _Images:
-    """Images to write, (H, W, 4) by name, with a pixel per Gaussian in almost square images."""
-
-    def __init__(self, count: int) -> None:
-        self.files: dict[str, Array] = {}
-        self.count = count
-        self.width = 4 * math.ceil(math.sqrt(count) / 4)
-        self.height = 4 * math.ceil(count / self.width / 4)
-
-    def add(self, name: str, *columns: Array) -> str:
-        """Add an image with the columns (N, k) as its channels; return the name of its file."""
-        pixels = np.full((self.height * self.width, 4), 255, np.uint8)
-        for channel, column in enumerate(np.concatenate(columns, axis=1).T):
-            pixels[: self.count, channel] = column
-        self.files[f"{name}.webp"] = pixels.reshape(self.height, self.width, 4)
-        return f"{name}.webp"
-
-
-def _encode_means(means: Array, images: _Images) -> dict[str, Any]:
+def _encode_means(means: Array, images: Images) -> dict[str, Any]:
     logs = np.sign(means) * np.log1p(np.abs(means, dtype=np.float64))
     low, high = logs.min(axis=0), logs.max(axis=0)
     fixed = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
@@ -164,18 +171,18 @@ def _encode_means(means: Array, images: _Images) -> dict[str, Any]:
     return {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
 
 
-def _encode_quats(quats: Array, images: _Images) -> dict[str, Any]:
+def _encode_quats(quats: Array, images: Images) -> dict[str, Any]:
     largest, others = smallest_three(quats)
     codes = np.rint(255 * (0.5 + others * SQRT1_2)).astype(np.uint8)
     return {"files": [images.add("quats", codes, QUAT_TAG + largest[:, None])]}
 
 
-def _encode_by_codebook(name: str, values: Array, images: _Images, *alpha: Array) -> dict[str, Any]:
+def _encode_by_codebook(name: str, values: Array, images: Images, *alpha: Array) -> dict[str, Any]:
     book = codebook(values)
     return {"codebook": book.tolist(), "files": [images.add(name, nearest(book, values), *alpha)]}
 
 
-def _encode_bands(g: Gaussians, images: _Images) -> dict[str, Any]:
+def _encode_bands(g: Gaussians, images: Images) -> dict[str, Any]:
     """Encode the bands above 0 by a palette."""
     n = len(g)
     entries, labels = palette(g.sh[:, 1:].reshape(n, -1), _importance(g))
@@ -200,15 +207,6 @@ def _importance(gaussians: Gaussians) -> Array:
     largest = np.sort(gaussians.log_scales, axis=1)[:, 1:].sum(axis=1)
     logs = (largest + np.log(np.maximum(gaussians.opacities, 1e-3))) / 2
     return np.exp(np.maximum(logs - logs.max(), -30)).astype(np.float32)
-
-
-def _webp(pixels: Array) -> bytes:
-    from PIL import Image
-
-    file = io.BytesIO()
-    # Without exact, the encoder drops colours where alpha is 0; here alpha is data like the other channels.
-    Image.fromarray(pixels).save(file, format="WEBP", lossless=True, exact=True, method=METHOD)
-    return file.getvalue()
 
 
 def _zip_reader(path: Path, archive: zipfile.ZipFile) -> Reader:

@@ -1,9 +1,11 @@
-"""The streamed SOG of PlayCanvas, which is read: a tree of SOG scenes in several levels of detail.
+"""The streamed SOG of PlayCanvas: a tree of SOG scenes in several levels of detail.
 
 ``lod-meta.json`` names the SOG scenes beside it (folders or .sog files), and has a tree whose nodes give, for each
 level of detail, the scene, the first Gaussian and the number of Gaussians that show the node. Level 0 is the finest.
 Another scene, the environment, may always be shown.
-Source: the writer and the reader of splat-transform, https://github.com/playcanvas/splat-transform.
+Source: the specification of version 1,
+https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog, and the writer and the reader of
+splat-transform, https://github.com/playcanvas/splat-transform.
 """
 
 import json
@@ -12,11 +14,14 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from clsplat.atomic import replacing
 from clsplat.config import Mode
 from clsplat.errors import InputError
-from clsplat.formats.sog import load_sog
+from clsplat.formats.detail_tree import Node, bounds
+from clsplat.formats.quantisation import morton_order
+from clsplat.formats.sog import META, load_sog, save_sog_folder
 from clsplat.formats.validity import reading
 from clsplat.gaussians import Gaussians
 
@@ -69,6 +74,82 @@ def load_streamed_sog(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.flo
     for part in parts:
         part.sh = np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))
     return Gaussians.concatenate(parts), "antialiased" if "antialiased" in modes else "classic", offsets[0]
+
+
+class StreamedSogWriter:
+    """A streamed SOG that is being written: a SOG scene for each node, and lod-meta.json as the last file.
+
+    Each leaf of the tree can be shown in any level, whatever the others show. Rounding errors are those of
+    `save_sog`, with ranges and codebooks of each node.
+
+    Parameters
+    ----------
+    folder : Path
+        Existing folder.
+    mode, offset
+        As in `clsplat.formats.save_gaussians`.
+    """
+
+    def __init__(self, folder: Path, mode: Mode = "classic", offset: ArrayLike | None = None):
+        self._folder, self._mode, self._offset = folder, mode, offset
+        self._files: list[str] = []
+        self._counts: list[int] = []
+        self._lods: dict[int, dict[str, dict[str, int]]] = {}
+        self._corners: dict[int, tuple[Any, Any]] = {}
+
+    def add(self, node: Node) -> None:
+        """Write a node; each comes before its parent.
+
+        Raises
+        ------
+        InputError
+            If a value is not finite as float32, or a file cannot be written.
+        """
+        name = f"{node.height}_{node.number}"
+        self._counts += [0] * (node.height + 1 - len(self._counts))
+        self._counts[node.height] += len(node.gaussians)
+        ordered, at = [], 0
+        for leaf, count in node.leaves:
+            part = node.gaussians.take(np.arange(at, at + count))
+            ordered.append(part.take(morton_order(part.means)))
+            span = {"file": len(self._files), "offset": at, "count": count}
+            self._lods.setdefault(leaf, {})[str(node.height)] = span
+            low, high = bounds(part)
+            finer = self._corners.get(leaf, (low, high))
+            self._corners[leaf] = np.minimum(low, finer[0]), np.maximum(high, finer[1])
+            at += count
+        save_sog_folder(self._folder / name, Gaussians.concatenate(ordered), self._mode, self._offset)
+        self._files.append(f"{name}/{META}")
+
+    def finish(self) -> None:
+        """Write lod-meta.json.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written.
+        """
+        meta = {
+            "version": 1,
+            "asset": {"generator": "clsplat"},
+            "count": sum(self._counts),
+            "counts": self._counts,
+            "lodLevels": len(self._counts),
+            "filenames": self._files,
+            "tree": _branch(sorted(self._lods), self._lods, self._corners),
+        }
+        with replacing(self._folder / LOD_META) as file:
+            file.write(json.dumps(meta).encode())
+
+
+def _branch(leaves: list[int], lods: dict[int, Any], corners: dict[int, tuple[Any, Any]]) -> dict[str, Any]:
+    """The tree over consecutive leaves, a power of two of them."""
+    low, high = (f([corners[leaf][k] for leaf in leaves], axis=0) for k, f in ((0, np.min), (1, np.max)))
+    node: dict[str, Any] = {"bound": {"min": low.tolist(), "max": high.tolist()}}
+    if len(leaves) == 1:
+        return node | {"lods": lods[leaves[0]]}
+    half = len(leaves) // 2
+    return node | {"children": [_branch(part, lods, corners) for part in (leaves[:half], leaves[half:])]}
 
 
 def read_tree(path: str | Path) -> tuple[Path, dict[str, Any], list[Span]]:

@@ -7,7 +7,7 @@ mathematics, which is in cl/ and, as NumPy, in `clsplat.reference`.
 from functools import partial
 
 from clsplat.device import Device
-from clsplat.ops.adam import adam_step
+from clsplat.ops.adam import adam_array, adam_step
 from clsplat.ops.bin import bin_splats
 from clsplat.ops.composite import composite_bwd, composite_fwd
 from clsplat.ops.count import count_pairs
@@ -15,14 +15,20 @@ from clsplat.ops.dropout import dropout_bwd, dropout_fwd
 from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.ops.finite import count_not_finite
+from clsplat.ops.hashgrid import hashgrid_bwd, hashgrid_fwd
+from clsplat.ops.heads import heads_bwd, heads_fwd, heads_join, heads_join_bwd, heads_sh_bwd, heads_sh_fwd
 from clsplat.ops.loss import l1_ssim
+from clsplat.ops.march import march
 from clsplat.ops.median import median_splats
+from clsplat.ops.mlp import mlp_bwd, mlp_fwd
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
-from clsplat.ops.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
+from clsplat.ops.project import join_rows, project_bwd, project_bwd_adam, project_disparities, project_fwd
+from clsplat.ops.rays import rays_bwd, rays_fwd
 from clsplat.ops.removal import removal
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
+from clsplat.ops.voxels import voxels_bwd, voxels_fwd, voxels_tv
 
 
 class Launches:
@@ -30,6 +36,7 @@ class Launches:
 
     def __init__(self, device: Device) -> None:
         self.project_fwd = partial(project_fwd, device)
+        self.join_rows = partial(join_rows, device)
         self.project_disparities = partial(project_disparities, device)
         self.project_bwd = partial(project_bwd, device)
         self.project_bwd_adam = partial(project_bwd_adam, device)
@@ -54,3 +61,20 @@ class Launches:
         self.exclusive_scan = partial(exclusive_scan, device)
         self.argsort = partial(argsort, device)
         self.argsort_segments = partial(argsort_segments, device)
+        self.rays_fwd = partial(rays_fwd, device)
+        self.rays_bwd = partial(rays_bwd, device)
+        self.hashgrid_fwd = partial(hashgrid_fwd, device)
+        self.hashgrid_bwd = partial(hashgrid_bwd, device)
+        self.mlp_fwd = partial(mlp_fwd, device)
+        self.mlp_bwd = partial(mlp_bwd, device)
+        self.march = partial(march, device)
+        self.heads_join = partial(heads_join, device)
+        self.heads_fwd = partial(heads_fwd, device)
+        self.heads_bwd = partial(heads_bwd, device)
+        self.heads_join_bwd = partial(heads_join_bwd, device)
+        self.adam_array = partial(adam_array, device)
+        self.heads_sh_fwd = partial(heads_sh_fwd, device)
+        self.heads_sh_bwd = partial(heads_sh_bwd, device)
+        self.voxels_fwd = partial(voxels_fwd, device)
+        self.voxels_bwd = partial(voxels_bwd, device)
+        self.voxels_tv = partial(voxels_tv, device)

@@ -2,13 +2,18 @@
 
 from typing import Any
 
+from pyopencl.array import Array
+
 from clsplat.device import Device
 from clsplat.gaussians import SHAPES, Gaussians
 from clsplat.stages import AdamStep
-from clsplat.structs import adam_struct
+from clsplat.structs import RATES, adam_struct
 
 # Number of values per work-item: one vector.
 RUN = 16
+
+# Number of vectors per work-item in long arrays on a CPU.
+CPU_RUNS = 64
 
 
 def adam_step(
@@ -43,3 +48,33 @@ def adam_step(
         penalties = [float(weight) * (name == field) for weight, field in zip(step.penalties, fields, strict=True)]
         scalars: list[Any] = [total, stride, width, split, *rates, *penalties, struct]
         device.launch("adam", "adam_step", (-(-total // stride),), [*scalars, *arrays])
+
+
+def adam_array(
+    device: Device,
+    parameters: Array,
+    gradients: Array,
+    first: Array,
+    second: Array,
+    rate: float,
+    step: AdamStep,
+    *,
+    sparse: bool = False,
+) -> None:
+    """Take one step of Adam on an array of parameters, in place.
+
+    Parameters
+    ----------
+    parameters, gradients, first, second : (P,) real
+        As for `adam_step`, of any one shape.
+    rate : float
+        Learning rate.
+    step : AdamStep
+        Its number and constants; rates by field, degree and penalties are not used.
+    sparse : bool
+        Whether parameters whose gradient is 0, and their moments, stay as they are (Müller et al. 2022, section 4).
+    """
+    total, struct = parameters.size, adam_struct(step._replace(rates=dict.fromkeys(RATES, rate)), device.real)
+    run = RUN * CPU_RUNS if device.is_cpu else RUN
+    arguments = [total, run, int(sparse), struct["means"], struct, parameters, gradients, first, second]
+    device.launch("adam", "adam_array", (-(-total // run),), arguments)

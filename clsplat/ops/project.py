@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 
 from clsplat.camera import Camera, pixel_rays
 from clsplat.device import Device
@@ -67,6 +68,26 @@ def project_fwd(
     _launch(device, "project_fwd", n, [*arguments, terms], defines)
     directions = pixel_rays(camera) if own_charts else np.zeros((1, 1, 3))
     return RaySplats(*splats, terms, device.constant("directions", directions))
+
+
+def join_rows(device: Device, first: Any, second: Any) -> Any:
+    """Append rows to others, so that splats of two scenes are composited into one image.
+
+    Parameters
+    ----------
+    first, second : (N, ...) and (M, ...)
+        Arrays of reals with N and M >= 1 rows of the same shape, such as a field of `Splats`.
+
+    Returns
+    -------
+    (N + M, ...)
+    """
+    result = device.empty(f"joined rows of {first.shape[1:]}", (first.shape[0] + second.shape[0], *first.shape[1:]))
+    # Blocks of the pool are larger than their arrays.
+    data: Any = result.data
+    cl.enqueue_copy(device.queue, data, first.data, byte_count=first.nbytes)
+    cl.enqueue_copy(device.queue, data, second.data, byte_count=second.nbytes, dst_offset=first.nbytes)
+    return result
 
 
 def project_disparities(device: Device, gaussians: Gaussians, camera: Camera, splats: AnySplats) -> Any:

@@ -57,6 +57,11 @@ def neighbours(gaussians: Gaussians) -> NDArray[np.intp]:
     return np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
 
 
+def masses(gaussians: Gaussians) -> Array:
+    """Masses, (N,) float64: optical depth times the mean area of the projections, but for a constant factor."""
+    return _depths(gaussians.opacities) * _areas(np.exp(gaussians.log_scales.astype(np.float64)))
+
+
 def merged(gaussians: Gaussians, pairs: Array, visible: Array | None = None) -> Gaussians:
     """Merge pairs of Gaussians by matched moments.
 

@@ -97,7 +97,8 @@ def measure_removals(
         run = renderer.forward(placed, view.camera, sh_degree)
         rgb = download(run.image.rgb)
         residuals = (np.clip(rgb, 0, 1) if clamped else rgb) - view.image / 255
-        removal = renderer.stages.removal(run.splats, run.bins, np.array(renderer.background), residuals, view.mask)
+        removal = renderer.stages.removal(run.drawn, run.bins, np.array(renderer.background), residuals, view.mask)
+        removal = Removal(*(part[: len(gaussians)] for part in removal))  # without the backdrop
         yield Measured(view, run, residuals, removal)
 
 

@@ -160,7 +160,7 @@ def _shares(before: Gaussians, after: Gaussians, count: int, views: list[View], 
         change = ((np.clip(download(run.image.rgb), 0, 1) - old) ** 2).sum(axis=2)
         counts = np.ones(change.shape, bool) if view.mask is None else view.mask
         residuals = np.repeat(change[:, :, None], 3, axis=2)
-        pulls = renderer.stages.removal(run.splats, run.bins, background, residuals, view.mask).pulls
+        pulls = renderer.stages.removal(run.drawn, run.bins, background, residuals, view.mask).pulls
         shares += pulls[:count, 0] / max(1, counts.sum())
         total += float(change[counts].sum()) / max(1, counts.sum())
     # What falls on other Gaussians is shared as well.

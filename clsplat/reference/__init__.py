@@ -4,7 +4,7 @@ This module implements `clsplat.stages.Stages`. Belongs here: one module per sta
 several stages share (lenses, spherical harmonics). Does not belong here: the algorithms that make a stage fast.
 """
 
-from clsplat.reference.adam import adam_step
+from clsplat.reference.adam import adam_array, adam_step
 from clsplat.reference.bin import bin_splats
 from clsplat.reference.composite import composite_bwd, composite_fwd
 from clsplat.reference.count import count_pairs
@@ -12,11 +12,17 @@ from clsplat.reference.dropout import dropout_bwd, dropout_fwd
 from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.reference.finite import count_not_finite
+from clsplat.reference.hashgrid import hashgrid_bwd, hashgrid_fwd
+from clsplat.reference.heads import heads_bwd, heads_fwd, heads_join, heads_join_bwd, heads_sh_bwd, heads_sh_fwd
 from clsplat.reference.loss import l1_ssim
+from clsplat.reference.march import march
 from clsplat.reference.median import median_splats
+from clsplat.reference.mlp import mlp_bwd, mlp_fwd
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
-from clsplat.reference.project import project_bwd, project_bwd_adam, project_disparities, project_fwd
+from clsplat.reference.project import join_rows, project_bwd, project_bwd_adam, project_disparities, project_fwd
+from clsplat.reference.rays import rays_bwd, rays_fwd
 from clsplat.reference.removal import removal
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
+from clsplat.reference.voxels import voxels_bwd, voxels_fwd, voxels_tv

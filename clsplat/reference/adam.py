@@ -36,6 +36,24 @@ def adam_step(
             _update(p[block], g[block], m[block], v[block], rate / correction1, correction2, step)
 
 
+def adam_array(
+    parameters: Array,
+    gradients: Array,
+    first: Array,
+    second: Array,
+    rate: float,
+    step: AdamStep,
+    *,
+    sparse: bool = False,
+) -> None:
+    """Take one step of Adam on an array, in place. Arguments as for `clsplat.ops.adam_array`."""
+    correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
+    kept = gradients != 0 if sparse else np.ones(gradients.shape, bool)
+    p, m, v = (array[kept] for array in (parameters, first, second))
+    _update(p, gradients[kept], m, v, rate / correction1, correction2, step)
+    parameters[kept], first[kept], second[kept] = p, m, v
+
+
 def _penalised(name: str, p: Array, g: Array, step: AdamStep) -> Array:
     """Add the gradients of the penalties: d exp(p)/dp = exp(p), and o (1 - o) for o = sigmoid(p)."""
     opacity, scale, erank = step.penalties

@@ -131,6 +131,11 @@ def project_fwd(
     return RaySplats(*[*shown, directions])
 
 
+def join_rows(first: Array, second: Array) -> Array:
+    """Append rows to others. Arguments and result as for `clsplat.ops.join_rows`."""
+    return np.concatenate([first, second])
+
+
 def project_disparities(gaussians: Gaussians, camera: Camera, splats: AnySplats) -> Array:
     """Disparity along the rays of pixels. Arguments and result as for `clsplat.ops.project_disparities`.
 

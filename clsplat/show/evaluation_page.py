@@ -111,21 +111,12 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
     path : Path
         The HTML file. It links to the pictures by the relative paths in `result`, and loads nothing else.
     result : dict
-        Result of `clsplat.evaluate.evaluate`.
+        Result of `clsplat.evaluate.evaluate`, or of `evaluate_images` with method and model_bytes.
     """
     views = result["views"]
     worst_first = sorted(range(len(views)), key=lambda k: _rank(views[k]))
     tiles = "".join(_tile(metric, result["mean"], views) for metric in METRICS if result["mean"][metric] is not None)
-    facts = " · ".join(
-        html.escape(fact)
-        for fact in (
-            f"{result['num_gaussians']:,} Gaussians",
-            f"SH degree {result['sh_degree']}",
-            result["mode"],
-            result["resolution"],
-            result["device"],
-        )
-    )
+    facts = " · ".join(map(html.escape, (*_model(result), result["resolution"], result["device"])))
     steps = ", ".join(f"rgb({r} {g} {b})" for r, g, b in palette(9))
     page = PAGE.format(
         count=f"{len(views)} view{'s' if len(views) != 1 else ''}",
@@ -141,6 +132,13 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
     )
     with replacing(path) as file:
         file.write(page.encode())
+
+
+def _model(result: dict[str, Any]) -> tuple[str, ...]:
+    """Facts of Gaussians, or of a radiance field."""
+    if "method" in result:
+        return result["method"], f"{result['model_bytes'] / 1e6:.3g} MB"
+    return f"{result['num_gaussians']:,} Gaussians", f"SH degree {result['sh_degree']}", result["mode"]
 
 
 def _rank(view: dict[str, Any]) -> float:

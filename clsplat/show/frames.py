@@ -64,7 +64,7 @@ def picture(
         gradients=False,
     )
     if mode == "count":
-        count = download(renderer.stages.count_pairs(run.splats, run.bins)[1])
+        count = download(renderer.stages.count_pairs(run.drawn, run.bins)[1])
         most = max(int(count.max()), 1)
         return _colored(count / most), f"dark 0, bright {most} Gaussians per pixel; mean {count.mean():.1f}"
     image, alpha = download(run.image.rgb), download(run.image.alpha)

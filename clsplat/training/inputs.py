@@ -55,7 +55,7 @@ class Inputs:
     @classmethod
     def of(cls, scene: Scene, device: "Device") -> "Inputs":
         """The inputs of a training of a scene on a device."""
-        train, test = ({view.name: _photo(view, scene) for view in part} for part in (scene.train, scene.test))
+        train, test = (photos_of(part, scene.offset) for part in (scene.train, scene.test))
         points = _digest(scene.points, scene.colors) if len(scene.points) else ""
         return cls(train, test, points, f"{device.label}, driver {device.cl_device.driver_version.strip()}")
 
@@ -117,11 +117,16 @@ class Inputs:
         }
         if self.train.keys() == now.train.keys():  # near planes follow the set of training photos
             differing["other cameras"] = [n for n in both if not _same_camera(old[n].camera, new[n].camera)]
-        found = [f"{what} ({_some(names)})" for what, names in differing.items() if names]
+        found = [f"{what} ({named(names)})" for what, names in differing.items() if names]
         return found + ["other points"] * bool(now.points and now.points != self.points)
 
 
-def _photo(view: View, scene: Scene) -> Photo:
+def photos_of(views: list[View], offset: NDArray[np.float64]) -> dict[str, Photo]:
+    """Views by name, as a run recognises them; `offset` (3,) is that of their scene, world units."""
+    return {view.name: _photo(view, offset) for view in views}
+
+
+def _photo(view: View, offset: NDArray[np.float64]) -> Photo:
     c = view.camera
     numbers = [
         get_args(CameraModel).index(c.model),
@@ -136,7 +141,7 @@ def _photo(view: View, scene: Scene) -> Photo:
     ]
     pixels = _digest(view.image) if view.clear is None else _digest(view.image, view.clear)
     mask = "" if view.mask is None else _digest(view.mask)
-    pose = (*c.viewmat[:3, :3].flat, *c.viewmat[:3, 3], *scene.offset)
+    pose = (*c.viewmat[:3, :3].flat, *c.viewmat[:3, 3], *offset)
     return Photo(pixels, mask, [float(x) for x in (*numbers, *pose)])
 
 
@@ -157,6 +162,7 @@ def _same_camera(a: list[float], b: list[float]) -> bool:
     )
 
 
-def _some(names: list[str]) -> str:
+def named(names: list[str]) -> str:
+    """The first names of a list, and how many more there are."""
     left_out = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {left_out} more" if left_out > 0 else "")

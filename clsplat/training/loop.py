@@ -97,11 +97,27 @@ def train(
         else:
             state = replace(initial_state(scene, config), inputs=inputs)
         training = Training(scene, config, device, state)
-        log = log_file(out / LOG, min(state.iteration, config.iterations - 1))
-        recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
-        _run(training, recorder, out)
-        gaussians = finish(training, out)
-        recorder.end(gaussians)
+        return complete(training, out, evaluate=evaluate, evaluate_after=evaluate_after, progress=progress)
+
+
+def complete(
+    training: Training,
+    out: Path,
+    *,
+    evaluate: Callable[[Gaussians], dict[str, float]] | None = None,
+    evaluate_after: Container[int] | None = None,
+    progress: Callable[[dict[str, Any]], None] = lambda record: None,
+) -> Gaussians:
+    """Run a training from its state to its end, with log and checkpoints in a folder that this process holds.
+
+    Parameters, result and errors are those of `train`.
+    """
+    state, config = training.state, training.config
+    log = log_file(out / LOG, min(state.iteration, config.iterations - 1))
+    recorder = Recorder(training, out, log, progress, evaluate, evaluate_after)
+    _run(training, recorder, out)
+    gaussians = finish(training, out)
+    recorder.end(gaussians)
     return gaussians
 
 

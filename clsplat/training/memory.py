@@ -29,6 +29,7 @@ PER_GAUSSIAN = {
     "composite": 12 + 9,  # packed splats; v_means2d 2, v_conics 3, v_opacities, v_colors 3
     "observe": 2,  # grad_sum, seen
 }
+JOINED = 12  # the splats once more, followed by those of the backdrop
 PER_INTERSECTION = {
     "bin": 2,  # intersections twice
     "composite": 9,  # gradients per intersection
@@ -68,6 +69,8 @@ class Footprint:
         Whether ``--sort per_tile`` is used.
     exposure : bool
         Whether ``--exposure`` is used.
+    backdrop : int
+        Number of Gaussians of the renderer's backdrop, which are drawn and do not train.
     """
 
     width: int
@@ -76,22 +79,29 @@ class Footprint:
     gpu: bool
     per_tile: bool = False
     exposure: bool = False
+    backdrop: int = 0
 
     @classmethod
-    def of(cls, scene: Scene, config: TrainConfig, device: "Device") -> "Footprint":
+    def of(cls, scene: Scene, config: TrainConfig, device: "Device", backdrop: int = 0) -> "Footprint":
         """Footprint of training on the scene's photos."""
         cameras = [view.camera for view in scene.train + scene.test]
         width, height = max(c.width for c in cameras), max(c.height for c in cameras)
         per_tile = config.render.sort == "per_tile"
-        return cls(width, height, config.init.sh_degree, not device.is_cpu, per_tile, config.exposure)
+        return cls(width, height, config.init.sh_degree, not device.is_cpu, per_tile, config.exposure, backdrop)
 
     def per_gaussian(self, intersections: float = INTERSECTIONS) -> float:
         """Bytes per Gaussian, if each meets `intersections` tiles."""
-        parameters = 11 + 3 * (self.sh_degree + 1) ** 2
+        values = COPIES * self._parameters + sum(PER_GAUSSIAN.values()) + intersections * self._per_intersection
+        return REAL * ROUNDING * (values + (JOINED if self.backdrop else 0))
+
+    @property
+    def _parameters(self) -> int:
+        return 11 + 3 * (self.sh_degree + 1) ** 2
+
+    @property
+    def _per_intersection(self) -> int:
         per_intersection = sum(PER_INTERSECTION.values())
-        per_intersection += self.gpu * PER_INTERSECTION_GPU + self.per_tile * PER_INTERSECTION_PER_TILE
-        values = COPIES * parameters + sum(PER_GAUSSIAN.values()) + intersections * per_intersection
-        return REAL * ROUNDING * values
+        return per_intersection + self.gpu * PER_INTERSECTION_GPU + self.per_tile * PER_INTERSECTION_PER_TILE
 
     @property
     def fixed(self) -> int:
@@ -99,13 +109,19 @@ class Footprint:
         per_pixel = sum(PER_PIXEL.values()) + self.exposure * PER_PIXEL_EXPOSURE
         return round(REAL * ROUNDING * self.height * (self.width * per_pixel + PER_ROW))
 
+    def still(self, intersections: float = INTERSECTIONS) -> int:
+        """Bytes for the backdrop, if each of its Gaussians meets `intersections` tiles."""
+        values = self._parameters + sum(PER_GAUSSIAN.values()) + JOINED + intersections * self._per_intersection
+        return round(REAL * ROUNDING * self.backdrop * values)
+
     def total(self, n: int, intersections: float = INTERSECTIONS) -> int:
         """Bytes for n Gaussians, if each meets `intersections` tiles; one photo is on the device."""
-        return self.fixed + round(n * self.per_gaussian(intersections))
+        return self.fixed + self.still(intersections) + round(n * self.per_gaussian(intersections))
 
     def most_gaussians(self, limit: int, intersections: float = INTERSECTIONS) -> int:
         """The largest number of Gaussians for which `total` is within `limit` bytes; 0 where none is."""
-        return max(0, int((limit - self.fixed) / self.per_gaussian(intersections)))
+        left = limit - self.fixed - self.still(intersections)
+        return max(0, int(left / self.per_gaussian(intersections)))
 
     def check(self, start: int, limit: int) -> None:
         """Check that `start` Gaussians fit `limit` bytes.

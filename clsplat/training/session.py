@@ -40,11 +40,15 @@ class Training:
     device : Device
     state : State
         The state to go on from.
+    backdrop : Gaussians, optional
+        Gaussians that are drawn in every image and do not train, such as the surroundings of a block.
     """
 
-    def __init__(self, scene: Scene, config: TrainConfig, device: "Device", state: State):
+    def __init__(
+        self, scene: Scene, config: TrainConfig, device: "Device", state: State, backdrop: Gaussians | None = None
+    ):
         self.scene, self.config, self.device, self.state = scene, config, device, state
-        self.renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
+        self.renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background], backdrop)
         self.optimizer = Optimizer(self.renderer, config.optimizer)
         self.photos = Photos(device)
         self._views: list[View] = scene.train
@@ -55,7 +59,8 @@ class Training:
     @cached_property
     def need(self) -> Footprint:
         """Device memory that the training takes."""
-        return Footprint.of(self.scene, self.config, self.device)
+        backdrop = self.renderer.backdrop
+        return Footprint.of(self.scene, self.config, self.device, 0 if backdrop is None else len(backdrop))
 
     def fork(self, state: State) -> "Training":
         """A training of the same scene that goes on from another state."""
@@ -169,7 +174,7 @@ def step(training: Training, view: View) -> float:
     )
     learn_pose(seen, v_camera, progress, state, config)
     strategy.perturb(optimizer.stages, state.gaussians, iteration, settings.rates["means"])
-    state.intersections = max(state.intersections, run.bins.gauss_ids.shape[0] / len(gaussians))
+    state.intersections = max(state.intersections, run.bins.gauss_ids.shape[0] / run.drawn.depths.shape[0])
     state.iteration = iteration
     return loss
 

@@ -103,9 +103,10 @@ class State:
         return views
 
 
-def initial_state(scene: Scene, config: TrainConfig) -> State:
-    """The state before the first iteration, on the host."""
-    gaussians = initialize(scene, start_config(config), config.seed, config.max_gaussians)
+def initial_state(scene: Scene, config: TrainConfig, gaussians: Gaussians | None = None) -> State:
+    """The state before the first iteration, on the host, with the first Gaussians of `initialize` or with others."""
+    if gaussians is None:
+        gaussians = initialize(scene, start_config(config), config.seed, config.max_gaussians)
     strategy = STRATEGIES[config.strategy](config, scene.extent, len(gaussians))
     searches = config.size == "auto" and can_validate(scene.train)
     names = [view.name for view in scene.train]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_cli import fails, run, write_dataset
+from cli_runs import fails, run, write_dataset
 from walls import HEIGHT, WIDTH, scene_of, view
 
 from clsplat.bench import measures

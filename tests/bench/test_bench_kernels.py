@@ -4,7 +4,6 @@ No test depends on the speed of the machine.
 """
 
 import json
-import math
 import re
 import subprocess
 from dataclasses import asdict
@@ -16,9 +15,10 @@ from matplotlib.figure import Figure
 
 import clsplat
 from clsplat import ops, reference
+from clsplat.bench import networks as network_bench
 from clsplat.bench import roof
 from clsplat.bench.environment import commit
-from clsplat.bench.kernel_report import chart_title, details, scaling_chart, summary
+from clsplat.bench.kernel_report import chart_title, details, networks, scaling_chart, summary
 from clsplat.bench.kernels import _watched, bench_kernels, stage_bytes
 from clsplat.bench.timing import STILL, training_of
 from clsplat.bench.workloads import DEFAULT, from_files, scaling_names, synthetic
@@ -34,19 +34,13 @@ from clsplat.training.optimizer import Moments, adam_settings
 STAGES = ("project_fwd", "bin_splats", "composite_fwd", "l1_ssim", "composite_bwd", "observe", "project_bwd_adam")
 
 
-@pytest.fixture
-def quick_roof(monkeypatch):
-    """Micro-benchmarks that take milliseconds."""
-    for name, value in {"SECONDS": 1e-4, "RUNS": 1, "LAUNCHES": 5, "BUFFER_BYTES": 2**20}.items():
-        monkeypatch.setattr(roof, name, value)
-
-
 @pytest.fixture(scope="module")
 def results(device):
     """Results of two tiny workloads."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"SECONDS": 1e-4, "RUNS": 1, "LAUNCHES": 5, "BUFFER_BYTES": 2**20}.items():
             patch.setattr(roof, name, value)
+        patch.setattr(network_bench, "OPERATIONS", 2**17)
         return bench_kernels([synthetic("300-40x32"), synthetic("200-56x24")], RenderConfig(), device, 3)
 
 
@@ -59,48 +53,15 @@ def test_the_reference_workload_has_the_documented_counts(device):
     assert run.bins.gauss_ids.shape[0] == pytest.approx(365_000, rel=2e-3)
 
 
-class TestRoof:
-    @pytest.mark.parametrize("width", [1, 4, 16])
-    @pytest.mark.parametrize(
-        ("kernel", "scalars", "fixpoint"),
-        [("roof_fma", [0.5, 0.5], 1.0), ("roof_exp", [], 0.5671432904), ("roof_exp2", [], 0.6411857445)],
-    )
-    def test_recurrences_reach_their_fixpoint(self, device, width, kernel, scalars, fixpoint):
-        out = device.upload("out", np.zeros(6 * width))
-        device.launch("roof", kernel, (6,), [80, *scalars, out], defines=roof.defines(device, width), group=(1,))
-        np.testing.assert_allclose(out.get(), roof.CHAINS * fixpoint, rtol=1e-5)
-
-    @pytest.mark.parametrize("step", [1, 6])
-    @pytest.mark.parametrize("width", [4, 16])
-    def test_every_number_is_moved(self, device, step, width):
-        a = np.arange(6 * 5 * width, dtype=np.float32)
-        arrays = [device.upload("a", a), device.upload("b", 2 * a), device.upload("y", 0 * a)]
-        defines = roof.defines(device, width)
-        device.launch("roof", "roof_triad", (6,), [5, step, 0.5, *arrays], defines=defines, group=(1,))
-        np.testing.assert_array_equal(arrays[2].get(), 2 * a)
-        device.launch("roof", "roof_copy", (6,), [5, step, *arrays[1:]], defines=defines, group=(1,))
-        np.testing.assert_array_equal(arrays[2].get(), 2 * a)
-        device.launch("roof", "roof_copy", (6,), [5, step, arrays[0], arrays[2]], defines=defines, group=(1,))
-        np.testing.assert_array_equal(arrays[2].get(), a)
-
-    def test_everything_is_measured(self, configured_device, quick_roof):
-        measured = roof.measure_roof(configured_device)
-        assert all(math.isfinite(value) and value > 0 for value in measured.values()), measured
-        assert 0.5 < measured["buffer_mib"] <= 1
-
-    def test_rates_are_work_over_time(self, device, monkeypatch):
-        monkeypatch.setattr(roof, "_best", lambda device, run, runs: 2.0)  # every run takes 2 s
-        measured = roof.measure_roof(device)
-        items = (
-            4 * device.cl_device.max_compute_units * 16
-            if device.is_cpu
-            else 2048 * device.cl_device.max_compute_units
-        )
-        assert measured["fma_gflops"] == pytest.approx(2e-9 * items * 16 * 64 / 2)
-        assert measured["exp_gops"] == measured["exp2_gops"] == pytest.approx(1e-9 * items * 16 * 64 / 2)
-        assert measured["copy_gbs"] == pytest.approx(1e-9 * 2 * measured["buffer_mib"] * 2**20 / 2)
-        assert measured["triad_gbs"] == pytest.approx(1.5 * measured["copy_gbs"])
-        assert measured["launch_us"] == measured["queued_launch_us"] == pytest.approx(2e6 / roof.LAUNCHES)
+def test_networks_are_timed_and_reported(results):
+    """Each network with its rates, as fractions of the roof; older files have no networks."""
+    timed = results["networks"]
+    assert [tuple(network["widths"]) for network in timed] == list(network_bench.WIDTHS)
+    text = networks(results)
+    for network in timed:
+        share = network["backward_gflops"] / results["roof"]["fma_gflops"]
+        assert f"{network['forward_gflops']:.4g}" in text and f"{100 * share:.3g} %" in text
+    assert networks({"roof": results["roof"]}) == ""
 
 
 class TestWorkloads:
@@ -322,7 +283,7 @@ class TestPage:
     """docs/benchmarks.md shows the content of docs/results: its tables are made from these files."""
 
     def test_results_are_complete(self, measured, results):
-        assert set(measured) == set(results)
+        assert set(measured) | {"networks"} == set(results)  # the page shows no networks
         assert set(measured["roof"]) == set(results["roof"])
         assert {w["name"] for w in measured["workloads"]} == {*DEFAULT, *scaling_names()}
         assert set(measured["workloads"][0]) == set(results["workloads"][0])

@@ -1,6 +1,5 @@
 """The viewer, opened by the commands `view` and `train`."""
 
-# ruff: noqa: F811 (a fixture is imported and then named as an argument)
 import shutil
 import sys
 import warnings
@@ -8,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import TRAIN, dataset, fails, run, trained  # noqa: F401  (fixtures)
+from cli_runs import TRAIN, fails, run
 
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene

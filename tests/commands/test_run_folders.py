@@ -1,6 +1,5 @@
 """The folder of a run as the argument of each command that takes a scene."""
 
-# ruff: noqa: F811 (a fixture is imported and then named as an argument)
 import json
 import shutil
 from dataclasses import asdict, replace
@@ -8,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import TRAIN, dataset, fails, read_image, run  # noqa: F401  (fixtures)
+from cli_runs import TRAIN, fails, read_image, run
 from test_info import info
 
 from clsplat.cli import main

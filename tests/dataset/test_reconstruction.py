@@ -1,101 +1,26 @@
 """Structure from motion on rendered photos with known cameras, and its model on disk."""
 
-import fcntl
 import json
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
 import tempfile
 
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.ndimage import gaussian_filter, map_coordinates
 from small_files import small_files
+from textured_corner import CONFIG, cameras, take_photos
 
-from clsplat.camera import Camera
 from clsplat.commands.info import dataset_lines
 from clsplat.config import DataConfig, SfmConfig
 from clsplat.dataset import load_scene
 from clsplat.dataset.colmap import read_model
 from clsplat.dataset.lenses import Intrinsics, is_pinhole, undistorted
-from clsplat.dataset.sfm import reconstruction as sfm
-from clsplat.dataset.sfm.reconstruction import LOCK, RECORD, WORK, read_record, reconstruct
+from clsplat.dataset.sfm.reconstruction import RECORD, WORK, read_record, reconstruct
 from clsplat.errors import InputError
 
-CONFIG = SfmConfig(camera_model="SIMPLE_RADIAL")
 FILES = ["cameras.bin", "images.bin", "points3D.bin"]
-
-
-def cameras():
-    """Four cameras in front of a corner, about 11 degrees apart."""
-    eyes = [(3.2 * np.cos(a), 3.2 * np.sin(a), 1.6 + 0.3 * (k % 2)) for k, a in enumerate(np.linspace(0.5, 1.1, 4))]
-    return [Camera.look_at(eye, (0.4, 0.4, 0.4), (0, 0, 1), 300, 320, 240) for eye in eyes]
-
-
-def corner(camera, textures):
-    """Photo of the three planes x = 0, y = 0, z = 0, each with a texture of 160 pixels per unit."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = camera.rays(x, y) @ camera.viewmat[:3, :3]
-    reach = np.where(rays < 0, -camera.position / rays, np.inf)
-    plane, hit = reach.argmin(axis=-1), camera.position + rays * reach.min(axis=-1)[..., None]
-    photo = np.zeros((*x.shape, 3))
-    for axis in range(3):
-        on = plane == axis
-        at = 160 * np.delete(hit[on], axis, axis=1).T
-        for channel in range(3):
-            photo[on, channel] = map_coordinates(textures[axis][..., channel], at, order=1, mode="grid-wrap")
-    return np.rint(photo).astype(np.uint8)
-
-
-def take_photos(seed, seen_by=None):
-    """Render a corner with textures of its own from the four cameras, or from others."""
-    rng = np.random.default_rng(seed)
-    textures = []
-    for _ in range(3):
-        layers = [s * gaussian_filter(rng.normal(size=(512, 512, 3)), (s, s, 0), mode="wrap") for s in (1.5, 4, 12)]
-        textures.append(np.clip(127 + 60 * sum(layers) / np.std(sum(layers)), 0, 255))
-    return [corner(camera, textures) for camera in seen_by or cameras()]
-
-
-@pytest.fixture(scope="session")
-def photos():
-    """The photos of the four cameras, as arrays."""
-    return take_photos(0)
-
-
-@pytest.fixture(scope="session")
-def solved(photos, tmp_path_factory):
-    """Folder of the photos with their model; tests must not change it."""
-    folder = tmp_path_factory.mktemp("solved")
-    for k, photo in enumerate(photos):
-        Image.fromarray(photo).save(folder / f"photo {k}.png")
-    assert reconstruct(folder, CONFIG) == folder / "sparse" / "0"
-    return folder
-
-
-@pytest.fixture
-def copy(solved, tmp_path):
-    """Copy of `solved` that a test may change."""
-    return shutil.copytree(solved, tmp_path / "copy")
-
-
-@pytest.fixture
-def runs(solved, monkeypatch):
-    """Replace the mapping by the model of `solved`, and count the calls."""
-    import pycolmap
-
-    asked = []
-
-    def largest_model(folder, names, work, config, verbose):
-        asked.append(names)
-        return pycolmap.Reconstruction(solved / "sparse" / "0")
-
-    monkeypatch.setattr(sfm, "_largest_model", largest_model)
-    return asked
 
 
 def test_known_cameras_are_recovered(solved):
@@ -329,56 +254,6 @@ def test_a_real_facade_is_recovered(shared, tmp_path):
     one, other = (points - points.mean(axis=0) for points in (one, other))
     correlation = np.linalg.svd(one.T @ other)[1].sum() / np.linalg.norm(one) / np.linalg.norm(other)
     assert correlation > 0.9999  # 1 for two point sets that differ by a similarity; 1 % of noise gives 0.99995
-
-
-STUCK = """
-import signal, sys
-from clsplat.cli import main
-from clsplat.dataset.sfm import reconstruction
-
-def stuck(*_):
-    print("ready", flush=True)
-    signal.pause()
-
-reconstruction._largest_model = stuck
-main(["sfm", sys.argv[1], "--camera-model", "PINHOLE"])
-"""
-
-
-def interrupted(folder, number):
-    """Structure from motion that gets a signal once pycolmap is loaded: its messages and its status."""
-    with subprocess.Popen(
-        [sys.executable, "-c", STUCK, str(folder)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    ) as process:
-        assert process.stdout.readline() == "ready\n"
-        process.send_signal(number)
-        return process.stderr.read(), process.wait()
-
-
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_terminated_run_leaves_nothing(copy, number, status):
-    before = sorted(os.listdir(copy))
-    messages, returned = interrupted(copy, number)
-    assert returned == status
-    assert "clsplat: " in messages and "Aborted at" not in messages and "    @ " not in messages
-    assert sorted(os.listdir(copy)) == before
-
-
-def test_what_a_killed_run_left_is_removed_by_the_next(copy, runs):
-    interrupted(copy, signal.SIGKILL)
-    assert len([name for name in os.listdir(copy) if name.startswith(WORK)]) == 1
-    alive = copy / f"{WORK}alive"
-    alive.mkdir()
-    with (alive / LOCK).open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        reconstruct(copy, CONFIG)
-        assert [name for name in os.listdir(copy) if name.startswith(WORK)] == [alive.name]
-    reconstruct(copy, CONFIG)
-    assert not alive.exists() and runs == []
 
 
 def test_a_record_leads_to_no_other_photos(copy, photos, tmp_path):

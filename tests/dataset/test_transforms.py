@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from numpy.lib.recfunctions import repack_fields
 from PIL import Image
 
 from clsplat.camera import Camera
@@ -37,13 +36,6 @@ def write_photos(root, names=NAMES, size=(64, 48), mode="RGB"):
     for k, name in enumerate(names):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new(mode, size, (k, 100, 200, 0) if mode == "RGBA" else (k, 100, 200)).save(root / name)
-
-
-@pytest.fixture
-def root(tmp_path):
-    """A folder with four photos."""
-    write_photos(tmp_path)
-    return tmp_path
 
 
 def intrinsics_of(root, downscale=1):
@@ -171,37 +163,6 @@ def test_frames_without_a_file_are_counted_in_one_warning(root):
     assert len(caught) == 1 and [photo.name for photo in dataset.photos] == [NAMES[0], NAMES[3]]
 
 
-@pytest.mark.parametrize("binary", [True, False])
-def test_points_come_from_the_ply(root, binary):
-    from plyfile import PlyData, PlyElement
-
-    dtype = [(axis, "f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
-    vertices = np.array([(1, 2, 3, 4, 5, 6), (-1, 0, 0.5, 255, 0, 7)], dtype=dtype)
-    PlyData([PlyElement.describe(vertices, "vertex")], text=not binary).write(root / "points.ply")
-    write(root, fl_x=50, ply_file_path="points.ply")
-    dataset = read_dataset(root, DataConfig())
-    np.testing.assert_array_equal(dataset.points, [[1, 2, 3], [-1, 0, 0.5]])
-    np.testing.assert_array_equal(dataset.colors, [[4, 5, 6], [255, 0, 7]])
-    PlyData([PlyElement.describe(repack_fields(vertices[["x", "y", "z"]]), "vertex")]).write(root / "points.ply")
-    np.testing.assert_array_equal(read_dataset(root, DataConfig()).colors, np.full((2, 3), 128))
-    vertices["x"] = np.nan
-    PlyData([PlyElement.describe(vertices, "vertex")]).write(root / "points.ply")
-    with pytest.raises(InputError, match=r"points\.ply.*finite"):
-        read_dataset(root, DataConfig())
-
-
-PLY_HEADER = b"ply\nformat %s 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n"
-
-
-@pytest.mark.parametrize("content", [None, b"", PLY_HEADER % b"ascii", PLY_HEADER % b"binary_little_endian"])
-def test_damaged_points_are_refused_by_name(root, content):
-    if content is not None:
-        (root / "points.ply").write_bytes(content)
-    write(root, fl_x=50, ply_file_path="points.ply")
-    with pytest.raises(InputError, match=r"points\.ply"):
-        read_dataset(root, DataConfig())
-
-
 def test_masks_of_frames_and_of_the_folder(root):
     write_photos(root, [f"masks/{k}.png" for k in range(4)])
     write(root, fl_x=50)
@@ -325,17 +286,6 @@ def test_whole_numbers_in_text_are_not_wrapped(root):
     (root / "points.ply").write_text(f"{header}{colours}end_header\n1 2 3 300 0 0\n")
     write(root, fl_x=50, ply_file_path="points.ply")
     with pytest.raises(InputError, match=r"points\.ply: expected red within uint8"):
-        read_dataset(root, DataConfig())
-
-
-@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
-def test_points_declared_but_not_there_take_no_memory(root, kind):
-    header = f"ply\nformat {kind} 1.0\nelement vertex 100000000000\n" + "".join(
-        f"property float {a}\n" for a in "xyz"
-    )
-    (root / "points.ply").write_text(f"{header}end_header\n1 2 3\n")
-    write(root, fl_x=50, ply_file_path="points.ply")
-    with pytest.raises(InputError, match=r"points\.ply: expected at least \d+ bytes"):
         read_dataset(root, DataConfig())
 
 

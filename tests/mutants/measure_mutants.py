@@ -43,18 +43,19 @@ WHOLE = (
 """Tests of the whole renderer and of training, for mutants that the tests of their file do not see."""
 
 PROJECT = ("tests/test_project.py", "tests/test_lens.py", "tests/test_project_degenerate.py")
-COMPOSITE = ("tests/test_composite.py", "tests/test_composite_gpu.py", "tests/test_composite_sorted.py")
+LIMITS = "tests/test_composite_limits.py"
+COMPOSITE = ("tests/test_composite.py", "tests/test_composite_gpu.py", "tests/test_composite_sorted.py", LIMITS)
 REMOVAL = ("tests/test_removal.py",)
 TESTS: dict[str, tuple[str, ...]] = {
-    "common": ("tests/test_composite.py", *PROJECT),
+    "common": (*(f"tests/test_{name}.py" for name in ("programs", "observe", "dropout", "composite")), *PROJECT),
     "composite": COMPOSITE,
     "composite_blocks": COMPOSITE,
-    "composite_cpu": COMPOSITE[:1],
-    "composite_gpu": COMPOSITE[1:2],
-    "composite_sorted": COMPOSITE[2:],
+    "composite_cpu": (COMPOSITE[0], LIMITS),
+    "composite_gpu": (*COMPOSITE[:2], LIMITS),
+    "composite_sorted": COMPOSITE[2:3],
     "composite_splats": COMPOSITE,
     "composite_tiles": (*COMPOSITE[:2], *REMOVAL),
-    "ellipse": ("tests/test_bin.py", *COMPOSITE[:1]),
+    "ellipse": ("tests/test_bin.py", *COMPOSITE[:1], *PROJECT[:1], "tests/test_dropout.py"),
     "lanes": PROJECT,
     "lens": PROJECT,
     "linalg": PROJECT,
@@ -73,7 +74,10 @@ TRAINING = {
     "clsplat/training/densify": tuple(
         f"tests/training/test_{name}.py" for name in ("densify", "mcmc", "error_guided", "loop")
     ),
-    "clsplat/training/autosize": ("tests/training/test_autosize.py", "tests/commands/test_cli.py"),
+    "clsplat/training/autosize": (
+        *(f"tests/training/test_autosize{part}.py" for part in ("_reduction", "")),
+        "tests/commands/test_cli.py",
+    ),
 }
 """Tests of folders of the training."""
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import fails, run, write_dataset
+from cli_runs import fails, run, write_dataset
 
 from clsplat.camera import Camera
 from clsplat.config import DataConfig

@@ -1,6 +1,7 @@
 """Fixtures of the viewer's tests."""
 
 import pytest
+from fake_browsers import Clock
 from small_scenes import cameras, views_of
 
 from clsplat.renderer import Renderer
@@ -17,3 +18,11 @@ def viewer(device):
     result.show(Renderer(device), first_photo(cams), views_of(cams))
     yield result
     result.close()
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    result = Clock()
+    monkeypatch.setattr("clsplat.show.viewer.time", result)
+    monkeypatch.setattr("clsplat.show.viewer_statistics.time", result)
+    return result

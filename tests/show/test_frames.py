@@ -9,6 +9,9 @@ from small_scenes import cameras
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
+from clsplat.metrics import to_uint8
+from clsplat.ops import count_pairs
+from clsplat.render import render
 from clsplat.renderer import Renderer
 from clsplat.show.frames import MODES, Look, normals, picture, splash
 from clsplat.show.viewer_photos import blended
@@ -101,3 +104,43 @@ def test_without_av_a_video_is_a_sentence(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(InputError, match=r"pip install 'clsplat\[video\]'"):
         video([np.zeros((2, 2, 3), np.uint8)])
+
+
+class TestPicture:
+    def test_render_is_the_image_of_render(self, device):
+        gaussians, (camera, *_) = cameras()
+        frame, legend = picture(Renderer(device, background=(1.0, 0.0, 0.5)), gaussians, camera)
+        ours = render(gaussians, camera, device=device, background=(1.0, 0.0, 0.5))
+        np.testing.assert_array_equal(frame, to_uint8(ours.rgb))
+        assert legend == ""
+
+    def test_depth_alpha_and_count_and_their_legends(self, device):
+        gaussians, (camera, *_) = cameras()
+        gaussians.logit_opacities[:] = 4
+        ours = render(gaussians, camera, device=device, depth=True)
+        shown = {
+            mode: picture(Renderer(device, background=(0.0, 0.0, 0.0)), gaussians, camera, Look(mode))
+            for mode in MODES
+        }
+        alpha = np.repeat(ours.alpha[:, :, None], 3, axis=2)
+        np.testing.assert_array_equal(shown["alpha"][0], to_uint8(alpha))
+        solid = ours.alpha > 0.5
+        assert 0 < solid.mean() < 1
+        assert not shown["depth"][0][~solid].any()
+        brightness = shown["depth"][0].sum(axis=2)[solid].astype(float)
+        assert np.corrcoef(brightness, ours.depth[solid])[0, 1] < -0.8, "near must be bright"
+        near, far = np.percentile(ours.depth[solid], [2, 98])
+        assert f"bright {near:.3g}, dark {far:.3g}" in shown["depth"][1]
+        run = Renderer(device).forward(gaussians, camera, 0, gradients=False)
+        count = count_pairs(device, run.splats, run.bins)[1].get()
+        assert f"bright {count.max()} Gaussians per pixel; mean {count.mean():.1f}" in shown["count"][1]
+        order = np.argsort(count, axis=None)[[0, -1]]
+        darkest, brightest = shown["count"][0].sum(axis=2).ravel()[order]
+        assert darkest < brightest == shown["count"][0].sum(axis=2).max()
+
+    def test_an_empty_view_has_no_depth(self, device):
+        gaussians, (camera, *_) = cameras()
+        gaussians.logit_opacities[:] = -20
+        frame, legend = picture(Renderer(device, background=(1.0, 1.0, 1.0)), gaussians, camera, Look("depth"))
+        assert not frame.any()
+        assert legend == "nothing opaque in view"

@@ -26,7 +26,7 @@ FAILURES = {
     "runs that differ": ["repeated-runs"],
     "SH extrapolation": ["sh-extrapolation"],
     "dark areas turning transparent": ["dark-areas"],
-    "floaters near cameras": ["floaters"],
+    "floaters near cameras": ["floaters", "outermost"],
     "images of mixed size, orientation, EXIF rotation, 16-bit, grey, RGBA, CMYK, corrupt": ["images"],
     "wrong intrinsics": ["focal-length"],
     "moving objects": ["moving-object"],

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import pyopencl as cl
 import pytest
 
+from clsplat.buffers import Buffers
 from clsplat.device import Device
 from clsplat.programs import kernel_folder
 
@@ -270,14 +271,14 @@ class Pool:
 
 
 def _watch_device(patch: pytest.MonkeyPatch, calls: Calls) -> None:
-    allocate, launch, program, copy = Device._allocate, Device.launch, Device.program, cl.enqueue_copy
+    allocate, launch, program, copy = Buffers.allocate, Device.launch, Device.program, cl.enqueue_copy
 
-    def allocate_(self: Device, *arguments: Any) -> Any:
-        pool, self._pool = self._pool, Pool(self._pool, calls)
+    def allocate_(self: Buffers, *arguments: Any) -> Any:
+        pool, self.pool = self.pool, Pool(self.pool, calls)
         try:
             return allocate(self, *arguments)
         finally:
-            self._pool = pool
+            self.pool = pool
 
     def launch_(self: Device, stage: str, kernel: str, *arguments: Any, **named: Any) -> None:
         calls.check("launch", kernel)
@@ -299,7 +300,7 @@ def _watch_device(patch: pytest.MonkeyPatch, calls: Calls) -> None:
 
         return call
 
-    patch.setattr(Device, "_allocate", allocate_)
+    patch.setattr(Buffers, "allocate", allocate_)
     patch.setattr(Device, "launch", launch_)
     patch.setattr(Device, "program", program_)
     patch.setattr(cl, "enqueue_copy", copy_)

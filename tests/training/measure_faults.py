@@ -26,9 +26,9 @@ from typing import Any, NamedTuple
 
 import pytest
 import tyro
+from cli_runs import write_dataset
 from failing_calls import FAULTS, Calls, Point, watched
 from filelock import FileLock, Timeout
-from test_cli import write_dataset
 
 from clsplat import cli
 from clsplat.atomic import PART

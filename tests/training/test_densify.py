@@ -203,6 +203,15 @@ def test_growth_reaches_the_cap_in_time(settings: McmcConfig | ErrorConfig, iter
         assert first == max([sizes[0][0], *(i for i, _ in sizes if i <= schedule.full)])
 
 
+def test_rounds_are_from_the_start_to_before_the_end() -> None:
+    settings = McmcConfig(start=200, every=100, stop_fraction=0.5)
+    schedule = Schedule(replace(CONFIG, iterations=30_000, max_gaussians=5000), settings)
+    start = schedule.start
+    assert (start % 100, schedule.stop) == (0, 15_000)
+    times = (start - 100, start, start + 50, 14_900, 15_000, 15_100)
+    assert [schedule.due(i) for i in times] == [False, True, False, True, False, False]
+
+
 def test_growth_takes_nothing_away() -> None:
     """Where less than there is fits the device."""
     schedule = Schedule(replace(CONFIG, max_gaussians=5000), McmcConfig())

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pyopencl as cl
 import pytest
+from cli_runs import TRAIN, fails, run, write_dataset
 from small_files import small_files
-from test_cli import TRAIN, fails, run, write_dataset
 
 from clsplat.device import Device
 from clsplat.errors import BuildError, DeviceError, driver_errors

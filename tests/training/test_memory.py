@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from every_strategy import with_rounds
 
+from clsplat.buffers import Buffers
 from clsplat.camera import Camera
 from clsplat.config import AdcConfig, OptimConfig, RenderConfig, TrainConfig
 from clsplat.device import Device
@@ -20,8 +21,10 @@ from clsplat.render import render_views
 from clsplat.scene import Scene, View
 from clsplat.training.checkpoint import load_state
 from clsplat.training.densify import STRATEGIES
-from clsplat.training.loop import train
+from clsplat.training.loop import complete, train
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
+from clsplat.training.session import Training
+from clsplat.training.state import initial_state
 
 FIXED_N = AdcConfig(stop_fraction=0)
 """No densification."""
@@ -85,6 +88,22 @@ def test_what_is_predicted_is_allocated(
     assert device.memory_peak <= predicted <= 1.2 * device.memory_peak
 
 
+def test_a_backdrop_is_predicted(tmp_path: Path) -> None:
+    scene, device = make_scene(5000, 160, 120), Device()
+    config = TrainConfig(strategy="adc", size="fixed", iterations=6, adc=FIXED_N)
+    state = initial_state(scene, config)
+    training = Training(scene, config, device, state, backdrop=initial_state(scene, config).gaussians)
+    complete(training, tmp_path)
+    photos = sum(view.image.nbytes for view in scene.train)
+    need = training.need
+    assert need.backdrop == 5000
+    predicted = need.total(5000, training.state.intersections) + photos
+    assert device.memory_peak <= predicted <= 1.2 * device.memory_peak
+    # Without the backdrop's bytes the prediction would be too low.
+    assert replace(need, backdrop=0).total(5000, training.state.intersections) + photos < device.memory_peak
+    assert abs(need.most_gaussians(need.total(5000)) - 5000) <= 1
+
+
 def test_a_million_gaussians_fit_4_gb() -> None:
     """At 1280x720, with intersections to spare and an evaluation's copy."""
     for gpu in (False, True):
@@ -95,16 +114,16 @@ def test_the_steady_state_allocates_nothing(tmp_path: Path, monkeypatch: pytest.
     device = Device()
     done: list[int] = []
     new: list[int] = []
-    allocate = Device._allocate
+    allocate = Buffers.allocate
 
-    def counted(self: Device, what: str, nbytes: int) -> Any:
+    def counted(self: Buffers, what: str, nbytes: int) -> Any:
         before = self.memory
         block = allocate(self, what, nbytes)
         if self.memory != before:
             new.append(len(done))
         return block
 
-    monkeypatch.setattr(Device, "_allocate", counted)
+    monkeypatch.setattr(Buffers, "allocate", counted)
     still = OptimConfig(1e-9, 1e-9, log_scales_lr=0, quats_lr=0, logit_opacities_lr=0)  # lists stay as they are
     config = TrainConfig(strategy="adc", size="fixed", iterations=30, adc=FIXED_N, optim=still)
     train(make_scene(2000, 96, 64, 6), config, tmp_path, device, progress=lambda _: done.append(1))
@@ -177,15 +196,15 @@ def test_running_out_of_memory_leaves_the_checkpoint(tmp_path: Path, monkeypatch
     scene, device = make_scene(300, 48, 32), Device()
     config = TrainConfig(strategy="adc", size="fixed", iterations=12, checkpoint_every=5, adc=FIXED_N)
     done: list[int] = []
-    allocate = Device._allocate
+    allocate = Buffers.allocate
 
-    def full(self: Device, what: str, nbytes: int) -> Any:
+    def full(self: Buffers, what: str, nbytes: int) -> Any:
         if len(done) == 7:
             raise DeviceError(f"{what}: no memory left")
         return allocate(self, what, nbytes)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Device, "_allocate", full)
+        patch.setattr(Buffers, "allocate", full)
         with pytest.raises(
             DeviceError, match=r"^iteration 8: .*: no memory left; the last checkpoint in .* is intact"
         ):

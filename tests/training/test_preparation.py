@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import run, write_dataset
+from cli_runs import run, write_dataset
 from test_triangulation import POINTS_TARGET, posed, write_transforms  # noqa: F401  (a fixture)
 
 from clsplat import TrainConfig, prepare, save_gaussians, train

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_runs import fails, run, write_dataset
 from PIL import Image
-from test_cli import fails, run, write_dataset
 
 from clsplat.errors import InputError
 from clsplat.training.run_folder import held

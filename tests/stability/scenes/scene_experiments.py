@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from dead_gaussians import DEAD
-from needles_and_floaters import EFFECTIVE_RANK, FLOATERS
+from needles_and_floaters import EFFECTIVE_RANK, FLOATERS, OUTERMOST
 from other_scales import OTHER_SCALES
 from random_start import RANDOM_START
 from real_photos import EXPOSURE, FEW_VIEWS, POSES
@@ -20,6 +20,7 @@ SCENE_EXPERIMENTS: dict[str, Experiment] = {
     "poses": POSES,
     "few-views": FEW_VIEWS,
     "floaters": FLOATERS,
+    "outermost": OUTERMOST,
     "random-start": RANDOM_START,
     "dead-gaussians": DEAD,
 }
@@ -27,7 +28,18 @@ SCENE_EXPERIMENTS: dict[str, Experiment] = {
 
 ORDER = (
     *("world-offset", "equal-depths", "repeated-runs", "popping", "poisoning", "needles", "effective-rank"),
-    *("jacobian", "wide-angle", "scales", "exposure", "poses", "few-views", "floaters", "dark-areas", "constants"),
+    *(
+        "jacobian",
+        "wide-angle",
+        "scales",
+        "exposure",
+        "poses",
+        "few-views",
+        "floaters",
+        "outermost",
+        "dark-areas",
+        "constants",
+    ),
     *("everything-pruned", "opacity-reset", "blow-up", "random-start", "sh-extrapolation", "dead-gaussians"),
     "images",
     "focal-length",

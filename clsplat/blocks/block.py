@@ -1,0 +1,146 @@
+"""Training of a block: a function of files, whose result is a file that exists whole or not at all."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from clsplat.atomic import replacing
+from clsplat.blocks.jobs import Job, digest_of, read_job
+from clsplat.blocks.partition import EVERYWHERE
+from clsplat.blocks.survey import seen_by_block
+from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.dataset import load_scene
+from clsplat.errors import ClsplatError, InputError
+from clsplat.formats import load_gaussians, save_gaussians
+from clsplat.gaussians import Gaussians
+from clsplat.pruning.prices import without_invisible
+from clsplat.renderer import Renderer
+from clsplat.scene import Scene, View
+from clsplat.training.checkpoint import CHECKPOINT, load_state
+from clsplat.training.inputs import Inputs
+from clsplat.training.loop import complete
+from clsplat.training.preparation import open_device
+from clsplat.training.recorder import LOG
+from clsplat.training.run_folder import held
+from clsplat.training.session import Training
+from clsplat.training.state import initial_state
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+Progress = Callable[[dict[str, Any]], None]
+"""Called after every iteration, as the argument of `clsplat.training.loop.train`."""
+
+
+def result_of(job_file: Path) -> Path:
+    """The file of a block's result, beside that of its job."""
+    return job_file.with_suffix(".ply")
+
+
+def log_of(job_file: Path) -> Path:
+    """The file of a block's log, beside that of its job."""
+    return job_file.with_suffix(".jsonl")
+
+
+def train_block(
+    job_file: Path | str,
+    loaded: list[View] | None = None,
+    device: "Device | None" = None,
+    progress: Progress = lambda record: None,
+) -> Path:
+    """Train a block, unless its result exists; continue where an interrupted run has left a checkpoint.
+
+    The Gaussians of the scene in the block and its margin train; the others that its photos show are drawn and stay
+    as they are. What lies in the block after the training is its result.
+
+    Parameters
+    ----------
+    job_file : Path or str
+        As `clsplat.blocks.jobs.Job.write` wrote it, with the scenes that it names beside it.
+    loaded : list of View, optional
+        The photos of the dataset. Default: they are read.
+    device : Device, optional
+        Default: the one that the job's configuration describes.
+    progress : callable
+
+    Returns
+    -------
+    Path
+        The result, `result_of` the job; its log is `log_of` it.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or is not the one that the job was made with, or another process trains the block.
+    ClsplatError
+        If the training fails, or leaves nothing in the block.
+    """
+    job_file = Path(job_file)
+    result, work = result_of(job_file), job_file.with_suffix("")
+    if result.exists():
+        return result
+    job = read_job(job_file)
+    start = _start(job_file, job)
+    views = job.views(load_scene(job.data, job.config.data).train if loaded is None else loaded)
+    device = device or open_device(job.config)
+    with held(work):
+        if not result.exists():
+            gaussians = _trained(job, start, views, device, work, progress)
+            with replacing(log_of(job_file)) as file:
+                file.write((work / LOG).read_bytes())
+            save_gaussians(result, gaussians, job.config.render.mode)
+    shutil.rmtree(work, ignore_errors=True)
+    return result
+
+
+def _start(job_file: Path, job: Job) -> Gaussians:
+    """The Gaussians from which a block starts and those around it."""
+    scene = read_scene(job_file.with_name(job.scene), job.config)
+    scene = scene.take(job.near.contains(scene.means))
+    if job.near == EVERYWHERE:
+        return scene
+    far = read_scene(job_file.with_name(job.far), job.config)
+    return Gaussians.concatenate([scene, far.take(~job.near.contains(far.means))])
+
+
+def read_scene(path: Path, config: TrainConfig) -> Gaussians:
+    """Read a scene, whose file has its digest as its name, with all bands of the spherical harmonics.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or has been changed.
+    """
+    gaussians = load_gaussians(path)[0]
+    if digest_of(path.read_bytes()) != path.stem:
+        raise InputError(f"{path}: expected a scene as it was written, found a changed file")
+    missing = (config.init.sh_degree + 1) ** 2 - gaussians.sh.shape[1]
+    return replace(gaussians, sh=np.pad(gaussians.sh, ((0, 0), (0, max(0, missing)), (0, 0))))
+
+
+def _trained(
+    job: Job, start: Gaussians, views: list[View], device: "Device", work: Path, progress: Progress
+) -> Gaussians:
+    """Train the block in a folder that is held, and return what lies in it."""
+    config = job.config
+    renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
+    trains = job.wide.contains(start.means)
+    seen, shown = seen_by_block(renderer, start, trains, views)
+    scene = Scene(seen, [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    inputs = Inputs.of(scene, device)
+    if (work / CHECKPOINT).exists():
+        state = load_state(work / CHECKPOINT, scene.extent, config, inputs)
+    else:
+        state = replace(initial_state(scene, config, start.take(trains)), inputs=inputs)
+    training = Training(scene, config, device, state, start.take(shown & ~trains))
+    gaussians = complete(training, work, progress=progress)
+    inside = job.box.contains(gaussians.means)
+    if not inside.any():
+        raise ClsplatError(
+            f"{work.name}: expected Gaussians in the block after its training, found none; use fewer --blocks"
+        )
+    return without_invisible(gaussians.take(inside))

@@ -1,0 +1,82 @@
+"""Blocks on a cluster of dask.distributed: one task per block, one block per device at a time."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from clsplat.blocks.block import result_of, train_block
+from clsplat.errors import InputError
+
+RESOURCE = "CL"
+"""Resource that a worker declares for each of its OpenCL devices, as in ``dask worker --resources "CL=1"``."""
+
+RETRIES = 3
+"""Times that a block is trained again elsewhere when its worker dies or raises an error; it continues from its last
+checkpoint."""
+
+
+def run_on_cluster(address: str, jobs: list[Path], tell: Callable[[str], None]) -> None:
+    """Train the blocks that have no result on the workers of a scheduler.
+
+    A task is named by the job's digest and its result is a file, so that it does not matter who trains a block, when,
+    and how often it was tried.
+
+    Parameters
+    ----------
+    address : str
+        Such as tcp://host:8786.
+    jobs : list of Path
+        In a folder that the workers see under the same path, as they do the dataset.
+    tell : callable
+        Called with a sentence when a block is done.
+
+    Raises
+    ------
+    InputError
+        If dask.distributed is not installed, there is no scheduler, or the workers do not share the folder.
+    ClsplatError
+        Those of `train_block`, from a worker.
+    """
+    try:
+        from distributed import Client, as_completed
+    except ImportError as error:
+        raise InputError(
+            "--scheduler: expected the package distributed, found none; pip install 'clsplat[cluster]'"
+        ) from error
+    try:
+        client = Client(address)
+    except (OSError, ValueError) as error:  # TimeoutError is an OSError
+        raise InputError(f"--scheduler: expected a scheduler of dask at {address}, found none: {error}") from error
+    waiting = [job.resolve() for job in jobs if not result_of(job).exists()]
+    with client:
+        _tell_missing(client, tell)
+        tasks = {
+            client.submit(_train, str(job), key=f"clsplat-{job.stem}", resources={RESOURCE: 1}, retries=RETRIES): job
+            for job in waiting
+        }
+        for number, task in enumerate(as_completed(list(tasks)), 1):
+            worker = task.result()
+            if not result_of(tasks[task]).exists():
+                raise InputError(
+                    f"{tasks[task].parent}: expected a folder that this machine shares with the workers, found no "
+                    f"result after {worker} had written one; choose a shared folder with -o"
+                )
+            tell(f"blocks: {number} of {len(tasks)} done, the last by {worker}")
+
+
+def _train(job: str) -> str:
+    """Train a block on a worker; return the name of the worker."""
+    from distributed import get_worker
+
+    train_block(job)
+    return str(get_worker().name)
+
+
+def _tell_missing(client: Any, tell: Callable[[str], None]) -> None:
+    """Say that blocks wait for workers, if no worker declares a device."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    if not any(worker.get("resources", {}).get(RESOURCE) for worker in workers):
+        tell(
+            f"blocks: {len(workers)} workers, none of which declares a device; blocks wait for workers that were "
+            f'started with: dask worker SCHEDULER --resources "{RESOURCE}=1" --nthreads 1'
+        )

@@ -1,0 +1,162 @@
+"""Jobs: files that say how a block is trained, named by the digest of everything that its result depends on."""
+
+import json
+from dataclasses import asdict, dataclass, replace
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.atomic import replacing
+from clsplat.blocks.partition import EVERYWHERE, Box
+from clsplat.blocks.plan import Block
+from clsplat.camera import Camera
+from clsplat.config import TrainConfig
+from clsplat.errors import InputError
+from clsplat.scene import View
+from clsplat.training.checkpoint import FREE
+from clsplat.training.inputs import DIGEST_BYTES, Photo, named, photos_of
+from clsplat.training.presets import with_settings
+
+BOXES = ("near", "box", "wide")
+"""Boxes of a job."""
+
+FORMAT = 1
+"""Version of the files of jobs."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """How a block is trained.
+
+    data: folder of the dataset; scene: name of the file, beside that of the job, of the Gaussians from which the
+    block starts and that surround it, named by its digest; near: where these are used; far: the file of those
+    elsewhere; box, wide: what the block keeps and trains; photos: digests of pixels and mask, by name; cameras: as
+    the scene has them, by name; config: settings of the block.
+    """
+
+    data: str
+    scene: str
+    near: Box
+    far: str
+    box: Box
+    wide: Box
+    photos: dict[str, Photo]
+    cameras: dict[str, dict[str, Any]]
+    config: TrainConfig
+
+    @property
+    def digest(self) -> str:
+        """Digest of what the result depends on: all but the dataset's place and settings that change no bit."""
+        content = self.content()
+        del content["data"]
+        for name in FREE:
+            del content["config"][name]
+        return digest_of(json.dumps(content, sort_keys=True).encode())
+
+    def content(self) -> dict[str, Any]:
+        """The job as JSON."""
+        return {
+            "format": FORMAT,
+            "data": self.data,
+            "scene": self.scene,
+            "far": self.far,
+            **{name: [_face(side) for side in getattr(self, name)] for name in BOXES},
+            "photos": {
+                name: {"pixels": photo.pixels, "mask": photo.mask, "camera": self.cameras[name]}
+                for name, photo in self.photos.items()
+            },
+            "config": asdict(self.config),
+        }
+
+    def write(self, folder: Path) -> Path:
+        """Write the job into a folder; return its file, which has the name of its digest."""
+        path = folder / f"{self.digest}.json"
+        with replacing(path) as file:
+            file.write((json.dumps(self.content(), indent=1) + "\n").encode())
+        return path
+
+    def views(self, loaded: list[View]) -> list[View]:
+        """The photos of the block with its cameras, of those that have been loaded.
+
+        Raises
+        ------
+        InputError
+            If one is missing, or has other pixels or another mask than the job was made for.
+        """
+        by_name = {view.name: view for view in loaded}
+        missing = [name for name in self.photos if name not in by_name]
+        if missing:
+            raise InputError(f"{self.data}: expected the photos of a block, missing {named(missing)}")
+        chosen = [by_name[name] for name in self.photos]
+        found = photos_of(chosen, np.zeros(3))
+        other = [
+            n for n, photo in self.photos.items() if found[n].pixels != photo.pixels or found[n].mask != photo.mask
+        ]
+        if other:
+            raise InputError(
+                f"{self.data}: expected the photos that the block was planned with, found other pixels or masks "
+                f"({named(other)}); start a new run in another folder"
+            )
+        return [replace(view, camera=_camera(self.cameras[view.name])) for view in chosen]
+
+
+def make_job(
+    data: Path, scene: str, block: Block, views: list[View], photos: dict[str, Photo], config: TrainConfig
+) -> Job:
+    """Make the job of a block in a scene's file from its photos, the digests of all photos, and its settings."""
+    names = [view.name for view in views]
+    cameras = {view.name: asdict(view.camera) | {"viewmat": view.camera.viewmat.tolist()} for view in views}
+    own = {name: photos[name] for name in names}
+    return Job(str(data), scene, EVERYWHERE, scene, block.box, block.wide, own, cameras, config)
+
+
+def read_job(path: Path) -> Job:
+    """Read a job.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is damaged, or is not named by its digest: it has been changed.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != FORMAT:
+            raise InputError(f"{path}: expected a job of format {FORMAT}, found {content['format']!r}")
+        boxes: dict[str, Any] = {n: Box(_corner(content[n][0], -1), _corner(content[n][1], 1)) for n in BOXES}
+        scenes: dict[str, Any] = {name: str(content[name]) for name in ("data", "scene", "far")}
+        photos = {name: Photo(str(p["pixels"]), str(p["mask"]), []) for name, p in content["photos"].items()}
+        cameras = {name: dict(p["camera"]) for name, p in content["photos"].items()}
+        config = with_settings(TrainConfig(), content["config"], str(path))
+        job = Job(**scenes, **boxes, photos=photos, cameras=cameras, config=config)
+        digest = job.digest
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    except (AttributeError, IndexError, KeyError, RecursionError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: expected a job that `clsplat train --blocks` wrote, found {error!r}") from error
+    if path.stem != digest:
+        raise InputError(f"{path}: expected a job as it was written, found a changed one; plan the run again")
+    return job
+
+
+def digest_of(*parts: bytes) -> str:
+    """Digest of bytes, as text."""
+    result = blake2b(digest_size=DIGEST_BYTES)
+    for part in parts:
+        result.update(part)
+    return result.hexdigest()
+
+
+def _face(side: tuple[float, ...]) -> list[float | None]:
+    return [x if np.isfinite(x) else None for x in side]
+
+
+def _corner(side: list[float | None], sign: int) -> tuple[float, ...]:
+    return tuple(sign * np.inf if x is None else float(x) for x in side)
+
+
+def _camera(saved: dict[str, Any]) -> Camera:
+    return Camera(**saved | {"viewmat": np.array(saved["viewmat"]), "distortion": tuple(saved["distortion"])})

@@ -1,0 +1,80 @@
+"""The cut of a scene into boxes: a kd-tree over the Gaussians of the coarse run, and a margin around each box."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MARGIN = 0.1
+"""Width of the margin of a box at each face that another box shares, as a fraction of the extent along this axis of
+the Gaussians in the box."""
+
+SPREAD = (0.05, 0.95)
+"""Quantiles of the Gaussians' positions along an axis whose difference is their extent. Single Gaussians lie far away
+from the others."""
+
+
+class Box(NamedTuple):
+    """Half-open box of the world: low <= point < high, world units; infinite at faces that no other box shares."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        """Whether points (N, 3) are in the box, (N,)."""
+        return np.asarray(((points >= self.low) & (points < self.high)).all(axis=1))
+
+    def widened(self, points: Array, by: float) -> "Box":
+        """The box with a margin of the width `by`, in extents of those of the points (N, 3) that are in it."""
+        inside = points[self.contains(points)]
+        margins = by * _extent(inside) if len(inside) else np.zeros(3)
+        low, high = np.asarray(self.low) - margins, np.asarray(self.high) + margins  # infinity stays infinite
+        return Box(tuple(low.tolist()), tuple(high.tolist()))
+
+
+EVERYWHERE = Box((-np.inf,) * 3, (np.inf,) * 3)
+
+
+def cut(points: Array, count: int) -> list[Box]:
+    """Cut space into boxes that hold about as many points each.
+
+    Each box is cut in two across the axis along which its points extend farthest, at the quantile that gives both
+    sides their share of the boxes (Bentley 1975, "Multidimensional binary search trees").
+
+    Parameters
+    ----------
+    points : (N, 3)
+        Positions, world units. The cost of a block grows with the number of its Gaussians, which these stand for.
+    count : int
+        Number of boxes, at least 1.
+
+    Returns
+    -------
+    list of Box
+        `count` boxes; each point of space is in exactly one.
+    """
+    return _cut(np.asarray(points, np.float64), EVERYWHERE, count)
+
+
+def _cut(points: Array, box: Box, count: int) -> list[Box]:
+    if count == 1:
+        return [box]
+    first = count // 2
+    axis, at = 0, 0.0
+    if len(points):
+        axis = int(_extent(points).argmax())
+        at = float(np.quantile(points[:, axis], first / count))
+    low, high = [*box.low], [*box.high]
+    low[axis] = high[axis] = at
+    left = points[:, axis] < at
+    return [
+        *_cut(points[left], Box(box.low, tuple(high)), first),
+        *_cut(points[~left], Box(tuple(low), box.high), count - first),
+    ]
+
+
+def _extent(points: Array) -> Array:
+    low, high = np.quantile(points, SPREAD, axis=0)
+    return np.asarray(high - low)

@@ -1,0 +1,139 @@
+"""What a scene shows in photos: the weights of its Gaussians, by which blocks choose photos and share pixels."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.constants import ALPHA_MIN, SH_C0
+from clsplat.gaussians import Gaussians
+from clsplat.metrics import to_uint8
+from clsplat.renderer import Pass, Renderer, download
+from clsplat.scene import View
+from clsplat.stages import Image
+
+Array = NDArray[np.float64]
+
+COVERED = 0.95
+"""Fraction of a block's weight, summed over all photos, that the photos of the block must show. The others show
+little of it each."""
+
+
+def weights(renderer: Renderer, gaussians: Gaussians, views: Iterable[View]) -> Iterator[Array]:
+    """Sum the compositing weights alpha T of each Gaussian over the pixels of photos.
+
+    The image is linear in a splat's colour, and its derivative by the colour is the splat's weight: one backward pass
+    with an image of ones gives the sums of all Gaussians.
+
+    Parameters
+    ----------
+    renderer : Renderer
+    gaussians : Gaussians of N >= 1 rows
+    views : iterable of View
+        Pixels that their masks leave out do not count.
+
+    Yields
+    ------
+    (N,) float64
+        Per view, in pixels; 0 for what is not seen.
+    """
+    placed = renderer.place(gaussians)
+    for view in views:
+        yield _weights(renderer, renderer.forward(placed, view.camera), view.mask)
+
+
+def _weights(renderer: Renderer, run: Pass, mask: NDArray[np.bool_] | None = None) -> Array:
+    shape = run.camera.height, run.camera.width
+    ones = np.zeros((*shape, 3))
+    ones[:, :, 0] = 1 if mask is None else mask
+    v = Image(renderer.upload("v_image", ones), renderer.upload("v_alpha", np.zeros(shape)))
+    return np.asarray(download(renderer.backward_to_splats(run, v).colors)[:, 0], np.float64)
+
+
+def block_weights(
+    renderer: Renderer, gaussians: Gaussians, views: list[View], blocks: NDArray[np.intp], count: int
+) -> Array:
+    """Sum the weights of the Gaussians of each block in each photo.
+
+    Parameters
+    ----------
+    renderer, gaussians, views
+        As given to `weights`.
+    blocks : (N,) int
+        The block of each Gaussian, below `count`.
+
+    Returns
+    -------
+    (V, count) float64
+        In pixels.
+    """
+    found = (np.bincount(blocks, each, count) for each in weights(renderer, gaussians, views))
+    return np.array(list(found)).reshape(len(views), count)
+
+
+def chosen_photos(shares: Array, fewest: int) -> NDArray[np.intp]:
+    """Choose the photos of a block: those that show most of it, until they show `COVERED` of its whole weight.
+
+    Parameters
+    ----------
+    shares : (V,)
+        Weight of the block in each photo.
+    fewest : int
+        Number of photos that are chosen in any case, if there are as many.
+
+    Returns
+    -------
+    (P,) int
+        Indices of photos, ascending; at least one.
+    """
+    order = np.argsort(-shares, kind="stable")
+    sums = np.cumsum(shares[order])
+    count = int(np.searchsorted(sums, COVERED * sums[-1])) + 1
+    return np.sort(order[: max(count, fewest)])
+
+
+def seen_by_block(
+    renderer: Renderer, gaussians: Gaussians, trains: NDArray[np.bool_], views: Iterable[View]
+) -> tuple[list[View], NDArray[np.bool_]]:
+    """Make the photos as a block should see them, and find the Gaussians that they show.
+
+    Let C be the scene's image, P the photo, and m the block's share in the weights of a pixel. The image is
+    linear in the weights, so the block's part in the difference P - C is m (P - C), and what the block trains on is
+    C + m (P - C). Where only its surroundings are visible, it finds the image that they make, and no error to mend.
+
+    Parameters
+    ----------
+    renderer : Renderer
+    gaussians : Gaussians of N >= 1 rows
+        The scene, on the host.
+    trains : (N,) bool
+        The Gaussians that the block trains.
+    views : iterable of View
+
+    Returns
+    -------
+    views : list of View
+        With these images.
+    shown : (N,) bool
+        The Gaussians that have a weight in any of them.
+    """
+    placed, marks = renderer.place(gaussians), renderer.place(_marked(gaussians, trains))
+    black = Renderer(renderer.device or "reference", renderer.config)
+    shown = np.zeros(len(gaussians), bool)
+    result = []
+    for view in views:
+        run = renderer.forward(placed, view.camera)
+        shown |= _weights(renderer, run) > 0
+        image = np.clip(download(run.image.rgb), 0, 1, dtype=np.float64)
+        marked = black.forward(marks, view.camera, gradients=False).image
+        share = download(marked.rgb)[:, :, :1] / np.maximum(download(marked.alpha)[:, :, None], ALPHA_MIN)
+        blended = image + np.clip(share, 0, 1) * (view.image / 255 - image)
+        result.append(replace(view, image=to_uint8(blended)))
+    return result, shown
+
+
+def _marked(gaussians: Gaussians, trains: NDArray[np.bool_]) -> Gaussians:
+    """The Gaussians in white where they train and in black elsewhere, without view dependence."""
+    color = np.where(trains, 0.5, -0.5) / SH_C0
+    return replace(gaussians, sh=np.repeat(color[:, None, None], 3, axis=2).astype(gaussians.sh.dtype))

@@ -1,0 +1,215 @@
+"""A training in blocks: the coarse run, the jobs of the blocks, and the scene that their results make."""
+
+import json
+import shutil
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import asdict, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from clsplat.atomic import replacing
+from clsplat.blocks.block import Progress, log_of, read_scene, result_of, train_block
+from clsplat.blocks.jobs import digest_of, make_job, read_job
+from clsplat.blocks.plan import (
+    COARSE_FACTOR,
+    Block,
+    block_config,
+    check_blocks,
+    coarse_config,
+    make_plan,
+    one_fits,
+    refining_config,
+)
+from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.formats import load_gaussians, save_gaussians
+from clsplat.gaussians import Gaussians
+from clsplat.renderer import Renderer
+from clsplat.scene import Scene
+from clsplat.show.training_curve import read_log
+from clsplat.training.checkpoint import CHECKPOINT, FREE
+from clsplat.training.inputs import photos_of
+from clsplat.training.loop import train
+from clsplat.training.recorder import LOG
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+BLOCKS = "blocks"
+"""Name of the folder, in that of a run, with the jobs and results of its blocks."""
+
+Watch = Callable[[str, TrainConfig], AbstractContextManager[Progress]]
+"""Shows the progress of a training, by its name and configuration."""
+
+
+def plan_blocks(
+    scene: Scene,
+    config: TrainConfig,
+    device: "Device",
+    data: Path,
+    out: Path,
+    watch: Watch,
+    tell: Callable[[str], None],
+) -> tuple[list[Path], list[Block]]:
+    """Train the coarse scene, cut it into blocks, and write a job for each.
+
+    What an interrupted run has finished is not done again.
+
+    Parameters
+    ----------
+    scene : Scene
+    config : TrainConfig
+        Both as `clsplat.training.preparation.prepare` returns them.
+    device : Device
+    data : Path
+        The dataset, from which other processes read the photos.
+    out : Path
+        Folder of the run.
+    watch : callable
+    tell : callable
+        Called with a sentence about each step.
+
+    Returns
+    -------
+    jobs : list of Path
+        Their files, in the order of the blocks; empty if one block is enough.
+    blocks : list of Block
+
+    Raises
+    ------
+    InputError
+        If the configuration cannot train blocks, or they do not fit the memory.
+    """
+    check_blocks(config)
+    if one_fits(scene, config, device):
+        tell(f"blocks: one is enough for {config.max_gaussians} Gaussians")
+        return [], []
+    folder = out / BLOCKS
+    folder.mkdir(parents=True, exist_ok=True)
+    photos = photos_of(scene.train, scene.offset)
+    file, seconds = _coarse(scene, config, device, folder, json.dumps(photos), watch)
+    coarse = read_scene(file, config)
+    renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
+    plan = make_plan(coarse, scene, config, renderer)
+    if len(plan.blocks) == 1:
+        tell(f"blocks: one is enough for about {plan.total} Gaussians")
+        return [], []
+    tell(plan.describe(config, scene, seconds * COARSE_FACTOR**2))
+    jobs = []
+    for block in plan.blocks:
+        views = [scene.train[i] for i in block.photos]
+        settings = block_config(config, scene, block)
+        jobs.append(make_job(data.resolve(), file.name, block, views, photos, settings).write(folder))
+    return jobs, plan.blocks
+
+
+def plan_refinement(jobs: list[Path], blocks: list[Block]) -> list[Path]:
+    """Write the jobs of the second trainings, in which each block has the trained ones around it.
+
+    In the first trainings each block is surrounded by the coarse scene. Together, the blocks are therefore worse than
+    a scene that has been trained as a whole.
+
+    Parameters
+    ----------
+    jobs : list of Path
+        Those of the first trainings, all of which have results.
+    blocks : list of Block
+        As `plan_blocks` returned them.
+
+    Returns
+    -------
+    list of Path
+        The files of the jobs, in the order of the blocks.
+    """
+    scene, first = merge(jobs), [read_job(job) for job in jobs]
+    name = _save(scene, jobs[0].parent, first[0].config)
+    refined = []
+    for job, block in zip(first, blocks, strict=True):
+        settings = refining_config(job.config, int(block.wide.contains(scene.means).sum()))
+        refined.append(replace(job, scene=name, near=block.near, config=settings).write(jobs[0].parent))
+    return refined
+
+
+def _save(gaussians: Gaussians, folder: Path, config: TrainConfig) -> str:
+    """Write a scene to a file that is named by its digest; return the name."""
+    with TemporaryDirectory(dir=folder) as beside:
+        file = Path(beside) / "scene.ply"
+        save_gaussians(file, gaussians, config.render.mode)
+        name = f"{digest_of(file.read_bytes())}.ply"
+        file.replace(folder / name)
+    return name
+
+
+def _coarse(
+    scene: Scene, config: TrainConfig, device: "Device", folder: Path, photos: str, watch: Watch
+) -> tuple[Path, float]:
+    """Train the coarse scene, unless it exists. Returns its file and the seconds that an iteration took."""
+    settings = coarse_config(config, scene, device)
+    bound = {name: value for name, value in asdict(settings).items() if name not in FREE}
+    digest = digest_of(json.dumps(bound, sort_keys=True).encode(), photos.encode(), scene.points.tobytes())
+    done, work = folder / f"coarse-{digest}.json", folder / f"coarse-{digest}"
+    if not done.exists():
+        with watch("coarse run", settings) as progress:
+            resume = (work / CHECKPOINT).exists()
+            gaussians = train(scene, settings, work, device, resume=resume, progress=progress)
+        seconds = read_log(work / LOG)[-1]["seconds"] / settings.iterations
+        with replacing(done) as file:
+            file.write(json.dumps({"scene": _save(gaussians, folder, settings), "seconds": seconds}).encode())
+        shutil.rmtree(work, ignore_errors=True)
+    record = json.loads(done.read_text())
+    return folder / record["scene"], record["seconds"]
+
+
+def unfinished(jobs: list[Path]) -> list[Path]:
+    """The jobs that have no result."""
+    return [job for job in jobs if not result_of(job).exists()]
+
+
+def run_here(jobs: list[Path], scene: Scene, device: "Device", watch: Watch) -> None:
+    """Train the blocks that have no result one after the other on a device."""
+    for number, job in enumerate(jobs, 1):
+        if not result_of(job).exists():
+            with watch(f"block {number} of {len(jobs)}", read_job(job).config) as progress:
+                train_block(job, scene.train, device, progress)
+
+
+def merge(jobs: list[Path]) -> Gaussians:
+    """Join the results of blocks in their order, whoever computed them.
+
+    Returns
+    -------
+    Gaussians
+        In the scene's coordinates, on the host, with the highest degree of spherical harmonics that a block has.
+
+    Raises
+    ------
+    InputError
+        If a result cannot be read.
+    """
+    parts = [load_gaussians(result_of(job))[0] for job in jobs]
+    most = max(part.sh.shape[1] for part in parts)
+    for part in parts:
+        part.sh = np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))
+    return Gaussians.concatenate(parts)
+
+
+def write_log(out: Path, jobs: list[Path], last: dict[str, Any]) -> None:
+    """Write the log of a run: those of the blocks one after the other, and a last record.
+
+    Iterations and seconds go on from block to block; `block` counts blocks from 1. The last record, about the whole
+    scene, needs only what is measured in it.
+    """
+    lines: list[dict[str, Any]] = []
+    iteration, seconds = 0, 0.0
+    for number, job in enumerate(jobs, 1):
+        records = read_log(log_of(job))
+        for record in records:
+            moved = {"iteration": iteration + record["iteration"], "seconds": seconds + record["seconds"]}
+            lines.append(record | moved | {"block": number})
+        iteration, seconds = iteration + records[-1]["iteration"], seconds + records[-1]["seconds"]
+    lines.append({"iteration": iteration, "seconds": seconds} | last)
+    with replacing(out / LOG) as file:
+        file.writelines(f"{json.dumps(line)}\n".encode() for line in lines)

@@ -1,0 +1,111 @@
+"""Training in blocks from the command line: its progress, its clusters, and the command `block`."""
+
+import shlex
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from clsplat.commands.console import say
+from clsplat.commands.options import ClusterOptions
+from clsplat.commands.progress import Progress
+from clsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from clsplat.blocks.whole import Watch
+    from clsplat.config import TrainConfig
+    from clsplat.device import Device
+    from clsplat.gaussians import Gaussians
+    from clsplat.renderer import Renderer
+    from clsplat.scene import Scene
+
+
+def train_in_blocks(
+    scene: "Scene", config: "TrainConfig", renderer: "Renderer", data: Path, out: Path, where: ClusterOptions
+) -> "Gaussians | None":
+    """Train the blocks of a scene and merge them; None if one block is enough.
+
+    Raises
+    ------
+    JobsPrinted
+        If `where` asks for commands, and blocks have to be trained.
+    """
+    from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
+    from clsplat.evaluate import mean_metrics
+
+    @contextmanager
+    def watch(name: str, settings: "TrainConfig") -> Iterator[Callable[[dict[str, Any]], None]]:
+        say(f"{name}: {settings.iterations} iterations")
+        progress = Progress(scene, settings, renderer, out, None, lambda: None)
+        with progress.watching():
+            yield progress.after
+
+    assert renderer.device
+    first, blocks = plan_blocks(scene, config, renderer.device, data, out, watch, say)
+    if not first:
+        return None
+    _run(first, scene, renderer.device, watch, where)
+    second = plan_refinement(first, blocks)
+    _run(second, scene, renderer.device, watch, where)
+    gaussians = merge(second)
+    scores = mean_metrics(gaussians, scene.test, renderer) if scene.test else {}
+    write_log(out, [*first, *second], {"num_gaussians": len(gaussians)} | scores)
+    return gaussians
+
+
+class JobsPrinted(Exception):
+    """The commands that train blocks have been printed, and are left to others."""
+
+
+def _run(jobs: list[Path], scene: "Scene", device: "Device", watch: "Watch", where: ClusterOptions) -> None:
+    """Train the blocks that have no result, where the options say."""
+    from clsplat.blocks.whole import run_here, unfinished
+
+    if where.print_jobs and unfinished(jobs):
+        for job in unfinished(jobs):
+            print(shlex.join(["clsplat", "block", str(job.resolve())]))
+        raise JobsPrinted
+    if where.scheduler is not None:
+        from clsplat.blocks.cluster import run_on_cluster
+
+        run_on_cluster(where.scheduler, jobs, say)
+    else:
+        run_here(jobs, scene, device, watch)
+
+
+def began(out: Path) -> bool:
+    """Whether a folder holds a run that can be resumed."""
+    from clsplat.blocks.whole import BLOCKS
+    from clsplat.training.checkpoint import CHECKPOINT
+
+    return (out / CHECKPOINT).is_file() or (out / BLOCKS).is_dir()
+
+
+def check_same(file: Path, config: "TrainConfig") -> None:
+    """Raise an InputError if a run in blocks would continue with another configuration than it began with."""
+    from clsplat.training.checkpoint import FREE
+    from clsplat.training.presets import load_config
+
+    free = {name: getattr(config, name) for name in FREE}
+    if replace(load_config(file), **free) != config:
+        raise InputError(
+            f"{file}: expected the configuration that the run began with, found another one; leave out other flags, "
+            "or start a new run in another folder"
+        )
+
+
+@dataclass(frozen=True)
+class Block:
+    """Train one block of a scene, as `train --print-jobs` lists them."""
+
+    job: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="JOB")]
+    """File that describes the block; the coarse scene is beside it."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from clsplat.blocks.block import train_block
+
+        say(f"{train_block(self.job)}: done")

@@ -1,0 +1,90 @@
+"""The training of a radiance field by `clsplat train --method`."""
+
+from collections.abc import Iterator
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.commands.console import say, say_scores, write_json
+from clsplat.commands.run_folders import CONFIG
+from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.errors import InputError
+from clsplat.training.presets import DATA_PATH
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+    from clsplat.fields import Field
+    from clsplat.scene import View
+
+COUNTED = ("iterations", "seed", "checkpoint_every", "eval_every", "device", "memory_limit", "data")
+"""Settings that count for a field."""
+
+
+def check_settings(method: str, config: TrainConfig) -> None:
+    """Raise an InputError if a setting is given that only Gaussians have."""
+    default = TrainConfig()
+    names = [f.name for f in fields(config) if getattr(config, f.name) != getattr(default, f.name)]
+    others = [name for name in names if name not in COUNTED]
+    if others:
+        raise InputError(
+            f"--method {method}: expected no settings of Gaussians, found {', '.join(others)}; leave them out"
+        )
+
+
+def images_of(field: "Field", views: "list[View]", config: TrainConfig) -> Iterator[NDArray[np.uint8]]:
+    """Render views in 8 bits, one after the other."""
+    from clsplat.metrics import to_uint8
+
+    for view in views:
+        yield to_uint8(field.image(view.camera, BACKGROUNDS[config.data.background]))
+
+
+def train_and_evaluate(
+    data: Path, method: str, config: TrainConfig, device: "Device", out: Path, resume: bool
+) -> None:
+    """Train a field with a progress bar, and write its file, log, and evaluation to `out`."""
+    from tqdm import tqdm
+
+    from clsplat.dataset import load_scene
+    from clsplat.evaluate import evaluate_images, mean_metrics_of
+    from clsplat.fields import METHODS
+    from clsplat.fields.field_files import MODEL
+    from clsplat.fields.field_training import train_field
+
+    kind = METHODS[method]
+    config = replace(config, iterations=config.iterations or kind.iterations)
+    scene = load_scene(data, replace(config.data, random_background=True))
+    if not resume:
+        write_json(out / CONFIG, {DATA_PATH: str(data.resolve()), **asdict(config)})
+    every = config.eval_every or config.iterations
+
+    def evaluated(field: "Field") -> dict[str, Any]:
+        if not scene.test or field.iteration % every or field.iteration == config.iterations:
+            return {}
+        return mean_metrics_of(images_of(field, scene.test, config), scene.test)
+
+    with tqdm(total=config.iterations, unit="it", dynamic_ncols=True) as bar:
+
+        def progress(record: dict[str, Any]) -> None:
+            bar.update(record["iteration"] - bar.n)
+            bar.set_postfix_str(f"loss={record['loss']:.4f}, rays={record['rays']}", refresh=False)
+
+        field = train_field(
+            scene,
+            kind,
+            config,
+            out,
+            device,
+            resume=resume,
+            evaluate=evaluated,
+            progress=progress,
+        )
+    size = (out / MODEL).stat().st_size
+    say(f"{out / MODEL}: {size / 1e6:.3g} MB")
+    if scene.test:
+        about = {"method": method, "model_bytes": size}
+        images = images_of(field, scene.test, config)
+        say_scores(evaluate_images(images, scene.test, out / "eval", about, device.label), out / "eval")

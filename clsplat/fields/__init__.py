@@ -1,0 +1,20 @@
+"""Radiance fields to compare with Gaussians: the methods of `METHODS`, trained and rendered on the same device.
+
+Belongs here: one module per method, and what they share: their space, pixels, grid of occupied cells, training and
+files. Does not belong here: kernels and launches, which are stages, and anything of Gaussians.
+"""
+
+from clsplat.fields.field import Field
+from clsplat.fields.ingp import IngpBase, IngpBig
+from clsplat.fields.plenoxels import Plenoxels
+
+METHODS: dict[str, type[Field]] = {method.name: method for method in (Plenoxels, IngpBase, IngpBig)}
+"""Methods by the name that `--method` takes."""
+
+GAUSSIANS = "gaussians"
+"""Name that stands for no field: the Gaussians that clsplat trains by default."""
+
+
+def method_names() -> list[str]:
+    """Names that `--method` takes."""
+    return [GAUSSIANS, *METHODS]

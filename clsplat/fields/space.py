@@ -1,0 +1,72 @@
+"""The space of a field: where it lies in the world, and how its rays are sampled."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera, focus_point
+from clsplat.field_stages import Marching
+from clsplat.scene import View
+
+BOX_SHARE = 0.375
+"""Half edge of the cube of a scene without a background, as a fraction of the cameras' mean distance from the point
+they look at: 1.5 for NeRF-synthetic scenes, whose cameras are 4 away (Mildenhall et al. 2020)."""
+
+STEP = 3**0.5 / 1024
+"""Length of a step in the unit cube: 1024 along its diagonal (Müller et al. 2022, appendix E)."""
+
+CONE = 1 / 256
+"""Length of a step per distance, where there is a background (Müller et al. 2022, appendix E)."""
+
+FAR = 100.0
+"""Distance at which rays end where there is a background, in distances of the farthest camera from the centre. The
+contraction maps it to 1.99 of 2."""
+
+
+@dataclass(frozen=True)
+class Space:
+    """Field coordinates: (x - centre) / scale + shift for a point x of the world.
+
+    Without `contracted` the field is the unit cube. With it, the unit ball around 0 has the cameras in it, and the
+    space around it is contracted.
+    """
+
+    centre: NDArray[np.float64]
+    scale: float
+    contracted: bool
+    near: float
+
+    @classmethod
+    def of(cls, views: list[View]) -> "Space":
+        """The space of a scene: a cube if its photos are transparent around an object, otherwise all space.
+
+        Parameters
+        ----------
+        views : list of View
+            The training photos, loaded with random backgrounds, which keeps their transparency.
+        """
+        cameras = [view.camera for view in views]
+        centre = focus_point(cameras)
+        distances = [float(np.linalg.norm(camera.position - centre)) for camera in cameras]
+        if any(view.clear is not None for view in views):
+            return cls(centre, 2 * BOX_SHARE * float(np.mean(distances)), False, 0.0)
+        scale = max(distances)
+        return cls(centre, scale, True, min(camera.near_depth for camera in cameras) / scale)
+
+    @property
+    def marching(self) -> Marching:
+        """How rays are sampled."""
+        if not self.contracted:
+            return Marching(STEP, 0.0, 0.0, 1e6, False)
+        return Marching(2 * STEP, CONE, self.near, FAR, True)  # the unit ball is two wide
+
+    def rays(self, camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Origins and directions (R, 3) of the rays through points of an image, in px, in the field's coordinates.
+
+        A direction is NaN where a fisheye sees nothing.
+        """
+        directions = camera.rays(u, v) @ camera.viewmat[:3, :3]
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)  # poses may be printed with few digits
+        origin = (camera.position - self.centre) / self.scale + (0.0 if self.contracted else 0.5)
+        return np.broadcast_to(origin, directions.shape), directions

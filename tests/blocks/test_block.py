@@ -1,0 +1,185 @@
+"""A block is a function of files: same bits after an interruption and from other processes, and named problems."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_plan import Planned, plan, unseen
+
+from clsplat.blocks.block import _start, read_scene, result_of, train_block
+from clsplat.blocks.jobs import read_job
+from clsplat.blocks.partition import EVERYWHERE
+from clsplat.blocks.survey import seen_by_block
+from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
+from clsplat.device import Device
+from clsplat.errors import InputError
+from clsplat.formats import load_gaussians
+from clsplat.show.training_curve import read_log
+
+
+def copied(planned: Planned, folder: Path) -> list[Path]:
+    """Jobs and coarse scene in another folder, without results."""
+    shutil.copytree(planned.jobs[0].parent, folder)
+    return [folder / job.name for job in planned.jobs]
+
+
+def test_results_merge_to_the_same_bits_in_any_order(planned: Planned, device: Device, tmp_path: Path) -> None:
+    for job in planned.jobs:
+        assert train_block(job, planned.scene.train, device) == result_of(job)
+    others = copied(planned, tmp_path / "others")
+    for job in others:
+        result_of(job).unlink()
+    for job in reversed(others):  # photos are read from the dataset, with another device object
+        train_block(job)
+    assert [result_of(j).read_bytes() for j in others] == [result_of(j).read_bytes() for j in planned.jobs]
+
+    scene = merge(planned.jobs)
+    means = [load_gaussians(result_of(job))[0].means for job in planned.jobs]
+    np.testing.assert_array_equal(scene.means, np.concatenate(means))
+    for job, inside in zip(planned.jobs, means, strict=True):
+        assert len(inside) > 40 and read_job(job).box.contains(inside).all()
+        assert not job.with_suffix("").exists(), "its folder is removed"
+
+    write_log(tmp_path, planned.jobs, {"num_gaussians": len(scene), "psnr": 20.0})
+    log = read_log(tmp_path / "log.jsonl")
+    assert [log[0]["block"], log[-2]["block"], log[-1].get("psnr")] == [1, 2, 20.0]
+    assert [record["iteration"] for record in log] == [10, 20, 30, 40, 50, 60, 70, 80, 80]
+    seconds = [record["seconds"] for record in log]
+    assert seconds == sorted(seconds)
+
+
+def test_a_killed_block_goes_on_to_the_same_bits(planned: Planned, device: Device, tmp_path: Path) -> None:
+    job = planned.jobs[0]
+    other = copied(planned, tmp_path / "others")[0]
+    expected = train_block(job, planned.scene.train, device).read_bytes()
+
+    def kill(record: dict) -> None:
+        if record["iteration"] == 33:  # the last checkpoint is of iteration 25
+            raise MemoryError
+
+    with pytest.raises(MemoryError):
+        train_block(other, planned.scene.train, device, kill)
+    assert not result_of(other).exists()
+    seen: list[int] = []
+    train_block(other, planned.scene.train, device, lambda record: seen.append(record["iteration"]))
+    assert seen[0] == 26 and result_of(other).read_bytes() == expected
+
+
+def test_what_is_finished_is_not_done_again(planned: Planned, dataset: Path, device: Device, tmp_path: Path) -> None:
+    for job in planned.jobs:
+        train_block(job, planned.scene.train, device)
+    before = {path: path.stat().st_mtime_ns for path in planned.jobs[0].parent.iterdir()}
+    again = plan(dataset, device, tmp_path, 2)
+    assert again.jobs == planned.jobs
+    for job in again.jobs:
+        train_block(job, [], device)  # would raise an error without photos
+    jobs = set(planned.jobs)
+    assert {p: p.stat().st_mtime_ns for p in planned.jobs[0].parent.iterdir() if p not in jobs} == {
+        p: time for p, time in before.items() if p not in jobs
+    }
+
+
+@pytest.mark.parametrize("without", ["its surroundings", "its own view of the photos"])
+def test_a_block_begins_with_a_small_error(
+    planned: Planned, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, without: str
+) -> None:
+    """Surroundings are drawn as they were when the photos were made for the block."""
+
+    def first_loss(job: Path) -> float:
+        losses: list[float] = []
+
+        def stop(record: dict) -> None:
+            losses.append(record["loss"])
+            if len(losses) == 5:
+                raise StopIteration
+
+        with pytest.raises(StopIteration):
+            train_block(job, planned.scene.train, device, stop)
+        return float(np.mean(losses))
+
+    def changed(renderer: Any, coarse: Any, trains: Any, views: Any) -> Any:
+        seen, shown = seen_by_block(renderer, coarse, trains, views)
+        return (seen, shown & False) if without == "its surroundings" else (views, shown)
+
+    other = copied(planned, tmp_path / "others")[0]
+    with_both = first_loss(planned.jobs[0])
+    monkeypatch.setattr("clsplat.blocks.block.seen_by_block", changed)
+    # Measured: 0.13 with both, 0.21 and more without one of them.
+    assert first_loss(other) > 1.2 * with_both
+
+
+def test_other_photos(planned: Planned, device: Device, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"expected the photos of a block, missing .*\.png and \d more"):
+        train_block(planned.jobs[0], planned.scene.train[:1], device)
+    data = tmp_path / "data"
+    shutil.copytree(planned.data, data)
+    for name in read_job(planned.jobs[0]).photos:
+        Image.fromarray(np.zeros((32, 40, 3), np.uint8)).save(data / name)
+    content = json.loads(planned.jobs[0].read_text()) | {"data": str(data)}  # the place may change, the pixels not
+    planned.jobs[0].write_text(json.dumps(content))
+    with pytest.raises(InputError, match="expected the photos that the block was planned with, found other pixels"):
+        train_block(planned.jobs[0], None, device)
+
+
+DAMAGE = {
+    "changed": (lambda c: c | {"wide": c["box"]}, "expected a job as it was written, found a changed one"),
+    "format": (lambda c: c | {"format": 9}, "expected a job of format 1, found 9"),
+    "no photos": (lambda c: {k: v for k, v in c.items() if k != "photos"}, "found KeyError"),
+    "setting": (lambda c: c | {"config": {"nonsense": 1}}, "found no such setting"),
+    "list": (lambda c: [c], "found TypeError"),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_job_is_one_sentence(planned: Planned, case: str) -> None:
+    change, message = DAMAGE[case]
+    planned.jobs[0].write_text(json.dumps(change(json.loads(planned.jobs[0].read_text()))))
+    with pytest.raises(InputError, match=message) as error:
+        train_block(planned.jobs[0])
+    assert str(planned.jobs[0]) in str(error.value)
+
+
+def test_another_coarse_scene(planned: Planned, device: Device) -> None:
+    coarse = planned.jobs[0].with_name(read_job(planned.jobs[0]).scene)
+    first, second = (bytearray(coarse.read_bytes()) for _ in range(2))
+    second[-1] ^= 1
+    coarse.write_bytes(second)
+    with pytest.raises(InputError, match="expected a scene as it was written, found a changed file"):
+        train_block(planned.jobs[0], planned.scene.train, device)
+    assert first != second
+
+
+def test_one_block_that_fits_needs_no_coarse_run(planned: Planned, device: Device, tmp_path: Path) -> None:
+    told: list[str] = []
+    config = replace(planned.config, blocks="auto")
+    assert plan_blocks(planned.scene, config, device, planned.data, tmp_path / "new", unseen, told.append) == ([], [])
+    assert told == ["blocks: one is enough for 240 Gaussians"] and not (tmp_path / "new").exists()
+
+
+def test_a_second_training_is_surrounded_by_the_first_ones(planned: Planned, device: Device) -> None:
+    for job in planned.jobs:
+        train_block(job, planned.scene.train, device)
+    second = plan_refinement(planned.jobs, planned.blocks)
+    assert second == plan_refinement(planned.jobs, planned.blocks) and not set(second) & set(planned.jobs)
+    first = merge(planned.jobs)
+    job = read_job(second[0])
+    np.testing.assert_array_equal(read_scene(second[0].with_name(job.scene), job.config).means, first.means)
+    assert job.near == EVERYWHERE, "all fits"
+    counts = [len(load_gaussians(train_block(path, planned.scene.train, device))[0]) for path in second]
+    assert abs(sum(counts) - len(first)) <= 0.05 * len(first), "none are added; some move across the border"
+
+    # Where memory is small, what is farther away is coarse.
+    near = planned.blocks[0].wide
+    path = plan_refinement(planned.jobs, [block._replace(near=near) for block in planned.blocks])[0]
+    far = read_scene(path.with_name(job.far), job.config)
+    start = _start(path, read_job(path))
+    inside = near.contains(first.means)
+    np.testing.assert_array_equal(
+        start.means, np.concatenate([first.means[inside], far.means[~near.contains(far.means)]])
+    )
+    assert 0 < inside.sum() < len(first)

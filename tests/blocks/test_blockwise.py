@@ -1,0 +1,75 @@
+"""Training in blocks from the command line: a run like any other, resumed, printed as jobs, and refused."""
+
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+from cli_runs import fails, run
+
+from clsplat.formats import load_gaussians
+
+TRAIN = (
+    *("--iterations", 40, "--size", "fixed", "--max-gaussians", 240, "--init.no-triangulate", "--few.below", 3),
+    *("--init.random-points", 80, "--checkpoint-every", 20),
+)
+
+
+def test_a_run_is_like_any_other_and_printed_jobs_make_the_same(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "here"
+    run("train", dataset, "-o", out, *TRAIN, "--blocks", 2)
+    said = capsys.readouterr().err
+    assert "blocks: 2, each with " in said and "held-out photos: PSNR" in said
+    names = {path.name for path in out.iterdir()}
+    assert names == {"blocks", "config.json", "eval", "log.jsonl", "scene.ply", "training_curve.png"}
+    last = json.loads((out / "log.jsonl").read_text().splitlines()[-1])
+    assert last["num_gaussians"] == len(load_gaussians(out / "scene.ply")[0]) and last["psnr"] > 10
+    run("info", out)
+    assert "Gaussians" in capsys.readouterr().out
+
+    printed = tmp_path / "printed"
+    arguments = ["train", dataset, "-o", printed, *TRAIN, "--blocks", 2, "--print-jobs"]
+    for resume in ([], ["--resume"]):
+        run(*arguments, *resume)
+        jobs = capsys.readouterr().out.splitlines()
+        assert len(jobs) == 2 and not (printed / "scene.ply").exists()
+        for job in jobs:
+            program, *words = shlex.split(job)
+            assert program == "clsplat"
+            run(*words)
+        capsys.readouterr()
+    run(*arguments, "--resume")
+    assert (printed / "scene.ply").read_bytes() == (out / "scene.ply").read_bytes()
+
+    before = (out / "scene.ply").read_bytes()
+    capsys.readouterr()
+    run("train", dataset, "-o", out, *TRAIN, "--blocks", 2, "--resume")
+    assert "block 1" not in capsys.readouterr().err and (out / "scene.ply").read_bytes() == before
+    text = fails(capsys, "train", dataset, "-o", out, *TRAIN, "--blocks", 2, "--resume", "--seed", 1)
+    assert "expected the configuration that the run began with" in text
+    assert "holds a run already" in fails(capsys, "train", dataset, "-o", out, *TRAIN, "--blocks", 2)
+
+
+def test_one_block_is_todays_training(dataset: Path, tmp_path: Path) -> None:
+    for name, blocks in (("plain", ()), ("one", ("--blocks", 1)), ("auto", ("--blocks", "auto"))):
+        run("train", dataset, "-o", tmp_path / name, *TRAIN, *blocks)
+    scenes = [(tmp_path / name / "scene.ply").read_bytes() for name in ("plain", "one", "auto")]
+    assert scenes[0] == scenes[1] == scenes[2]
+    assert not (tmp_path / "auto" / "blocks").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--blocks", 2, "--poses"), "--poses: expected not with --blocks"),
+        (("--blocks", 99), "--blocks: expected at most 3, as the coarse scene has 60 Gaussians, found 99"),
+        (("--blocks", 0), "--blocks"),
+        (("--print-jobs",), "expected with --blocks, found --blocks 1"),
+    ],
+)
+def test_what_cannot_train_in_blocks(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: tuple[object, ...], message: str
+) -> None:
+    assert message in fails(capsys, "train", dataset, "-o", tmp_path / "out", *TRAIN, *flags)

@@ -1,0 +1,46 @@
+"""The cut of a scene: every point is in one box, boxes hold alike many, margins surround the shared faces only."""
+
+import numpy as np
+import pytest
+
+from clsplat.blocks.partition import MARGIN, Box, cut
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_each_point_is_in_one_box_and_boxes_are_alike(count: int) -> None:
+    points = np.random.default_rng(0).normal(size=(1000, 3)) * [5, 1, 2]
+    inside = np.array([box.contains(points) for box in cut(points, count)])
+    assert inside.shape[0] == count
+    assert (inside.sum(axis=0) == 1).all()
+    # A cut at a quantile of up to 1000 points is off by up to one, at each of up to three levels.
+    assert np.abs(inside.sum(axis=1) - 1000 / count).max() <= 3
+    far = np.array([[1e9, -1e9, 1e9]])
+    assert sum(int(box.contains(far)[0]) for box in cut(points, count)) == 1
+
+
+def test_the_longest_axis_is_cut_and_single_points_do_not_count() -> None:
+    points = np.random.default_rng(0).uniform(size=(1000, 3)) * [1, 3, 1]
+    points[0] = [1e6, 0, 0]
+    left, right = cut(points, 2)
+    assert left.high == (np.inf, right.low[1], np.inf)
+    assert 1.4 < left.high[1] < 1.6
+
+
+def test_a_margin_surrounds_shared_faces() -> None:
+    points = np.random.default_rng(0).uniform(size=(10_000, 3))
+    points[:, 0] *= 2
+    left, right = cut(points, 2)
+    wide = left.widened(points, MARGIN)
+    assert wide.low == (-np.inf,) * 3 and wide.high[1:] == (np.inf,) * 2
+    # Nine tenths of the side of 1 lie between the quantiles.
+    np.testing.assert_allclose(wide.high[0] - left.high[0], MARGIN * 0.9, rtol=0.02)
+    both = wide.contains(points) & right.widened(points, MARGIN).contains(points)
+    assert 0.08 < both.mean() < 0.1
+
+
+def test_fewer_points_than_boxes() -> None:
+    boxes = cut(np.zeros((1, 3)), 4)
+    assert len(boxes) == 4
+    assert sum(int(box.contains(np.zeros((1, 3)))[0]) for box in boxes) == 1
+    assert sum(int(box.contains(np.ones((1, 3)))[0]) for box in cut(np.zeros((0, 3)), 3)) == 1
+    assert Box((0, 0, 0), (1, 1, 1)).widened(np.zeros((0, 3)), 0.5) == Box((0, 0, 0), (1, 1, 1))

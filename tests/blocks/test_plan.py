@@ -1,0 +1,87 @@
+"""The plan: the fewest blocks that fit, configurations of coarse run and blocks, and what cannot be planned."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_plan import CONFIG
+from small_run import known_scene
+
+from clsplat.blocks.partition import EVERYWHERE
+from clsplat.blocks.plan import REFINING_LENGTH, Block, block_config, check_blocks, coarse_config, make_plan, one_fits
+from clsplat.config import TrainConfig
+from clsplat.device import Device
+from clsplat.errors import InputError
+from clsplat.renderer import Renderer
+from clsplat.testing import synthetic_scene
+from clsplat.training.memory import Footprint
+
+SIZE = 40_000
+
+
+def limited(least: int, scene, config) -> Device:
+    """A device that fits this number of Gaussians and the backdrop of a scene of 2000."""
+    need = replace(Footprint.of(scene, config, Device()), backdrop=2000)
+    return Device(memory_limit=need.total(least))
+
+
+def test_auto_takes_the_fewest_blocks_that_fit() -> None:
+    scene = known_scene()
+    config = replace(CONFIG, blocks="auto", max_gaussians=SIZE)
+    coarse = synthetic_scene(2000, seed=1)[0]
+    device = limited(SIZE // 3, scene, config)
+    assert not one_fits(scene, config, device)
+    plan = make_plan(coarse, scene, config, Renderer(device))
+    count = len(plan.blocks)
+    assert plan.memory <= device.memory_limit and plan.total == SIZE
+    fewer = make_plan(coarse, scene, replace(config, blocks=count - 1), Renderer(device))
+    assert fewer.memory > device.memory_limit
+    assert 3 <= count <= 12
+    assert sum(int(block.box.contains(coarse.means).sum()) for block in plan.blocks) == len(coarse)
+    text = plan.describe(config, scene, 1.0)
+    steps = count * 40 + round(count * 40 * REFINING_LENGTH)
+    assert text.startswith(f"blocks: {count}, each with 8 to ") and " of 12 photos" in text
+    assert f"about {SIZE} Gaussians in all, {steps} iterations, {round(steps / 60)} minutes" in text
+
+
+def test_nothing_fits() -> None:
+    scene = known_scene()
+    config = replace(CONFIG, blocks="auto", max_gaussians=SIZE)
+    with pytest.raises(InputError, match=r"^--memory-limit: expected one that a block fits, found 3\.0 MB, where"):
+        make_plan(synthetic_scene(200)[0], scene, config, Renderer(Device(memory_limit=3_000_000)))
+
+
+def test_too_many_blocks() -> None:
+    scene = known_scene()
+    with pytest.raises(
+        InputError, match=r"^--blocks: expected at most 2, as the coarse scene has 40 Gaussians, found 3"
+    ):
+        make_plan(synthetic_scene(40)[0], scene, replace(CONFIG, blocks=3), Renderer())
+
+
+@pytest.mark.parametrize("name", ["poses", "exposure"])
+def test_what_photos_learn_is_not_trained_in_blocks(name: str) -> None:
+    with pytest.raises(InputError, match=f"^--{name}: expected not with --blocks"):
+        check_blocks(replace(TrainConfig(), **{name: True}))
+
+
+def test_one_block_is_known_before_the_coarse_run(device: Device) -> None:
+    scene = known_scene()
+    assert one_fits(scene, replace(CONFIG, blocks="auto"), device)
+    assert not one_fits(scene, replace(CONFIG, blocks=2), device)
+    assert not one_fits(scene, replace(CONFIG, blocks="auto", max_gaussians=None), device)
+    assert one_fits(scene, CONFIG, device)
+
+
+def test_configurations(device: Device) -> None:
+    scene = known_scene()
+    config = replace(CONFIG, iterations=9000, max_gaussians=1000)
+    coarse = coarse_config(config, scene, device)
+    assert (coarse.iterations, coarse.max_gaussians, coarse.coarse.factor) == (3000, 250, 2)
+    block = Block(EVERYWHERE, EVERYWHERE, EVERYWHERE, np.arange(3), 300, 0)
+    settings = block_config(config, scene, block)
+    # Three photos alone would train for 3000 iterations; a quarter of all photos' visits are 2250.
+    assert (settings.iterations, settings.max_gaussians, settings.optim.sh_degree_every) == (3000, 300, 1)
+    assert block_config(replace(config, iterations=24_000), scene, block).iterations == 6000
+    assert block_config(replace(config, iterations=70), scene, block).iterations == 70
+    assert block_config(replace(config, max_gaussians=None), scene, block).max_gaussians is None

@@ -1,0 +1,77 @@
+"""`clsplat train --method` and `clsplat bench quality --methods` with radiance fields, on a tiny dataset."""
+
+import json
+
+import numpy as np
+import pytest
+from cli_runs import fails, read_image, run
+from small_fields import SmallIngp
+
+from clsplat.bench.measures import sample_iterations
+from clsplat.bench.results import read_records
+from clsplat.config import DataConfig
+from clsplat.dataset import load_scene
+from clsplat.fields import METHODS
+from clsplat.fields.field_files import load_field
+from clsplat.metrics import to_uint8
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setitem(METHODS, SmallIngp.name, SmallIngp)
+    monkeypatch.setattr("clsplat.fields.space.STEP", 3**0.5 / 64)
+
+
+def train(dataset, out, *flags):
+    run("train", dataset, "-o", out, "--method", "ingp-base", "--iterations", 4, *flags)
+
+
+def test_train_leaves_a_field_and_its_evaluation(dataset, tmp_path, device):
+    train(dataset, tmp_path, "--eval-every", 2)
+    field = load_field(tmp_path / "field.npz", METHODS, device)
+    assert field.iteration == 4 and field.space.contracted
+    metrics = json.loads((tmp_path / "eval" / "metrics.json").read_text())
+    assert metrics["method"] == "ingp-base" and len(metrics["views"]) == 2
+    assert metrics["model_bytes"] == (tmp_path / "field.npz").stat().st_size
+    assert "ingp-base" in (tmp_path / "eval" / "index.html").read_text()
+    picture = read_image(tmp_path / "eval" / metrics["views"][0]["render"])
+    camera = load_scene(dataset, DataConfig()).test[0].camera
+    np.testing.assert_array_equal(picture, to_uint8(field.image(camera, (0.0, 0.0, 0.0))))
+    log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [(r["iteration"], "psnr" in r) for r in log] == [(2, True), (4, False)]
+
+
+def test_a_run_is_not_overwritten_but_resumes(dataset, tmp_path, capsys):
+    train(dataset, tmp_path)
+    before = (tmp_path / "field.npz").read_bytes()
+    assert "holds a run already" in fails(capsys, "train", dataset, "-o", tmp_path, "--method", "ingp-base")
+    train(dataset, tmp_path, "--resume")
+    assert (tmp_path / "field.npz").read_bytes() == before
+
+
+def test_settings_of_gaussians_are_refused(dataset, tmp_path, capsys):
+    def message(*flags, out=tmp_path / "run"):
+        return fails(capsys, "train", dataset, "-o", out, "--method", "ingp-base", *flags)
+
+    assert "found strategy, optim" in message("--strategy", "mcmc", "--optim.ssim-weight", "0.1")
+    assert "expected a folder after -o and no viewer" in message(out=tmp_path / "run.spz")
+    assert "expected a folder after -o and no viewer" in message("--viewer")
+    assert "expected one of gaussians, plenoxels, ingp-base" in fails(
+        capsys, "train", dataset, "-o", tmp_path, "--method", "nerd"
+    )
+
+
+def test_bench_draws_fields_beside_gaussians(dataset, tmp_path):
+    """All samples of both, the fields' without a number of Gaussians; finished ones do not run again."""
+    (tmp_path / "plain.json").write_text(json.dumps({"init": {"random_points": 50, "sh_degree": 1}}))
+    flags = ["--methods", "ingp-base", tmp_path / "plain.json", "--iterations", 9, "-o", tmp_path / "out"]
+    run("bench", "quality", dataset, *flags)
+    records = read_records(tmp_path / "out" / "results.jsonl")
+    fields = [r for r in records if r["method"] == "ingp-base"]
+    assert [r["iteration"] for r in fields] == sample_iterations(9)
+    last = fields[-1]
+    assert last["num_gaussians"] is None and last["fps"] > 0 and last["memory_bytes"] > last["spz_bytes"] > 10**5
+    assert {r["method"] for r in records if "fps" in r} == {"ingp-base", "plain"}
+    assert "ingp-base" in (tmp_path / "out" / "index.html").read_text()
+    run("bench", "quality", dataset, *flags)
+    assert read_records(tmp_path / "out" / "results.jsonl") == records

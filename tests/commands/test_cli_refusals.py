@@ -1,0 +1,165 @@
+"""What the command line refuses, in one sentence, and what it leaves behind."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runs import TRAIN, fails, run, write_dataset
+
+from clsplat.formats import load_gaussians, save_gaussians
+
+
+def test_a_run_is_not_overwritten(trained: Path, dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = fails(capsys, "train", dataset, "-o", trained, *TRAIN)
+    assert "holds a run already" in message
+    assert "--resume" in message
+
+
+def test_train_says_what_memory_it_takes_and_when_it_has_begun(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("train", dataset, "-o", tmp_path / "out", *TRAIN, "--iterations", 2, "--memory-limit", "20MB")
+    said = capsys.readouterr().err
+    assert re.search(r"^memory: \d\.\d MB for 200 Gaussians, .* limit 20\.0 MB, enough for \d{4,5}$", said, re.M)
+    assert len(re.findall(r"^\r?.*first iteration: done \d+\.\d s after the start", said, re.M)) == 1
+
+
+def test_memory_limits_that_cannot_be_kept(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ("train", dataset, "-o", tmp_path / "out", *TRAIN, "--memory-limit")
+    assert "expected a size such as 4GB" in fails(capsys, *command, "12")
+    message = fails(capsys, *command, "0.3MB")
+    assert re.search(r"expected at least \d\.\d MB for 200 Gaussians at 40x32, .* size: \d+ Gaussians", message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_folders(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert "missing" in fails(capsys, "train", tmp_path / "missing", "-o", out)
+    (tmp_path / "empty").mkdir()
+    assert "empty" in fails(capsys, "train", tmp_path / "empty", "-o", out)
+    assert not out.exists()
+    (tmp_path / "file").write_text("not a folder")
+    assert "cannot create" in fails(capsys, "train", dataset, "-o", tmp_path / "file" / "below", *TRAIN)
+
+
+def test_bad_photos_and_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_dataset(tmp_path / "data", 3)
+    (tmp_path / "data" / "1.png").write_bytes((tmp_path / "data" / "1.png").read_bytes()[:100])
+    assert "1.png" in fails(capsys, "train", tmp_path / "data", "-o", tmp_path / "out", *TRAIN)
+    write_dataset(tmp_path / "data", 3)
+    path = tmp_path / "data" / "transforms.json"
+    transforms = json.loads(path.read_text())
+    transforms["frames"][2]["transform_matrix"][0][3] = float("nan")
+    path.write_text(json.dumps(transforms))
+    assert "2.png" in fails(capsys, "train", tmp_path / "data", "-o", tmp_path / "out", *TRAIN)
+    path.write_text("{")
+    assert "transforms.json" in fails(capsys, "train", tmp_path / "data", "-o", tmp_path / "out", *TRAIN)
+
+
+def test_bad_scenes(trained: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = (trained / "scene.ply").read_bytes()
+    bad = tmp_path / "bad.ply"
+    bad.write_bytes(whole.replace(b"property float opacity\n", b"property float opaqueness\n"))
+    assert "opacity" in fails(capsys, "eval", bad, dataset, "-o", tmp_path / "out")
+    bad.write_bytes(whole[:-100])
+    assert "bad.ply" in fails(capsys, "export", bad, "-o", tmp_path / "out.ply")
+    assert "suffix" in fails(capsys, "export", trained / "scene.ply", "-o", tmp_path / "out.obj")
+    assert not (tmp_path / "out.ply").exists()
+
+
+def test_a_folder_is_no_scene(
+    trained: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = "expected a file of Gaussians, such as scene.ply, found a folder"
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    shutil.copyfile(trained / "scene.ply", alone / "scene.ply")
+    message = fails(capsys, "eval", alone, dataset, "-o", tmp_path / "eval")
+    assert message == f"clsplat: {alone}: {expected}; the scene in it is {alone / 'scene.ply'}"
+    original = tmp_path / "run" / "point_cloud" / "iteration_7000"
+    original.mkdir(parents=True)
+    shutil.copyfile(trained / "scene.ply", original / "point_cloud.ply")
+    message = fails(capsys, "eval", tmp_path / "run", dataset, "-o", tmp_path / "eval")
+    assert message.endswith(f"the scene in it is {original / 'point_cloud.ply'}")
+    assert fails(capsys, "eval", dataset, dataset, "-o", tmp_path / "eval").endswith(expected)
+
+
+def test_unknown_device_lists_the_known(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = fails(capsys, "train", dataset, "-o", tmp_path / "out", "--device", "no such device")
+    assert "no such device" in message
+    assert "expected part of one of these names" in message
+
+
+def test_without_a_driver_it_says_how_to_get_one(tmp_path: Path) -> None:
+    # In a process of its own, since the loader reads the list of drivers once.
+    script = (
+        "import sys, pyopencl\npyopencl.get_platforms = lambda: []\nfrom clsplat.cli import main\nmain(['devices'])"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    assert result.returncode == 2
+    assert "pip install 'clsplat[pocl]'" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_buffer_beyond_the_device_is_named(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from clsplat.device import Device
+
+    check = Device._check_size
+    monkeypatch.setattr(
+        Device,
+        "_check_size",
+        lambda self, what, nbytes: check(self, what, nbytes << (50 if what == "gradients per intersection" else 0)),
+    )
+    message = fails(capsys, "train", dataset, "-o", tmp_path / "out", *TRAIN)
+    assert "gradients per intersection: needs a buffer of" in message
+    assert "MiB" in message
+
+
+def test_a_full_disk_leaves_nothing_half_written(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "copy.ply"
+    gaussians, mode, offset = load_gaussians(trained / "scene.ply")
+    save_gaussians(target, gaussians.take(np.arange(5)), mode, offset)
+    before = target.read_bytes()
+    original = Path.open
+
+    class Full:
+        """A file on a disk with room for 100 bytes."""
+
+        def __init__(self, file: object):
+            self.file, self.room = file, 100
+
+        def write(self, data: bytes) -> int:
+            self.room -= len(data)
+            if self.room < 0:
+                raise OSError(28, "No space left on device")
+            return self.file.write(data)  # type: ignore[attr-defined]
+
+        def __enter__(self) -> "Full":
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            self.file.close()  # type: ignore[attr-defined]
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.file, name)
+
+    monkeypatch.setattr(
+        Path,
+        "open",
+        lambda self, mode="r", **kw: Full(original(self, mode, **kw)) if "w" in mode else original(self, mode, **kw),
+    )
+    message = fails(capsys, "export", trained / "scene.ply", "-o", target)
+    assert "No space left" in message
+    assert "copy.ply" in message
+    monkeypatch.undo()
+    assert target.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["copy.ply"]

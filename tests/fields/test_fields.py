@@ -1,0 +1,161 @@
+"""Radiance fields: a ball is learned, runs repeat and resume to the bit, and files hold what renders."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ball_photos import ball
+from small_fields import SmallIngp, SmallPlenoxels
+
+from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
+from clsplat.errors import InputError
+from clsplat.fields import METHODS
+from clsplat.fields.field_files import MODEL, load_checkpoint, load_field
+from clsplat.fields.field_training import CHECKPOINT, train_field
+from clsplat.fields.occupancy import FULL_UPDATES, SHARE, THRESHOLD, Occupancy
+from clsplat.fields.pixels import Pixels
+from clsplat.fields.space import FAR, Space
+from clsplat.metrics import psnr, to_uint8
+from clsplat.randomness import stream
+
+WHITE = BACKGROUNDS["white"]
+CONFIG = TrainConfig(iterations=250, data=DataConfig(background="white"))
+
+
+SMALL = [SmallIngp, SmallPlenoxels]
+EACH = pytest.mark.parametrize("method", SMALL, ids=lambda m: m.name)
+
+
+@pytest.fixture(autouse=True)
+def long_steps(monkeypatch):
+    """An eighth of the samples on a ray: the photos are small, too."""
+    monkeypatch.setattr("clsplat.fields.space.STEP", 3**0.5 / 128)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return ball()
+
+
+def quality(field, views):
+    return float(np.mean([psnr(to_uint8(field.image(v.camera, WHITE)), v.image) for v in views]))
+
+
+@EACH
+def test_a_ball_is_learned(device, scene, method, tmp_path):
+    """Held-out photos: far better than the background alone, which has 8 dB."""
+    field = train_field(scene, method, CONFIG, tmp_path, device)
+    assert quality(field, scene.test) > 20
+    losses = [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert losses[-1] < 0.1 * losses[0]
+
+
+@EACH
+def test_runs_repeat_and_resume_to_the_bit(device, scene, method, tmp_path):
+    config = replace(CONFIG, iterations=40)
+    folders = [tmp_path / name for name in ("whole", "again", "interrupted")]
+    for folder in folders:
+        folder.mkdir()
+    whole, again = (train_field(scene, method, config, folder, device) for folder in folders[:2])
+
+    def interrupt(record):
+        if record["iteration"] == 23:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_field(scene, method, config, folders[2], device, progress=interrupt)
+    resumed = train_field(scene, method, config, folders[2], device, resume=True)
+    for other in (again, resumed):
+        for name, array in whole.model().items():
+            np.testing.assert_array_equal(other.model()[name], array)
+    logs = [(folder / "log.jsonl").read_text().splitlines() for folder in folders[1:]]
+    assert [json.loads(line)["iteration"] for line in logs[1]] == [10, 20, 30, 40] == [
+        json.loads(line)["iteration"] for line in logs[0]
+    ]  # fmt: skip
+
+
+@EACH
+def test_the_file_renders_what_was_trained(device, scene, method, tmp_path):
+    field = train_field(scene, method, replace(CONFIG, iterations=20), tmp_path, device)
+    loaded = load_field(tmp_path / MODEL, {method.name: method}, device)
+    camera = scene.test[0].camera
+    np.testing.assert_array_equal(loaded.image(camera, WHITE), field.image(camera, WHITE))
+
+
+@EACH
+def test_another_configuration_does_not_resume(device, scene, method, tmp_path):
+    config = replace(CONFIG, iterations=2)
+    train_field(scene, method, config, tmp_path, device)
+    with pytest.raises(InputError, match="expected the configuration it was made with"):
+        load_checkpoint(tmp_path / CHECKPOINT, method, replace(config, seed=1), device)
+
+
+def test_rays_without_samples_see_the_background(device, scene, monkeypatch):
+    """Plenoxels with one transparent cell in a corner, rendered row by row: most rows have no sample."""
+    monkeypatch.setattr("clsplat.fields.field.RENDERED_RAYS", 24)
+    field = SmallPlenoxels(Space.of(scene.train), device, 0)
+    occupied = np.zeros((8, 8, 8), np.uint8)
+    occupied[0, 0, 0] = 1
+    field._place(occupied, np.zeros((8, 28)))
+    image = field.image(scene.test[0].camera, WHITE)
+    np.testing.assert_array_equal(image, np.ones_like(image))
+
+
+def test_damaged_files_are_refused(device, tmp_path):
+    path = tmp_path / MODEL
+    with pytest.raises(InputError, match="found no file"):
+        load_field(path, METHODS, device)
+    path.write_bytes(b"PK\x03\x04 no archive")
+    with pytest.raises(InputError, match="damaged"):
+        load_field(path, METHODS, device)
+    np.savez(path, about=json.dumps({"method": "nerd"}))
+    with pytest.raises(InputError, match="expected a field of plenoxels, ingp-base"):
+        load_field(path, METHODS, device)
+
+
+def test_pixels_are_those_of_the_photos(scene):
+    """Colours on the drawn background; rays that lead to the pixels."""
+    space = Space.of(scene.train)
+    pixels = Pixels(scene.train, space, WHITE)
+    batch = pixels.draw(stream(0, "pixels of a batch"), 500)
+    assert batch.background != WHITE
+    # A ray that misses the ball has the background's colour, and no other one.
+    along = -np.einsum("rc,rc->r", batch.directions, batch.origins - 0.5)
+    nearest = np.linalg.norm(batch.origins - 0.5 + along[:, None] * batch.directions, axis=1) * space.scale
+    missed = nearest > 0.7
+    assert 50 < missed.sum() < 450
+    np.testing.assert_allclose(batch.colors[missed], np.tile(batch.background, (missed.sum(), 1)), atol=1e-9)
+
+
+def test_masked_pixels_are_not_drawn(scene):
+    views = [replace(v, mask=np.zeros(v.image.shape[:2], bool)) for v in scene.train]
+    views[3].mask[5, 7] = True
+    batch = Pixels(views, Space.of(views), WHITE).draw(stream(0, "pixels of a batch"), 20)
+    np.testing.assert_array_equal(batch.directions, np.tile(batch.directions[0], (20, 1)))
+
+
+def test_photos_without_transparency_have_a_contracted_space(scene):
+    views = [replace(v, clear=None) for v in scene.train]
+    space = Space.of(views)
+    assert space.contracted and space.marching.contracted and space.marching.far == FAR
+    positions = [(v.camera.position - space.centre) / space.scale for v in views]
+    assert np.linalg.norm(positions, axis=1).max() <= 1 + 1e-9
+    background = Pixels(views, space, WHITE).draw(stream(0, "pixels of a batch"), 5).background
+    assert background == WHITE
+
+
+def test_occupancy_forgets_and_finds():
+    """A cell that is empty when it is visited fades; one that is not is occupied at once."""
+    grid = Occupancy(np.full((8, 8, 8), THRESHOLD, np.float32))
+    assert grid.occupied.all()
+    rng = np.random.default_rng(0)
+    inside = lambda p: np.where(np.abs(p - 0.5).max(axis=1) < 0.25, 1.0, 0.0)  # noqa: E731
+    for number in range(FULL_UPDATES):
+        grid.update(number, rng, inside)
+    expected = np.zeros((8, 8, 8))
+    expected[2:6, 2:6, 2:6] = 1
+    np.testing.assert_array_equal(grid.occupied, expected)
+    for number in range(FULL_UPDATES, FULL_UPDATES + 20 * SHARE):
+        grid.update(number, rng, lambda p: np.where(p[:, 0] < 0.125, 1.0, 0.0))
+    assert grid.occupied[:, :, 0].all() and not grid.occupied[:, :, 1:].any()

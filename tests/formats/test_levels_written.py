@@ -1,0 +1,130 @@
+"""Levels of detail as files: a streamed SOG and 3D Tiles, read back, bounded, and found broken in one sentence."""
+
+import json
+
+import numpy as np
+import pytest
+from bounds import matched, random_gaussians
+from cli_runs import fails, run
+from foreign_code import splat_transform
+
+from clsplat.errors import InputError
+from clsplat.formats import anatomy_of, load_gaussians, save_gaussians
+from clsplat.formats.gltf import load_glb
+from clsplat.formats.sog import load_sog
+from clsplat.formats.streamed_sog import LOD_META, StreamedSogWriter
+from clsplat.formats.tiles_3d import TILESET, Z_UP, TilesWriter
+from clsplat.pruning.levels import detail_tree
+
+OFFSET = np.array([1000.0, -2000.0, 0.5])
+
+
+@pytest.fixture
+def scene():
+    return random_gaussians(700, 2)
+
+
+@pytest.fixture
+def written(scene, tmp_path):
+    writers = [kind(tmp_path, "antialiased", OFFSET) for kind in (StreamedSogWriter, TilesWriter)]
+    for node in detail_tree(scene):
+        for writer in writers:
+            writer.add(node)
+    for writer in writers:
+        writer.finish()
+    return tmp_path
+
+
+@pytest.mark.parametrize(("name", "error"), [(LOD_META, 1e-3), (TILESET, 1e-6)])
+def test_the_finest_level_is_read_back(scene, written, name, error):
+    found, mode, offset = load_gaussians(written / name)
+    assert mode == "antialiased" and (offset == OFFSET).all() and found.sh.shape == scene.sh.shape
+    found = matched(found, scene)
+    assert np.abs(found.means - scene.means).max() <= error * np.abs(scene.means).max()
+    assert sum(anatomy_of(written / name).parts.values()) > 0
+
+
+def test_the_tree_of_a_streamed_sog(scene, written):
+    meta = json.loads((written / LOD_META).read_text())
+    assert meta["version"] == 1 and meta["lodLevels"] == 4 and meta["counts"][0] == len(scene)
+    assert meta["count"] == sum(meta["counts"])
+    leaves, waiting = [], [meta["tree"]]
+    while waiting:
+        node = waiting.pop()
+        waiting += node.get("children", [])
+        if "lods" in node:
+            leaves.append(node)
+    assert len(leaves) == 8
+    for leaf in leaves:
+        assert sorted(leaf["lods"]) == ["0", "1", "2", "3"]
+        for lod in leaf["lods"].values():
+            gaussians = load_sog(written / meta["filenames"][lod["file"]])[0]
+            means = gaussians.means[lod["offset"] : lod["offset"] + lod["count"]]
+            assert len(means) == lod["count"] > 0
+            low, high = (np.array(leaf["bound"][side]) for side in ("min", "max"))
+            slack = 1e-3 * np.abs(scene.means).max()  # of the quantisation
+            assert (means >= low - slack).all() and (means <= high + slack).all()
+
+
+def test_the_tree_of_tiles(written):
+    tileset = json.loads((written / TILESET).read_text())
+    seen = []
+
+    def visit(tile, parent):
+        numbers = np.array(tile["boundingVolume"]["box"])
+        centre, half = numbers[:3], numbers[3:].reshape(3, 3)
+        gaussians = load_glb(written / tile["content"]["uri"])[0]
+        seen.append(len(gaussians))
+        inside = np.abs((gaussians.means @ Z_UP.T - centre) @ np.linalg.inv(half).T)
+        assert inside.max() <= 1 + 1e-5  # single precision
+        assert tile["refine"] == "REPLACE" and tile["geometricError"] <= parent
+        children = tile.get("children", [])
+        assert len(children) in (0, 2) and (tile["geometricError"] == 0) == (not children)
+        for child in children:
+            visit(child, tile["geometricError"])
+
+    visit(tileset["root"], tileset["geometricError"])
+    assert len(seen) == 15
+    content = tileset["extensions"]["3DTILES_content_gltf"]
+    assert content["extensionsRequired"] == ["KHR_gaussian_splatting"] and tileset["asset"]["version"] == "1.1"
+
+
+BROKEN = {
+    "no root": ({"root": None}, "its tileset.json is damaged"),
+    "empty": ({"root": {}}, "expected tiles with contents"),
+    "above": ({"root": {"content": {"uri": "../a.glb"}}}, "expected contents beside tileset.json"),
+    "number": ({"root": {"content": {"uri": 3}}}, "damaged"),
+    "moved": ({"root": {"transform": [1]}}, "found a tile with a transform"),
+    "missing": ({"root": {"content": {"uri": "none.glb"}}}, "No such file"),
+    "deep": ({"root": {"children": 7}}, "damaged"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_tileset_is_one_sentence(written, case):
+    change, message = BROKEN[case]
+    tileset = json.loads((written / TILESET).read_text())
+    (written / TILESET).write_text(json.dumps(tileset | change))
+    with pytest.raises(InputError, match=message) as caught:
+        load_gaussians(written / TILESET)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_export_writes_levels(scene, tmp_path, capsys):
+    save_gaussians(tmp_path / "a.ply", scene)
+    run("export", tmp_path / "a.ply", tmp_path / "both")
+    assert "4 levels of 700, " in capsys.readouterr().err
+    assert {LOD_META, TILESET} <= {path.name for path in (tmp_path / "both").iterdir()}
+    for name, other in ((LOD_META, "*.glb"), (TILESET, "*.webp")):
+        run("export", tmp_path / "a.ply", tmp_path / name.split(".")[0] / name)
+        folder = tmp_path / name.split(".")[0]
+        assert (folder / name).exists() and not list(folder.rglob(other))
+        assert (folder / name).read_bytes() == (tmp_path / "both" / name).read_bytes()
+    assert "xyz" in fails(capsys, "export", tmp_path / "a.ply", tmp_path / "a.xyz")
+
+
+@pytest.mark.foreign
+def test_splat_transform_reads_what_is_written(written, scene, tmp_path):
+    splat_transform(written / LOD_META, tmp_path / "back.ply")
+    found = load_gaussians(tmp_path / "back.ply")[0]
+    assert len(found) == len(scene)

@@ -1,0 +1,179 @@
+"""The viewer's panel: view, photos, edits, recordings, and curves of a training."""
+
+import contextlib
+import io
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fake_browsers import FakeClient
+from PIL import Image
+from small_scenes import cameras
+
+from clsplat.metrics import psnr, to_uint8
+from clsplat.render import render
+from clsplat.show.browser_cameras import whole_view
+from clsplat.show.pacing import STILL_AFTER
+from clsplat.show.viewer_statistics import POINTS_MAX
+from clsplat.show.viewer_tasks import TASKS_MAX
+
+
+class TestPanel:
+    """What the panel's inputs do, without a browser; clients are records of what they are sent."""
+
+    @pytest.fixture
+    def look(self, viewer):
+        """Set an input of the panel by its label, as a message of a page does; or click a button."""
+
+        def change(label, value=True):
+            handles = viewer._server.gui._gui_input_handle_from_uuid.values()
+            (handle,) = (h for h in handles if h._impl.props.label == label)
+            assert viewer._panel._inputs[handle._impl.uuid](value)
+            handle._impl.value = value
+            event = SimpleNamespace(client=viewer._clients[0].handle, client_id=0, target=handle)
+            for callback in handle._impl.update_cb:
+                callback(event)
+
+        return change
+
+    @pytest.fixture
+    def client(self, viewer):
+        client = FakeClient(viewer, cameras()[1][2])
+        client.files = {}
+        client.state.handle.send_file_download = lambda name, data, **_: client.files.update({name: data})
+        client.state.handle.camera = SimpleNamespace(aspect=4 / 3)
+        client.state.handle.atomic = contextlib.nullcontext
+        return client
+
+    def settled(self, viewer, gaussians):
+        while viewer.draw(gaussians):
+            pass
+
+    def test_background_harmonics_and_field_of_view(self, viewer, look, client, clock):
+        gaussians = cameras()[0]
+        clock.now += STILL_AFTER
+        self.settled(viewer, gaussians)
+        for label, value in (("Background", (0, 255, 0)), ("Harmonics", 0)):
+            before, count = client.frames[-1], len(client.frames)
+            look(label, value)
+            clock.now += STILL_AFTER
+            self.settled(viewer, gaussians)
+            assert len(client.frames) > count and (client.frames[-1] != before).any(), label
+        look("Field of view", 90)
+        assert client.state.handle.camera.fov == pytest.approx(math.pi / 2)
+
+    def test_a_photo_is_chosen_compared_and_left(self, viewer, look, client, clock):
+        gaussians, cams = cameras()
+        viewer._photos._views[2].image[:] = (255, 0, 255)
+        clock.now += STILL_AFTER
+        self.settled(viewer, gaussians)
+        plain = client.frames[-1]
+        look("Photo", "2.png")
+        np.testing.assert_allclose(client.state.handle.camera.position, cams[2].position)
+        assert client.state.handle.camera.fov == pytest.approx(whole_view(cams[2], 4 / 3))
+        assert viewer._photos._thumbnail.image.shape == (240, 320, 3)
+        look("Compare", "overlay")
+        look("Photo's share", 100)
+        self.settled(viewer, gaussians)
+        assert (client.frames[-1] == (255, 0, 255)).all()
+        look("Compare", "beside")
+        look("Photo's share", 25)
+        self.settled(viewer, gaussians)
+        assert (client.frames[-1][:, :79] == (255, 0, 255)).all()
+        np.testing.assert_array_equal(client.frames[-1][:, 82:], plain[:, 82:])
+        client.state.camera = cams[3]  # another view than the photo's
+        clock.now += STILL_AFTER
+        self.settled(viewer, gaussians)
+        assert not (client.frames[-1] == (255, 0, 255)).all(axis=2).any()
+        look("Next")
+        np.testing.assert_allclose(client.state.handle.camera.position, cams[3].position)
+        assert viewer._photos.selected.name == "3.png"
+
+    def test_outlines_fade_with_distance_and_the_one_looked_through_is_hidden(self, viewer, look):
+        cams = cameras()[1]
+        outlines = {i: SimpleNamespace(visible=True, color=(255, 140, 0)) for i in range(5)}
+        viewer._photos.fade(outlines, cams[1])
+        assert [outlines[i].visible for i in range(5)] == [True, False, True, True, True]
+        away = [np.linalg.norm(c.position - cams[1].position) for c in cams]
+        shades = [sum(outlines[i].color) for i in sorted((0, 2, 3, 4), key=lambda i: away[i])]
+        assert shades == sorted(shades, reverse=True) and shades[0] > shades[-1] > 0
+
+    def test_edits_are_shown_undone_and_saved(self, viewer, look, client, clock):
+        gaussians, cams = cameras()
+        saved = []
+        viewer.edit(gaussians, lambda rest: saved.append(len(rest)) or f"saved {len(rest)}")
+        held = {"left": 3}
+
+        def hold():
+            held["left"] = 3
+            viewer.hold(gaussians, lambda: (held.update(left=held["left"] - 1), held["left"] < 0)[1])
+
+        hold()
+        whole = client.frames[-1]
+        viewer._editing.select(cams[2], (0.0, 0.0), (1.0, 1.0))
+        hold()
+        assert "300 of 300 Gaussians, 289 selected" in viewer._editing._text.content
+        assert client.frames[-1].mean() != whole.mean(), "what is selected is orange"
+        viewer._editing.select(cams[2], (-9.0, -9.0), (9.0, 9.0))
+        look("Delete selected")
+        hold()
+        assert client.notes == ["expected at least one Gaussian to remain, found none"]
+        look("Select none")
+        viewer._editing.select(cams[2], (0.0, 0.0), (0.5, 1.0))
+        look("Delete selected")
+        look("Save")
+        hold()
+        assert 0 < saved[0] < 300 and f"saved {saved[0]}" in viewer._editing._text.content
+        look("Undo")
+        look("Select none")
+        look("Half size", (0.5, 0.5, 0.5))
+        look("Crop", "sphere")
+        look("Save")
+        look("Delete outside")
+        look("Save")
+        hold()
+        assert saved[1] == saved[2] < 300
+        look("Crop", "off")
+        look("Undo")
+        look("Save")
+        hold()
+        assert saved[-1] == 300
+
+    def test_screenshot_and_videos(self, viewer, look, client, device):
+        gaussians, cams = cameras()
+        look("Screenshot")
+        self.settled(viewer, gaussians)
+        with Image.open(io.BytesIO(client.files["clsplat.png"])) as image:
+            expected = to_uint8(render(gaussians, cams[2], device=device).rgb)
+            np.testing.assert_array_equal(np.asarray(image), expected)
+        av = pytest.importorskip("av", reason="PyAV, the extra `video`, is missing")
+        look("Seconds", 1)
+        for views in (0, 2):
+            for camera in cams[:views]:
+                client.state.camera = camera
+                look("Add view to path")
+            client.files.clear()
+            look("Record video")
+            self.settled(viewer, gaussians)
+            with av.open(io.BytesIO(client.files["clsplat.mp4"])) as container:
+                frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+            assert len(frames) == 30 and frames[0].shape == (240, 320, 3)
+        first, last = (to_uint8(render(gaussians, c, device=device).rgb) for c in cams[:2])
+        assert psnr(frames[0], first) > 25 and psnr(frames[-1], last) > 25
+
+    def test_tasks_do_not_pile_up(self, viewer, look, client):
+        for _ in range(3 * TASKS_MAX):
+            look("Screenshot")
+        assert len(viewer._tasks._waiting) == TASKS_MAX
+
+    def test_curves_of_a_training(self, viewer, clock):
+        for iteration in range(1, 3001):
+            clock.now += 0.5
+            viewer.record(iteration, 100 + iteration, 20.0 + iteration / 100 if iteration % 500 == 0 else None)
+        plots = viewer._statistics._plots
+        assert plots["PSNR, dB"].data[1].tolist() == [25, 30, 35, 40, 45, 50]
+        iterations, counts = plots["Gaussians"].data
+        np.testing.assert_array_equal(counts, iterations + 100)
+        assert 100 < len(iterations) <= POINTS_MAX and iterations[-1] >= 2998
+        np.testing.assert_allclose(plots["it/s"].data[1], 2, rtol=0.02)

@@ -1,0 +1,107 @@
+"""Stage heads: against the twin and central differences, and at the limit of the exponent."""
+
+import numpy as np
+import pytest
+from tolerances import DOUBLE, FLOAT
+
+from clsplat import ops, reference
+from clsplat.field_stages import EXPONENT_MAX
+from clsplat.testing import assert_matches, gradcheck
+
+
+def inputs(samples=301, rays=17):
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(rays, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    arrays = rng.normal(size=(samples, 16)), directions, rng.normal(size=(samples, 16)), rng.normal(size=samples)
+    arrays += rng.normal(size=(samples, 3)), rng.normal(size=(samples, 32))
+    exact = [a.astype(np.float32).astype(np.float64) for a in arrays]
+    exact[0][:2, 0] = [20, -20]
+    return *exact, rng.integers(0, rays, samples).astype(np.uint32)
+
+
+def run(stages, features, directions, outputs, v_sigmas, v_colors, v_inputs, rays_of):
+    joined = stages("heads_join", features, directions, rays_of)
+    sigmas, colors = stages("heads_fwd", features, outputs)
+    v_outputs = stages("heads_bwd", colors, v_colors)
+    v_features = stages("heads_join_bwd", v_inputs, features, sigmas, v_sigmas)
+    return joined, sigmas, colors, v_outputs, v_features
+
+
+def by_kernel(device, *given):
+    arrays = [device.upload("array", a, None if a.dtype == np.float64 else a.dtype) for a in given]
+    results = run(lambda name, *a: getattr(ops, name)(device, *a), *arrays)
+    return [a.get() for a in results]
+
+
+def by_twin(*given):
+    return run(lambda name, *a: getattr(reference, name)(*a), *given)
+
+
+@pytest.mark.parametrize("samples", [1, 301])
+def test_matches_twin(any_device, samples):
+    given = inputs(samples) if samples > 1 else [a[:1] if len(a) == 301 else a for a in inputs()]
+    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    names = ("joined", "sigmas", "sample colours", "v_outputs", "v_features")
+    for name, found, expected in zip(names, by_kernel(any_device, *given), by_twin(*given), strict=True):
+        assert_matches(name, found, expected, tolerances)
+
+
+def test_the_density_is_limited(device64):
+    _, sigmas, _, _, v_features = by_kernel(device64, *inputs())
+    np.testing.assert_allclose(sigmas[:2], np.exp([EXPONENT_MAX, -EXPONENT_MAX]))
+    np.testing.assert_array_equal(v_features[:2, 0], inputs()[5][:2, 16])  # nothing from the density
+
+
+def test_gradients_by_central_differences(device64):
+    features, directions, outputs, v_sigmas, v_colors, v_inputs, rays_of = inputs(60)
+    features[:2] = 0.5
+    given = features, directions, outputs, v_sigmas, v_colors, v_inputs, rays_of
+    *_, v_outputs, v_features = by_kernel(device64, *given)
+
+    def total(features, outputs):
+        joined, sigmas, colors, *_ = by_kernel(device64, features, directions, outputs, *given[3:])
+        return float((joined * v_inputs).sum() + sigmas @ v_sigmas + (colors * v_colors).sum())
+
+    gradcheck(total, {"features": features, "outputs": outputs}, {"features": v_features, "outputs": v_outputs})
+
+
+SCALE = 7.0
+
+
+def harmonics(samples=301):
+    """Features of Plenoxels, with densities and colours on both sides of 0, and what `inputs` has besides."""
+    _, directions, _, v_sigmas, v_colors, _, rays_of = inputs(samples)
+    features = np.random.default_rng(1).normal(size=(samples, 28)).astype(np.float32).astype(np.float64)
+    return features, directions, rays_of, v_sigmas, v_colors
+
+
+def sh_by_kernel(device, features, directions, rays_of, v_sigmas, v_colors):
+    x, d, v_s, v_c = (device.upload("array", a) for a in (features, directions, v_sigmas, v_colors))
+    rays = device.upload("rays", rays_of, np.uint32)
+    results = [*ops.heads_sh_fwd(device, x, d, rays, SCALE), ops.heads_sh_bwd(device, x, d, rays, SCALE, v_s, v_c)]
+    return [a.get() for a in results]
+
+
+def test_harmonics_match_twin(any_device):
+    features, directions, rays_of, v_sigmas, v_colors = given = harmonics()
+    sigmas, colors = reference.heads_sh_fwd(features, directions, rays_of, SCALE)
+    assert (sigmas == 0).any() and (colors == 0).any() and (colors > 0).any()
+    v_features = reference.heads_sh_bwd(features, directions, rays_of, SCALE, v_sigmas, v_colors)
+    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    found = sh_by_kernel(any_device, *given)
+    for name, array, expected in zip(
+        ("sigmas", "sample colours", "v_features"), found, (sigmas, colors, v_features), strict=True
+    ):
+        assert_matches(name, array, expected, tolerances)
+
+
+def test_gradients_of_harmonics_by_central_differences(device64):
+    features, *rest = harmonics(40)
+    *_, v_sigmas, v_colors = rest
+
+    def total(features):
+        sigmas, colors, _ = sh_by_kernel(device64, features, *rest)
+        return float(sigmas @ v_sigmas + (colors * v_colors).sum())
+
+    gradcheck(total, {"features": features}, {"features": sh_by_kernel(device64, features, *rest)[2]})
