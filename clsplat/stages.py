@@ -40,6 +40,25 @@ class Splats(NamedTuple):
     colors: Any
 
 
+class RaySplats(NamedTuple):
+    """Gaussians projected for evaluation along rays; the first six fields are those of `Splats`.
+
+    means2d, conics and extents are the outline, outside of which alpha < ALPHA_MIN: an ellipse, or where the conic is
+    0 the box of the extents. rays (N, 8 or 17): the terms of the exponent (cl/gaussian_rays.h): the centre in a chart,
+    Q (xx, xy, yy), the slopes of lambda and k; 17 with the axes of a chart of its own. directions (H, W, 3): unit
+    vectors of the pixels' rays in the camera's frame, for such charts; otherwise (1, 1, 3) zeros.
+    """
+
+    means2d: Any
+    conics: Any
+    depths: Any
+    extents: Any
+    opacities: Any
+    colors: Any
+    rays: Any
+    directions: Any
+
+
 class SplatGrads(NamedTuple):
     """Gradients with respect to the fields of `Splats` that compositing reads, of the same shapes."""
 
@@ -47,6 +66,27 @@ class SplatGrads(NamedTuple):
     conics: Any
     opacities: Any
     colors: Any
+
+
+class RayGrads(NamedTuple):
+    """Gradients with respect to what compositing reads of `RaySplats`.
+
+    means2d (N, 2): by the centre in the chart, px^-1; conics (N, 3) and slopes (N, 3): by Q, and by the slopes and k;
+    opacities and colors as in `SplatGrads`.
+    """
+
+    means2d: Any
+    conics: Any
+    slopes: Any
+    opacities: Any
+    colors: Any
+
+
+AnySplats = Splats | RaySplats
+"""Projected Gaussians of either projection."""
+
+AnyGrads = SplatGrads | RayGrads
+"""Gradients with respect to them."""
 
 
 class CameraGrads(NamedTuple):
@@ -152,16 +192,17 @@ class Stages(FieldStages, Protocol):
         *,
         antialiased: bool = False,
         channels: int = 3,
-    ) -> Splats: ...
+        rays: bool = False,
+    ) -> AnySplats: ...
     def join_rows(self, first: Array, second: Array) -> Array: ...
-    def project_disparities(self, gaussians: "Gaussians", camera: "Camera", splats: Splats) -> Array: ...
+    def project_disparities(self, gaussians: "Gaussians", camera: "Camera", splats: AnySplats) -> Array: ...
     def project_bwd(
         self,
         gaussians: "Gaussians",
         camera: "Camera",
         sh_degree: int,
-        splats: Splats,
-        v_splats: SplatGrads,
+        splats: AnySplats,
+        v_splats: AnyGrads,
         *,
         antialiased: bool = False,
         camera_grad: bool = False,
@@ -171,18 +212,18 @@ class Stages(FieldStages, Protocol):
         gaussians: "Gaussians",
         moments: tuple["Gaussians", "Gaussians"],
         camera: "Camera",
-        splats: Splats,
-        v_splats: SplatGrads,
+        splats: AnySplats,
+        v_splats: AnyGrads,
         step: AdamStep,
         *,
         antialiased: bool = False,
         camera_grad: bool = False,
     ) -> CameraGrads | None: ...
-    def dropout_fwd(self, splats: Splats, dropout: Dropout) -> None: ...
-    def dropout_bwd(self, v_splats: SplatGrads, dropout: Dropout) -> None: ...
+    def dropout_fwd(self, splats: AnySplats, dropout: Dropout) -> None: ...
+    def dropout_bwd(self, v_splats: AnyGrads, dropout: Dropout) -> None: ...
     def bin_splats(
         self,
-        splats: Splats,
+        splats: AnySplats,
         width: int,
         height: int,
         tile_size: int,
@@ -191,21 +232,28 @@ class Stages(FieldStages, Protocol):
         scheme: str = "auto",
     ) -> Bins: ...
     def composite_fwd(
-        self, splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto", disparities: Array = None
+        self,
+        splats: AnySplats,
+        bins: Bins,
+        background: Any,
+        *,
+        compositor: str = "auto",
+        disparities: Array = None,
     ) -> Image: ...
     def composite_bwd(
         self,
-        splats: Splats,
+        splats: AnySplats,
         bins: Bins,
         image: Image,
         v_image: Image,
         *,
         compositor: str = "auto",
         disparities: Array = None,
-    ) -> SplatGrads: ...
-    def count_pairs(self, splats: Splats, bins: Bins) -> tuple[Array, Array]: ...
+    ) -> AnyGrads: ...
+    def count_pairs(self, splats: AnySplats, bins: Bins) -> tuple[Array, Array]: ...
+    def median_splats(self, splats: AnySplats, bins: Bins) -> Array: ...
     def removal(
-        self, splats: Splats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
+        self, splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
     ) -> Removal: ...
     def exposure_fwd(self, image: Array, affine: Any, photo: Array) -> Array: ...
     def exposure_bwd(self, image: Array, affine: Any, photo: Array, v_image: Array) -> Any: ...

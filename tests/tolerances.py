@@ -20,6 +20,9 @@ DOUBLE = {
     "opacities": _REORDERED,
     "colors": _REORDERED,
     "disparities": _CANCELS,
+    "rays": _CANCELS,
+    "directions": _REORDERED,
+    "v_slopes": _CANCELS,
     "filtered log_scales": _REORDERED,
     "filtered logit_opacities": _CANCELS,
     "image": _REORDERED,
@@ -70,6 +73,12 @@ DOUBLE = {
     "moved world": Tolerance(1e-9, 1e-11, "float64: translations of 10 units and scales of 40 cost three digits"),
 }
 
+ALONG_RAYS = DOUBLE | {
+    "v_log_scales": Tolerance(1e-10, 1e-11, "float64: close to the camera's plane, vectors of up to 1e4 px cancel"),
+    "v_quats": Tolerance(1e-10, 1e-11, "float64: as for v_log_scales"),
+    "v_means": Tolerance(1e-10, 1e-11, "float64: as for v_log_scales"),
+}
+
 _NEEDLE = "float32: the gradient by a needle's covariance cancels along its axis"
 _SUM = "float32: a sum over up to 1e4 pixels, whose terms cancel in part"
 
@@ -107,6 +116,7 @@ FLOAT = {
     "v_ray colours": Tolerance(3e-5, 1e-6, "float32: as for transmittances"),
     "v_means2d": Tolerance(1e-4, 2e-5, _SUM),
     "v_conics": Tolerance(1e-4, 1e-5, _SUM),
+    "v_slopes": Tolerance(1e-4, 2e-5, _SUM),
     "v_opacities": Tolerance(1e-4, 2e-5, _SUM),
     "v_colors": Tolerance(1e-5, 2e-6, _SUM),
     "v_means": Tolerance(1e-3, 2e-5, _NEEDLE),

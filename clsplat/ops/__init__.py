@@ -19,6 +19,7 @@ from clsplat.ops.hashgrid import hashgrid_bwd, hashgrid_fwd
 from clsplat.ops.heads import heads_bwd, heads_fwd, heads_join, heads_join_bwd, heads_sh_bwd, heads_sh_fwd
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.march import march
+from clsplat.ops.median import median_splats
 from clsplat.ops.mlp import mlp_bwd, mlp_fwd
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
@@ -45,6 +46,7 @@ class Launches:
         self.composite_fwd = partial(composite_fwd, device)
         self.composite_bwd = partial(composite_bwd, device)
         self.count_pairs = partial(count_pairs, device)
+        self.median_splats = partial(median_splats, device)
         self.removal = partial(removal, device)
         self.exposure_fwd = partial(exposure_fwd, device)
         self.exposure_bwd = partial(exposure_bwd, device)

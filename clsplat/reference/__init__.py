@@ -16,6 +16,7 @@ from clsplat.reference.hashgrid import hashgrid_bwd, hashgrid_fwd
 from clsplat.reference.heads import heads_bwd, heads_fwd, heads_join, heads_join_bwd, heads_sh_bwd, heads_sh_fwd
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.march import march
+from clsplat.reference.median import median_splats
 from clsplat.reference.mlp import mlp_bwd, mlp_fwd
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
