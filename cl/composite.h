@@ -5,6 +5,8 @@
 //   sigma = (a dx^2 + c dy^2)/2 + b dx dy,   alpha = min(ALPHA_MAX, opacity exp(-sigma))    (paper, equation 4)
 //   C = sum_i c_i alpha_i T_i,   T_i = prod_{j<i} (1 - alpha_j)                             (paper, equation 3)
 //
+// With -DRAYS, sigma is that along the pixel's ray (composite_rays.h).
+//
 // Splats are packed for exponents of two: alpha = 2^t, t = log2(opacity) - sigma log2(e). A splat is visible where
 // sigma >= 0, which only the rounding of a needle's conic violates, and alpha >= ALPHA_MIN. Both are tests of t.
 #ifndef CLSPLAT_COMPOSITE_H
@@ -17,6 +19,13 @@
 #if !defined(CHANNELS) || CHANNELS < 1
 #error "-DCHANNELS must give the number of colour channels, 1 or more"
 #endif
+#if !defined(RAYS) || RAYS < 0 || RAYS > 2
+#error "-DRAYS must be 0, 1 or 2"
+#endif
+
+#if RAYS
+#include "composite_rays.h"
+#else
 
 // A splat: t = level + a dx^2 + b dx dy + c dy^2. Padded to whole quarters of a cache line of 64 bytes.
 #define SPLAT_REALS ((8 + CHANNELS + 3) / 4 * 4)
@@ -28,10 +37,43 @@ typedef struct {
     real color[SPLAT_REALS - 8];
 } Splat;
 
-// t of the splat at (dx, dy) from its centre.
-static inline REALV splat_exponent(const Splat *s, REALV dx, REALV dy) {
-    return s->level + (dx * (s->a * dx + s->b * dy) + s->c * dy * dy);
+// Position of a pixel relative to the splat's centre, px.
+typedef struct {
+    REALV dx, dy;
+} Offset;
+
+// Nothing, but what composite_rays.h needs for gradients. A struct has a member.
+typedef struct {
+    char unused;
+} Bend;
+
+// t of the splat at an offset from its centre.
+static inline REALV splat_exponent(const Splat *s, const Offset *o, Bend *bend) {
+    return s->level + (o->dx * (s->a * o->dx + s->b * o->dy) + s->c * o->dy * o->dy);
 }
+
+// Sums over pixels of v_sigma, v_sigma dx, ..., from which all gradients of a splat follow (composite_splats.h).
+typedef struct {
+    REALV m, mx, my, mxx, mxy, myy;
+} Moments;
+
+#define NO_MOMENTS                                                                                                   \
+    { 0, 0, 0, 0, 0, 0 }
+
+static inline void add_moments(const Offset *o, const Bend *bend, REALV v_sigma, Moments *m) {
+    const REALV x_sigma = o->dx * v_sigma, y_sigma = o->dy * v_sigma;
+    m->m += v_sigma;
+    m->mx += x_sigma;
+    m->my += y_sigma;
+    m->mxx += o->dx * x_sigma;
+    m->mxy += o->dx * y_sigma;
+    m->myy += o->dy * y_sigma;
+}
+
+// A record holds the sums of one splat and one tile: the moments, then those of weight v_image.
+#define MOMENTS 6
+#define RECORD  (MOMENTS + CHANNELS)
+#endif
 
 static inline MASKV splat_seen(const Splat *s, REALV t) {
     return (t <= (REALV)(s->level + (real)EXPONENT_SLACK)) & (t >= (REALV)LOG2_ALPHA_MIN);
@@ -60,9 +102,5 @@ static inline REALV splat_over_vjp(REALV alpha, MASKV live, REALV weight, REALV 
     // Clamped alpha has no gradient. ALPHA_MAX < 1 bounds the quotient.
     return (live & (alpha < (REALV)ALPHA_MAX)) ? *behind * (alpha / (1 - alpha)) - part : (REALV)0;
 }
-
-// Sums over pixels of v_sigma, v_sigma dx, ... and of weight v_image, from which all gradients of a splat follow
-// (composite_splats.h). A record holds them for one splat and one tile: RECORD reals, in this order.
-#define RECORD (6 + CHANNELS)
 
 #endif

@@ -109,6 +109,9 @@ static inline int lane_of(int x, int y) {
 // Pixel centres in each column and in each row of blocks, relative to the tile's corner.
 typedef struct {
     REALV x[COLUMNS], y[ROWS];
+#if RAYS == 2
+    REALV rays[BLOCKS][3]; // directions of the pixels' rays
+#endif
 } Grid;
 
 static inline Grid pixel_grid(void) {
@@ -120,18 +123,71 @@ static inline Grid pixel_grid(void) {
     return grid;
 }
 
+// Arguments of a kernel that reads the directions of the pixels' rays, and their loading.
+#if RAYS == 2
+#define DIRECTIONS , const __global real *directions
+#define LOAD_DIRECTIONS(grid)                                                                                        \
+    for (int r = 0; r < rows; ++r) {                                                                                 \
+        for (int x = 0; x < columns; ++x) {                                                                          \
+            const size_t p = (size_t)(y0 + r) * width + x0 + x;                                                      \
+            for (int k = 0; k < 3; ++k)                                                                              \
+                ((real *)&(grid).rays[block_of(x, r)][k])[lane_of(x, r)] = directions[3 * p + k];                    \
+        }                                                                                                            \
+    }
+#else
+#define DIRECTIONS
+#define LOAD_DIRECTIONS(grid)
+#endif
+
+// The tile's corner as seen from a splat, px.
+typedef struct {
+    real x, y;
+} Corner;
+
+static inline Corner corner_from(const Splat *s, int x0, int y0) {
+#if RAYS == 2
+    const Corner corner = {0, 0};
+#else
+    const Corner corner = {x0 - s->x, y0 - s->y};
+#endif
+    return corner;
+}
+
+static inline Offset offset_in(const Grid *grid, uint b, const Splat *s, Corner corner) {
+#if RAYS == 2
+    const REALV x = grid->rays[b][0], y = grid->rays[b][1], z = grid->rays[b][2];
+    const Offset o = {s->axis0[0] * x + s->axis0[1] * y + s->axis0[2] * z,
+                      s->axis1[0] * x + s->axis1[1] * y + s->axis1[2] * z,
+                      s->axis2[0] * x + s->axis2[1] * y + s->axis2[2] * z};
+#else
+    Offset o;
+    o.dx = grid->x[b % COLUMNS] + corner.x;
+    o.dy = grid->y[b / COLUMNS] + corner.y;
+#if RAYS
+    o.along = 1;
+#endif
+#endif
+    return o;
+}
+
 // The blocks of the tile with corner (x0, y0) whose pixel centres the splat's ellipse meets, as bits.
 static inline uint blocks_met(const Splat *s, int x0, int y0) {
+#if RAYS
+    const Outline *e = &s->outline;
+    const real inv_half_height = e->inv_half_height, slope = e->slope, half_sq = e->half_sq;
+#else
+    const Splat *e = s;
     const real inv_a = 1 / s->a, inv_half_height = 1 / s->half_height, slope = (real)-0.5 * s->b * inv_a;
     const real half_sq = ((real)(LOG2_ALPHA_MIN - LOG2_E * EXTENT_SLACK) - s->level) * inv_a;
-    const ROWV top = BLOCK_ROWS * ROW + (y0 + (real)0.5 - s->y), bottom = top + (BLOCK_ROWS - 1), zero = 0;
-    const ROWV at_left = CLAMP((ROWV)-s->at_right, top, bottom), at_right = CLAMP((ROWV)s->at_right, top, bottom);
+#endif
+    const ROWV top = BLOCK_ROWS * ROW + (y0 + (real)0.5 - e->y), bottom = top + (BLOCK_ROWS - 1), zero = 0;
+    const ROWV at_left = CLAMP((ROWV)-e->at_right, top, bottom), at_right = CLAMP((ROWV)e->at_right, top, bottom);
     const ROWV t_left = at_left * inv_half_height, t_right = at_right * inv_half_height;
     const ROWV rest_left = 1 - t_left * t_left, rest_right = 1 - t_right * t_right;
     const ROWV sq_left = half_sq * GREATER(rest_left, zero), sq_right = half_sq * GREATER(rest_right, zero);
-    const ROWV x_min = s->x - x0 + slope * at_left - OF_ROWS(sqrt, sq_left);
-    const ROWV x_max = s->x - x0 + slope * at_right + OF_ROWS(sqrt, sq_right);
-    const MASKR met = (top <= (ROWV)s->half_height) & (bottom >= (ROWV)-s->half_height) & (x_min <= x_max);
+    const ROWV x_min = e->x - x0 + slope * at_left - OF_ROWS(sqrt, sq_left);
+    const ROWV x_max = e->x - x0 + slope * at_right + OF_ROWS(sqrt, sq_right);
+    const MASKR met = (top <= (ROWV)e->half_height) & (bottom >= (ROWV)-e->half_height) & (x_min <= x_max);
     MASKR bits = 0;
     _Pragma("unroll") for (int i = 0; i < COLUMNS; ++i) bits |=
         (x_min <= (ROWV)(4 * i + (real)3.5)) & (x_max >= (ROWV)(4 * i + (real)0.5)) & (FIRST_BIT << i);
@@ -197,7 +253,7 @@ static inline uint load_batch(const __global Splat *splats, const __global uint 
         batch[j].splat = splats[gauss_ids[first + j]];
     for (uint j = first + BATCH; j < LESSER(end, first + 2 * BATCH); ++j) {
         // Most of them span two cache lines.
-        FETCH_TO_READ(&splats[gauss_ids[j]].x);
+        FETCH_TO_READ(&splats[gauss_ids[j]]);
         FETCH_TO_READ(&splats[gauss_ids[j]].color[CHANNELS - 1]);
     }
     for (uint j = 0; j < count; ++j)
@@ -224,10 +280,12 @@ static inline void composite_tile(const Grid *grid, const __global Splat *splats
         const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
         for (uint j = 0; j < count; ++j) {
             const Splat *s = &batch[j].splat;
-            const real to_x = x0 - s->x, to_y = y0 - s->y;
+            const Corner corner = corner_from(s, x0, y0);
             for (uint blocks = unfinished & batch[j].blocks; blocks;) {
                 const uint b = take_block(&blocks);
-                const REALV t = splat_exponent(s, grid->x[b % COLUMNS] + to_x, grid->y[b / COLUMNS] + to_y);
+                const Offset o = offset_in(grid, b, s, corner);
+                Bend bend;
+                const REALV t = splat_exponent(s, &o, &bend);
                 REALV alpha = POWERV(t);
                 MASKV live;
                 const REALV weight = splat_over(splat_seen(s, t), stop, &alpha, &live, &transmittance[b]);

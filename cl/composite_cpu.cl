@@ -20,23 +20,28 @@
 // Buffers: N splats as in project.cl, M intersections and T tiles as in bin.cl, C = CHANNELS
 //   in   means2d, conics, extents, opacities, colors, as in project.cl; splats[N], the same, packed by composite_pack;
 //        gauss_ids[M], tile_ranges[T,2], background[C], slots[M]
-//   out  image[H,W,C], alpha[H,W]; backward: records[M,6+C], v_means2d[N,2], v_conics[N,3], v_opacities[N],
-//        v_colors[N,C]
+//        rays[N,RAY_REALS] with RAYS, instead of conics in composite_sum
+//   out  image[H,W,C], alpha[H,W]; backward: records[M,RECORD], v_means2d[N,2], v_conics[N,3], v_slopes[N,3] with RAYS,
+//        v_opacities[N], v_colors[N,C]
 // -DTILE=8|16   edge of a tile, px
 // -DCHANNELS    number of colour channels, 1 or more
 // -DLANES=8|16  number of pixels of a block
+// -DRAYS=0|1|2  1, 2: along rays (composite_rays.h), in the image or in a chart of each splat; 2 reads directions[H,W,3],
+//               unit vectors of the pixels' rays in the camera's frame
 #include "common.h"
 #include "composite_blocks.h"
 
 __kernel void composite_fwd(const int width, const int height, const __global Splat *splats,
                             const __global uint *gauss_ids, const __global uint *tile_ranges,
-                            const __global real *background, __global real *image, __global real *alpha_image) {
+                            const __global real *background, __global real *image,
+                            __global real *alpha_image DIRECTIONS) {
     const uint t = get_global_id(0);
     const int tiles_x = (width + TILE - 1) / TILE;
     const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
     const int rows = LESSER(TILE, height - y0), columns = LESSER(TILE, width - x0);
 
-    const Grid grid = pixel_grid();
+    Grid grid = pixel_grid();
+    LOAD_DIRECTIONS(grid)
     REALV transmittance[BLOCKS], sums[BLOCKS][CHANNELS];
     for (int b = 0; b < BLOCKS; ++b) {
         transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
@@ -62,13 +67,14 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
                             const __global uint *gauss_ids, const __global uint *tile_ranges,
                             const __global uint *slots, const __global real *image, const __global real *alpha_image,
                             const __global real *v_image, const __global real *v_alpha_image,
-                            __global real *records) {
+                            __global real *records DIRECTIONS) {
     const uint t = get_global_id(0);
     const int tiles_x = (width + TILE - 1) / TILE;
     const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
     const int rows = LESSER(TILE, height - y0), columns = LESSER(TILE, width - x0);
 
-    const Grid grid = pixel_grid();
+    Grid grid = pixel_grid();
+    LOAD_DIRECTIONS(grid)
     REALV transmittance[BLOCKS], behind[BLOCKS], v_pixels[BLOCKS][CHANNELS];
     for (int b = 0; b < BLOCKS; ++b) {
         transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
@@ -101,13 +107,15 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
             FETCH_TO_WRITE(&records[(size_t)RECORD * slots[first + j]]);
         for (uint j = 0; j < count; ++j) {
             const Splat *s = &batch[j].splat;
-            const real to_x = x0 - s->x, to_y = y0 - s->y;
-            REALV m = 0, mx = 0, my = 0, mxx = 0, mxy = 0, myy = 0, v_colors[CHANNELS];
+            const Corner corner = corner_from(s, x0, y0);
+            Moments sums = NO_MOMENTS;
+            REALV v_colors[CHANNELS];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) v_colors[k] = 0;
             for (uint blocks = unfinished & batch[j].blocks; blocks;) {
                 const uint b = take_block(&blocks);
-                const REALV dx = grid.x[b % COLUMNS] + to_x, dy = grid.y[b / COLUMNS] + to_y;
-                const REALV t = splat_exponent(s, dx, dy);
+                const Offset o = offset_in(&grid, b, s, corner);
+                Bend bend;
+                const REALV t = splat_exponent(s, &o, &bend);
                 REALV alpha = POWERV(t);
                 MASKV live;
                 const REALV weight =
@@ -118,23 +126,22 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
                     v_colors[k] += weight * v_pixels[b][k];
                 }
                 const REALV v_sigma = splat_over_vjp(alpha, live, weight, u, &behind[b]);
-                const REALV x_sigma = dx * v_sigma, y_sigma = dy * v_sigma;
-                m += v_sigma;
-                mx += x_sigma;
-                my += y_sigma;
-                mxx += dx * x_sigma;
-                mxy += dx * y_sigma;
-                myy += dy * y_sigma;
+                add_moments(&o, &bend, v_sigma, &sums);
             }
             __global real *record = records + (size_t)RECORD * slots[first + j];
-            store4(record, 0, sum_lanes4(m, mx, my, mxx));
-#if CHANNELS == 3
-            store4(record + 4, 0, sum_lanes4(mxy, myy, v_colors[0], v_colors[1]));
+            store4(record, 0, sum_lanes4(sums.m, sums.mx, sums.my, sums.mxx));
+#if RAYS
+            store4(record + 4, 0, sum_lanes4(sums.mxy, sums.myy, sums.ml, sums.mlx));
+            record[8] = sum_lanes(sums.mly);
+            record[9] = sum_lanes(sums.mk);
+            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[MOMENTS + k] = sum_lanes(v_colors[k]);
+#elif CHANNELS == 3
+            store4(record + 4, 0, sum_lanes4(sums.mxy, sums.myy, v_colors[0], v_colors[1]));
             record[8] = sum_lanes(v_colors[2]);
 #else
-            record[4] = sum_lanes(mxy);
-            record[5] = sum_lanes(myy);
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[6 + k] = sum_lanes(v_colors[k]);
+            record[4] = sum_lanes(sums.mxy);
+            record[5] = sum_lanes(sums.myy);
+            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[MOMENTS + k] = sum_lanes(v_colors[k]);
 #endif
         }
     }

@@ -27,13 +27,14 @@
 // computation, and therefore each bit of the result, is the same.
 //
 // Buffers: as in composite_cpu.cl.
-// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (11 + CHANNELS), backward TILE^2
-// (2 + CHANNELS). With TILE 16, BATCH 64 and CHANNELS 4 this is 4 KiB and 6 KiB (double: 8 KiB and 12 KiB) of the 32
-// KiB that OpenCL 1.2 guarantees.
+// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (11 + CHANNELS), with RAYS (26 + CHANNELS),
+// backward TILE^2 (2 + CHANNELS). With TILE 16, BATCH 64 and CHANNELS 4 this is 4 KiB (RAYS 7.5 KiB) and 6 KiB (double:
+// twice as much) of the 32 KiB that OpenCL 1.2 guarantees.
 // -DTILE=8|16   edge of a tile, px
 // -DCHANNELS    number of colour channels, 1 or more
 // -DITEMS       number of work-items of the forward work-group, a divisor of TILE*TILE
 // -DBATCH       number of splats per batch, 1 or more; the backward work-group has BATCH work-items
+// -DRAYS=0|1|2  as in composite_cpu.cl
 // -DSUBGROUPS=0|1   1: the device has the functions of subgroups, by cl_khr_subgroups or OpenCL 2.1 and later
 #include "common.h"
 
@@ -47,7 +48,7 @@
 __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void
 composite_fwd(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
               const __global uint *tile_ranges, const __global real *background, __global real *image,
-              __global real *alpha_image) {
+              __global real *alpha_image DIRECTIONS) {
     __local Splat staged[BATCH];
     __local int live_pixels;
     const uint tile = get_group_id(0), lane = get_local_id(0);
@@ -76,9 +77,12 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
         for (int o = 0; o < OWNED; ++o) {
             const int was_live = transmittance[o] > 0;
             const int2 pixel = pixel_of(x0, y0, lane + o * ITEMS);
+            const real3 ray = was_live ? DIRECTIONS_OF((size_t)pixel.y * width + pixel.x) : (real3)0;
             for (uint j = 0; j < count && transmittance[o] > 0; ++j) {
                 const Splat s = staged[j];
-                const real t = splat_exponent(&s, pixel.x + (real)0.5 - s.x, pixel.y + (real)0.5 - s.y);
+                const Offset offset = offset_of(pixel, ray, &s);
+                Bend bend;
+                const real t = splat_exponent(&s, &offset, &bend);
                 real alpha = exp2(t);
                 int live;
                 const real weight =
@@ -106,7 +110,7 @@ __kernel __attribute__((reqd_work_group_size(BATCH, 1, 1))) void
 composite_bwd(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
               const __global uint *tile_ranges, const __global uint *slots, const __global real *image,
               const __global real *alpha_image, const __global real *v_image, const __global real *v_alpha_image,
-              __global real *records) {
+              __global real *records DIRECTIONS) {
     __local real transmittance[PIXELS], behind[PIXELS], v_pixels[CHANNELS][PIXELS];
     __local int unfinished;
     const uint tile = get_group_id(0), lane = get_local_id(0);
@@ -138,19 +142,21 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
         const uint count = min((uint)BATCH, length - first);
         const uint i = begin + first + lane;
         Splat s;
-        real sums[RECORD];
+        Moments sums = NO_MOMENTS;
+        real v_colors[CHANNELS];
         int any_live = 0;
         if (lane < count)
             s = splats[gauss_ids[i]];
-        for (int k = 0; k < RECORD; ++k)
-            sums[k] = 0;
+        for (int k = 0; k < CHANNELS; ++k)
+            v_colors[k] = 0;
 
         for (uint step = 0; step < PIXELS + count - 1; ++step) {
             const uint p = step - lane; // wraps to a value beyond PIXELS while no pixel has reached this work-item
             if (lane < count && p < PIXELS && transmittance[p] > 0) {
                 const int2 pixel = pixel_of(x0, y0, p);
-                const real dx = pixel.x + (real)0.5 - s.x, dy = pixel.y + (real)0.5 - s.y;
-                const real t = splat_exponent(&s, dx, dy);
+                const Offset offset = offset_of(pixel, DIRECTIONS_OF((size_t)pixel.y * width + pixel.x), &s);
+                Bend bend;
+                const real t = splat_exponent(&s, &offset, &bend);
                 real alpha = exp2(t), after = transmittance[p];
                 int live;
                 const real weight = splat_over(splat_seen(&s, t), TRANSMITTANCE_MIN, &alpha, &live, &after);
@@ -160,24 +166,24 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
                     real u = 0;
                     for (int k = 0; k < CHANNELS; ++k) {
                         u += s.color[k] * v_pixels[k][p];
-                        sums[6 + k] += weight * v_pixels[k][p];
+                        v_colors[k] += weight * v_pixels[k][p];
                     }
                     real part = behind[p];
                     const real v_sigma = splat_over_vjp(alpha, live, weight, u, &part);
                     behind[p] = part;
-                    sums[0] += v_sigma;
-                    sums[1] += dx * v_sigma;
-                    sums[2] += dy * v_sigma;
-                    sums[3] += dx * dx * v_sigma;
-                    sums[4] += dx * dy * v_sigma;
-                    sums[5] += dy * dy * v_sigma;
+                    add_moments(&offset, &bend, v_sigma, &sums);
                 }
             }
             hand_on();
         }
 
-        for (int k = 0; lane < count && k < RECORD; ++k)
-            records[(size_t)RECORD * slots[i] + k] = sums[k];
+        if (lane < count) {
+            __global real *record = records + (size_t)RECORD * slots[i];
+            for (int k = 0; k < MOMENTS; ++k)
+                record[k] = ((const real *)&sums)[k];
+            for (int k = 0; k < CHANNELS; ++k)
+                record[MOMENTS + k] = v_colors[k];
+        }
         if (lane == count - 1)
             unfinished = any_live;
         barrier(CLK_LOCAL_MEM_FENCE);

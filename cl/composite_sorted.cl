@@ -23,6 +23,7 @@
 // -DCHANNELS    number of colour channels, 1 or more
 // -DLANES=8|16  number of pixels of a block
 // -DWINDOW      number of entries of a pixel's window, 1 or more
+#define RAYS 0 // the disparities are those of the affine projection
 #include "common.h"
 #include "composite_blocks.h"
 
@@ -136,10 +137,10 @@ static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, c
 // enough.
 static inline void gather_splat(const Tile *tile, const Splat *s, real3 disparity, uint entry, Pixels *pixels,
                                 int b) {
-    const REALV x = tile->grid->x[b % COLUMNS] + (tile->x0 - s->x),
-                y = tile->grid->y[b / COLUMNS] + (tile->y0 - s->y);
-    const REALV t = splat_exponent(s, x, y);
-    const REALV here = disparity.x + (x * disparity.y + y * disparity.z), last = pixels->last_disparity[b];
+    const Offset o = offset_in(tile->grid, b, s, corner_from(s, tile->x0, tile->y0));
+    Bend bend;
+    const REALV t = splat_exponent(s, &o, &bend);
+    const REALV here = disparity.x + (o.dx * disparity.y + o.dy * disparity.z), last = pixels->last_disparity[b];
     const MASKV beyond = (here < last) | ((here == last) & ((MASKV)entry > pixels->last_entry[b]));
     const MASKV wanted = splat_seen(s, t) & beyond;
     Entry e;

@@ -9,22 +9,64 @@
 #ifndef CLSPLAT_COMPOSITE_SPLATS_H
 #define CLSPLAT_COMPOSITE_SPLATS_H
 
+#if RAYS
+// Of a row of rays: RAY_REALS in gaussian_rays.h.
+#define ROW_REALS (RAYS == 2 ? 17 : 8)
+
+// The outline as in ellipse_of (ellipse.h); r2 in the unit of 2 sigma.
+static inline Outline outline_of(real2 centre, real2 extent, real3 conic, real level) {
+    Outline e = {centre.x, centre.y, extent.y, 0, 0, 0, extent.x * extent.x};
+    if (conic.x > 0) {
+        e.inv_half_height = 1 / extent.y;
+        e.at_right = -conic.y / conic.z * extent.x;
+        e.slope = -conic.y / conic.x;
+        e.half_sq = ((real)(2 / LOG2_E) * (level - (real)LOG2_ALPHA_MIN) + 2 * EXTENT_SLACK) / conic.x;
+    }
+    return e;
+}
+#endif
+
 __kernel void composite_pack(const uint n, const __global real *means2d, const __global real *conics,
-                             const __global real *extents, const __global real *opacities,
-                             const __global real *colors, __global Splat *splats) {
+                             const __global real *extents, const __global real *opacities, const __global real *colors
+#if RAYS
+                             ,
+                             const __global real *rays
+#endif
+                             ,
+                             __global Splat *splats) {
     const size_t i = get_global_id(0);
     if (i >= n || !(extents[2 * i] > 0))
         return;
-    const real3 conic = load3(conics, i);
     Splat s;
+    s.level = logarithm(opacities[i]);
+#if RAYS
+    rays += (size_t)ROW_REALS * i;
+    const real3 conic = (real3)(rays[2], rays[3], rays[4]);
+    s.slope_x = rays[5];
+    s.slope_y = rays[6];
+    s.rest = (real)(2 / LOG2_E) * rays[7];
+    s.outline = outline_of(load2(means2d, i), load2(extents, i), load3(conics, i), s.level);
+#else
+    const real3 conic = load3(conics, i);
+    s.half_height = extents[2 * i + 1];
+    s.at_right = -conic.y / conic.z * extents[2 * i];
+#endif
+#if RAYS == 2
+    for (int k = 0; k < 3; ++k) {
+        s.axis0[k] = rays[8 + k];
+        s.axis1[k] = rays[11 + k];
+        s.axis2[k] = rays[14 + k];
+    }
+#elif RAYS
+    s.x = rays[0];
+    s.y = rays[1];
+#else
     s.x = means2d[2 * i];
     s.y = means2d[2 * i + 1];
+#endif
     s.a = (real)(-0.5 * LOG2_E) * conic.x;
     s.b = (real)-LOG2_E * conic.y;
     s.c = (real)(-0.5 * LOG2_E) * conic.z;
-    s.level = logarithm(opacities[i]);
-    s.half_height = extents[2 * i + 1];
-    s.at_right = -conic.y / conic.z * extents[2 * i];
     for (int k = 0; k < CHANNELS; ++k)
         s.color[k] = colors[CHANNELS * i + k];
     splats[i] = s;
@@ -32,8 +74,11 @@ __kernel void composite_pack(const uint n, const __global real *means2d, const _
 
 __kernel void composite_sum(const uint n, const __global uint *order, const __global uint *first_slots,
                             const __global real *conics, const __global real *opacities, const __global real *records,
-                            __global real *v_means2d, __global real *v_conics, __global real *v_opacities,
-                            __global real *v_colors) {
+                            __global real *v_means2d, __global real *v_conics,
+#if RAYS
+                            __global real *v_slopes,
+#endif
+                            __global real *v_opacities, __global real *v_colors) {
     const size_t i = get_global_id(0);
     if (i >= n)
         return;
@@ -46,20 +91,34 @@ __kernel void composite_sum(const uint n, const __global uint *order, const __gl
             total[k] += records[(size_t)RECORD * slot + k];
     }
     const uint g = order[i];
+#if RAYS
+    const __global real *row = conics + (size_t)ROW_REALS * g; // of rays
+    const real3 conic = (real3)(row[2], row[3], row[4]);
+    const real2 v_mean = -(real2)(conic.x * total[1] + conic.y * total[2] + row[5] * total[6],
+                                  conic.y * total[1] + conic.z * total[2] + row[6] * total[6]);
+    const real3 v_slope = (real3)(total[7], total[8], total[9]);
+#else
     const real3 conic = load3(conics, g);
     const real2 v_mean = -(real2)(conic.x * total[1] + conic.y * total[2], conic.y * total[1] + conic.z * total[2]);
+#endif
     const real3 v_conic = (real3)((real)0.5 * total[3], total[4], (real)0.5 * total[5]);
     const real v_opacity = begin < end ? -total[0] / opacities[g] : 0;
     // Gradients that overflow are set to 0: they would stay in the statistics of densification.
     real any = v_mean.x + v_mean.y + v_conic.x + v_conic.y + v_conic.z + v_opacity;
+#if RAYS
+    any += v_slope.x + v_slope.y + v_slope.z;
+#endif
     for (int k = 0; k < CHANNELS; ++k)
-        any += total[6 + k];
+        any += total[MOMENTS + k];
     const bool finite = 0 * any == 0;
     store2(v_means2d, g, finite ? v_mean : (real2)0);
     store3(v_conics, g, finite ? v_conic : (real3)0);
+#if RAYS
+    store3(v_slopes, g, finite ? v_slope : (real3)0);
+#endif
     v_opacities[g] = finite ? v_opacity : 0;
     for (int k = 0; k < CHANNELS; ++k)
-        v_colors[CHANNELS * g + k] = finite ? total[6 + k] : 0;
+        v_colors[CHANNELS * g + k] = finite ? total[MOMENTS + k] : 0;
 }
 
 #endif

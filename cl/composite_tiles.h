@@ -19,10 +19,7 @@
 #ifdef cl_khr_subgroups
 #pragma OPENCL EXTENSION cl_khr_subgroups : enable
 #endif
-#define REALV real
-#define MASKV int
-#include "composite.h"
-#include "power.h"
+#include "composite_pixels.h"
 
 #define PIXELS (TILE * TILE)
 

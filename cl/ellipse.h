@@ -1,5 +1,6 @@
 // The region in which a splat is visible: a dx^2 + 2 b dx dy + c dy^2 <= r2 around its centre, with the conic
-// (a, b, c) and r2 = 2 ln(opacity / ALPHA_MIN), where alpha = opacity exp(-sigma) falls to ALPHA_MIN.
+// (a, b, c) and r2 = 2 ln(opacity / ALPHA_MIN), where alpha = opacity exp(-sigma) falls to ALPHA_MIN. If the conic is 0,
+// the region is the box of the splat's extents.
 #ifndef CLSPLAT_ELLIPSE_H
 #define CLSPLAT_ELLIPSE_H
 
@@ -34,7 +35,7 @@ static inline real8 ellipse_r2_8(real8 opacity) {
 // Precomputed values of a splat's ellipse from which its ranges follow.
 typedef struct {
     real x, y;                         // centre, px; the other values are relative to it
-    real half_height, inv_half_height; // the first is 0 if the splat is invisible
+    real half_height, inv_half_height; // the first is 0 if the splat is invisible, the second if the region is a box
     real at_right;                     // y of the rightmost point; that of the leftmost is -at_right
     real slope, half_sq;               // x of a chord's middle over y; square of half the chord at y = 0
     real unused;
@@ -44,6 +45,9 @@ static inline Ellipse ellipse_of(real2 centre, real3 conic, real r2, real2 exten
     Ellipse e = {centre.x, centre.y, 0, 0, 0, 0, 0, 0};
     if (extent.x > 0) {
         e.half_height = extent.y;
+        e.half_sq = extent.x * extent.x;
+    }
+    if (extent.x > 0 && conic.x > 0) {
         e.inv_half_height = 1 / extent.y;
         e.at_right = -conic.y / conic.z * extent.x;
         e.slope = -conic.y / conic.x;

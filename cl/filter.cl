@@ -15,7 +15,7 @@
 //   filter_bwd      in pixels[N]; in and out v_log_scales[N,3], v_logit_opacities[N]: first the gradients with respect
 //                   to the outputs of filter_fwd, then those with respect to its inputs
 // -DFILTER_VARIANCE  variance of the filter, in squared sizes of a pixel
-// -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  camera model (lens.h)
+// -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE|EQUIRECTANGULAR  camera model (lens.h)
 #include "common.h"
 #include "lens.h"
 

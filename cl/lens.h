@@ -6,24 +6,28 @@
 //   FISHEYE       u = fx s x + cx, s = theta_d/rho, rho^2 = x^2 + y^2, theta = atan2(rho, z),
 //                 theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)   (Kannala and Brandt 2006,
 //                 equation 6, with the odd powers that OpenCV and COLMAP keep)
-// v accordingly. The depth is z, except for FISHEYE, which sees beyond 90 degrees: there it is the distance |p|.
-// docs/stages/project.md derives the second derivatives of FISHEYE; clsplat/reference/lens.py is the twin.
+//   EQUIRECTANGULAR  u = fx atan2(x, z) + cx, v = fy atan2(y, |(x, z)|) + cy; only without the Jacobian, for gaussian_rays.h
+// v accordingly. The depth is z, except for FISHEYE and EQUIRECTANGULAR, which see beyond 90 degrees: there it is the
+// distance |p|. docs/stages/project.md derives the second derivatives of FISHEYE; clsplat/reference/lens.py is the
+// twin.
 //
-// The file that includes this documents -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE. FISHEYE takes one lane (lanes.h).
+// The file that includes this documents -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE|EQUIRECTANGULAR. The last two take one lane
+// (lanes.h).
 #ifndef CLSPLAT_LENS_H
 #define CLSPLAT_LENS_H
 
 #include "linalg.h"
 #include "structs.h"
 
-#define PINHOLE      1
-#define ORTHOGRAPHIC 2
-#define FISHEYE      3
-#if !defined(LENS) || LENS < PINHOLE || LENS > FISHEYE
-#error "-DLENS must be PINHOLE, ORTHOGRAPHIC or FISHEYE"
+#define PINHOLE         1
+#define ORTHOGRAPHIC    2
+#define FISHEYE         3
+#define EQUIRECTANGULAR 4
+#if !defined(LENS) || LENS < PINHOLE || LENS > EQUIRECTANGULAR
+#error "-DLENS must be PINHOLE, ORTHOGRAPHIC, FISHEYE or EQUIRECTANGULAR"
 #endif
-#if LENS == FISHEYE && LANES != 1
-#error "-DLENS=FISHEYE needs -DLANES=1"
+#if LENS >= FISHEYE && LANES != 1
+#error "-DLENS=FISHEYE and EQUIRECTANGULAR need -DLANES=1"
 #endif
 
 static inline reals3 camera_rotate(const Camera *camera, reals3 v) {
@@ -122,6 +126,18 @@ static inline reals3 lens_vjp(const Camera *camera, reals3 p, const Lens *l, rea
     return vector3(camera->fx * v_centre.x, camera->fy * v_centre.y, v_depth);
 }
 
+#elif LENS == EQUIRECTANGULAR
+
+static inline reals2 lens_centre(const Camera *camera, reals3 p) {
+    const reals2 centre = {camera->fx * atan2(p.x, p.z) + camera->cx,
+                           camera->fy * atan2(p.y, sqrt(p.x * p.x + p.z * p.z)) + camera->cy};
+    return centre;
+}
+
+static inline masks lens_sees(const Camera *camera, reals3 p) {
+    return dot3(p, p) > camera->near * camera->near;
+}
+
 #else
 
 // s and its derivatives, which are even in rho: ds = q (x dx + y dy) + h dz; likewise for q (by w and m) and h (by
@@ -210,6 +226,8 @@ static inline reals3 lens_vjp(const Camera *camera, reals3 p, const Lens *l, rea
 static inline reals lens_reach(const Camera *camera, reals3 p) {
 #if LENS == ORTHOGRAPHIC
     return 1;
+#elif LENS == EQUIRECTANGULAR
+    return sqrt(dot3(p, p));
 #else
     return lens(camera, p).depth;
 #endif

@@ -6,6 +6,7 @@
 //   cov2d = J W Sigma W^T J^T + BLUR I,  Sigma = R S S^T R^T          (Kerbl et al. 2023, equations 5 and 6)
 //   colour = max(SH(direction) + 1/2, 0)                               (original code)
 //   antialiased: opacity * sqrt(det(cov2d - BLUR I)/det(cov2d))        (Yu et al. 2024, "Mip-Splatting", equation 10)
+// With RAYS, the covariance is that of gaussian_rays.h, and the shape is not approximated.
 // If each pixel is sorted, also the disparity 1/z at which the ray of a pixel meets it (project_disparities).
 // docs/stages/project.md derives the gradients; clsplat/reference/project.py is the float64 twin.
 //
@@ -16,6 +17,7 @@
 //   out  means2d[N,2] px, conics[N,3] px^-2 (xx, xy, yy), depths[N] world, extents[N,2] px, opacities[N],
 //        colors[N,C] (RGB, then the depth if C is 4)
 //        An invisible Gaussian has extents 0 and all its other outputs 0.
+//   out  rays[N,RAY_REALS], the terms along rays (gaussian_rays.h), with RAYS; means2d, conics and extents are then the outline
 //   out  disparities[N,3] of project_disparities: 1/z at the centre in 1/world, and its derivatives by x and y per px
 //   v_x  is the gradient with respect to x; v_camera[groups,16] holds a partial sum per work-group of the gradient
 //        with respect to rotation (9, row-major), translation (3) and fx, fy, cx, cy.
@@ -26,7 +28,8 @@
 // -DCHANNELS=3|4      4: the depth is composited as a fourth channel
 // -DANTIALIASED=0|1   1: opacity compensation
 // -DCAMERA_GRAD=0|1   1: the backward kernels also write v_camera; requires -DGROUP, the work-group size
-// -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE  camera model (lens.h)
+// -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE|EQUIRECTANGULAR  camera model (lens.h); the last one needs RAYS
+// -DRAYS=0|1          1: Gaussians are evaluated along rays; not with ORTHOGRAPHIC, whose affine projection is exact
 // -DLANES=1|8         Gaussians of a work-item
 #ifndef LANES
 #error "-DLANES, the number of Gaussians of a work-item, must be given"
@@ -42,6 +45,12 @@
 #endif
 #if !defined(ANTIALIASED) || !defined(CAMERA_GRAD) || ANTIALIASED & ~1 || CAMERA_GRAD & ~1
 #error "-DANTIALIASED and -DCAMERA_GRAD must be 0 or 1"
+#endif
+#if !defined(RAYS) || RAYS & ~1
+#error "-DRAYS must be 0 or 1"
+#endif
+#if LENS == EQUIRECTANGULAR && !RAYS || LENS == ORTHOGRAPHIC && RAYS
+#error "-DLENS=EQUIRECTANGULAR needs -DRAYS=1, and -DLENS=ORTHOGRAPHIC needs -DRAYS=0"
 #endif
 #if CAMERA_GRAD && (!defined(GROUP) || GROUP < 1)
 #error "-DCAMERA_GRAD=1 needs -DGROUP, the work-group size of the backward kernels"
@@ -64,6 +73,32 @@ typedef struct {
     reals3 scales; // world units
     reals opacity;
 } Activated;
+
+// Gradients with respect to the parameters and the camera.
+typedef struct {
+    reals3 mean, log_scales;
+    reals4 quat;
+    reals logit_opacity;
+    reals3 color; // that of coefficient k is basis[k] color
+#if CAMERA_GRAD
+    mat3 view;
+    reals3 translation;
+    reals4 intrinsics;
+#endif
+} GaussianGrad;
+
+#define NUMBERS ((int)(sizeof(GaussianGrad) / sizeof(reals)))
+
+// conic (xx, xy, yy) = inverse of cov2d: v_cov = -Q V Q with the symmetric matrix V of (v_xx, v_xy/2, v_yy).
+static inline reals3 conic_vjp(reals3 q, reals3 v) {
+    return vector3(-(q.x * q.x * v.x + q.x * q.y * v.y + q.y * q.y * v.z),
+                   -(2 * q.x * q.y * v.x + (q.y * q.y + q.x * q.z) * v.y + 2 * q.y * q.z * v.z),
+                   -(q.y * q.y * v.x + q.y * q.z * v.y + q.z * q.z * v.z));
+}
+
+#if RAYS
+#include "gaussian_rays.h"
+#else
 
 // Intermediate values for the forward and the backward pass.
 typedef struct {
@@ -99,21 +134,6 @@ static inline Footprint footprint(const Camera *camera, reals3 mean, reals3 scal
     return f;
 }
 
-// Gradients with respect to the parameters and the camera.
-typedef struct {
-    reals3 mean, log_scales;
-    reals4 quat;
-    reals logit_opacity;
-    reals3 color; // that of coefficient k is basis[k] color
-#if CAMERA_GRAD
-    mat3 view;
-    reals3 translation;
-    reals4 intrinsics;
-#endif
-} GaussianGrad;
-
-#define NUMBERS ((int)(sizeof(GaussianGrad) / sizeof(reals)))
-
 // v_cov = (v_xx, v_xy, v_yy): gradients of cov2d, where xy stands for both off-diagonal entries. v->quat receives the
 // gradient of the unit quaternion.
 static inline void footprint_vjp(const Camera *camera, const Footprint *f, reals3 mean, reals4 unit_quat,
@@ -142,6 +162,8 @@ static inline void footprint_vjp(const Camera *camera, const Footprint *f, reals
     add_outer(v_p, mean, &v->view);
 #endif
 }
+
+#endif
 
 // Factor on the opacity, and the gradients of the determinants with respect to it.
 static inline reals compensation(reals det0, reals det) {
@@ -178,13 +200,6 @@ static inline Activated activate(reals3 log_scales, reals logit_opacity) {
     return a;
 }
 
-// conic (xx, xy, yy) = inverse of cov2d: v_cov = -Q V Q with the symmetric matrix V of (v_xx, v_xy/2, v_yy).
-static inline reals3 conic_vjp(reals3 q, reals3 v) {
-    return vector3(-(q.x * q.x * v.x + q.x * q.y * v.y + q.y * q.y * v.z),
-                   -(2 * q.x * q.y * v.x + (q.y * q.y + q.x * q.z) * v.y + 2 * q.y * q.z * v.z),
-                   -(q.y * q.y * v.x + q.y * q.z * v.y + q.z * q.z * v.z));
-}
-
 // Whether the centre of one of `size` pixels lies in [lo, hi].
 static inline masks shows_pixel(reals lo, reals hi, int size) {
 #if LANES == 8
@@ -218,7 +233,12 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
                                   const __global real *quats, const __global real *logit_opacities,
                                   const __global real *sh, __global real *means2d, __global real *conics,
                                   __global real *depths, __global real *extents, __global real *opacities,
-                                  __global real *colors) {
+                                  __global real *colors
+#if RAYS
+                                  ,
+                                  __global real *rays
+#endif
+) {
     const size_t i = LANES * get_global_id(0);
     if (i >= n)
         return;
@@ -230,8 +250,15 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
     const Footprint f = footprint(&camera, mean, activated.scales, normalized4(quat));
     const reals opacity = activated.opacity * compensation(f.det0, f.det);
     const reals r2 = ellipse_r2(opacity);
+#if RAYS
+    const Outline outline = ray_outline(&camera, &f, r2);
+    const reals2 centre = outline.centre, extent = outline.extent;
+    const reals3 conic = outline.conic;
+#else
     const reals2 centre = lens_centre(&camera, f.p);
     const reals2 extent = {OF_LANES(sqrt, r2 * f.xx), OF_LANES(sqrt, r2 * f.yy)};
+    const reals3 conic = vector3(f.yy / f.det, -f.xy / f.det, f.xx / f.det);
+#endif
     reals basis[16];
     sh_basis(normalized3(lens_offset(&camera, mean)), sh_degree, basis);
     reals3 color = {(real)0.5, (real)0.5, (real)0.5};
@@ -247,8 +274,11 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
     }
 
     // 0 times infinity is NaN, so that one test detects values that are not finite in any term.
-    const reals any =
+    reals any =
         norm2 + f.det + f.lens.depth + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
+#if RAYS
+    any += conic.x + conic.y + conic.z + f.slopes.x + f.slopes.y + f.slopes.z;
+#endif
     const masks visible = (0 * any == zero) & lens_sees(&camera, f.p) & (norm2 >= (reals)QUAT_NORM2_MIN) &
                           (r2 > zero) & shows_pixel(centre.x - extent.x, centre.x + extent.x, camera.width) &
                           shows_pixel(centre.y - extent.y, centre.y + extent.y, camera.height);
@@ -259,8 +289,7 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
                                 IF_VISIBLE(GREATER(color.z, zero))};
     const reals depth = IF_VISIBLE(f.lens.depth);
     store_vectors2(means2d, i, n, shown_centre);
-    store_vectors3(conics, i, n,
-                   vector3(IF_VISIBLE(f.yy / f.det), IF_VISIBLE(-f.xy / f.det), IF_VISIBLE(f.xx / f.det)));
+    store_vectors3(conics, i, n, vector3(IF_VISIBLE(conic.x), IF_VISIBLE(conic.y), IF_VISIBLE(conic.z)));
     store_numbers(depths, i, n, depth);
     store_vectors2(extents, i, n, shown_extent);
     store_numbers(opacities, i, n, IF_VISIBLE(opacity));
@@ -269,8 +298,17 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
 #else
     store_vectors4(colors, i, n, vector4(shown_color.x, shown_color.y, shown_color.z, depth));
 #endif
+#if RAYS
+    reals row[RAY_REALS];
+    ray_row(&camera, &f, row);
+    for (int k = 0; k < RAY_REALS; ++k)
+        row[k] = IF_VISIBLE(row[k]);
+    transpose(row);
+    store_chunks(rays, RAY_REALS * i, RAY_REALS * n, RAY_REALS, row);
+#endif
 }
 
+#if !RAYS
 // Depth of a Gaussian's maximum along the ray of a pixel. In the local affine approximation, depth and image position
 // are jointly normal. For a pixel at d from the centre, the maximum is at the conditional mean of the depth,
 //   z + g.d,   g = cov2d^-1 (J W Sigma W^T e_z).
@@ -298,13 +336,18 @@ __kernel VECTORS void project_disparities(const uint n, const Camera camera, con
     const masks finite = visible & (0 * (slope_x * extent.x + slope_y * extent.y) == zero);
     store_vectors3(disparities, i, n, vector3(IF_VISIBLE(inv_z), finite ? slope_x : zero, finite ? slope_y : zero));
 }
+#endif
 
 typedef struct {
     const __global real *means, *log_scales, *quats, *logit_opacities, *sh;
 } GaussianArrays;
 
 typedef struct {
-    const __global real *conics, *extents, *colors, *v_means2d, *v_conics, *v_opacities, *v_colors;
+    const __global real *conics, *extents, *colors, *v_means2d, *v_conics;
+#if RAYS
+    const __global real *v_slopes;
+#endif
+    const __global real *v_opacities, *v_colors;
 } SplatArrays;
 
 // Gradients of the Gaussians from i on, and the basis of their spherical harmonics; 0 for those that are not visible.
@@ -329,10 +372,14 @@ static inline GaussianGrad gaussian_vjp(size_t i, size_t n, const Camera *camera
     const reals v_opacity = load_numbers(splats.v_opacities, i, n);
     v.logit_opacity = v_opacity * factor * opacity * (1 - opacity);
     const reals2 v_det = compensation_vjp(f.det0, f.det, v_opacity * opacity);
+#if RAYS
+    const reals3 v_conic = load_vectors3(splats.v_conics, i, n), v_slopes = load_vectors3(splats.v_slopes, i, n);
+#else
     reals3 v_cov = conic_vjp(load_vectors3(splats.conics, i, n), load_vectors3(splats.v_conics, i, n));
     v_cov.x += v_det.x * (f.yy - BLUR) + v_det.y * f.yy;
     v_cov.y += -2 * f.xy * (v_det.x + v_det.y);
     v_cov.z += v_det.x * (f.xx - BLUR) + v_det.y * f.xx;
+#endif
 
     // A colour that is clamped at 0 has the gradient 0.
 #if CHANNELS == 3
@@ -344,7 +391,12 @@ static inline GaussianGrad gaussian_vjp(size_t i, size_t n, const Camera *camera
 #endif
     v.color = vector3(color.x > zero ? v_color.x : zero, color.y > zero ? v_color.y : zero,
                       color.z > zero ? v_color.z : zero);
-    footprint_vjp(camera, &f, mean, unit_quat, v_cov, load_vectors2(splats.v_means2d, i, n), v_depth, &v);
+    const reals2 v_mean2d = load_vectors2(splats.v_means2d, i, n);
+#if RAYS
+    footprint_vjp(camera, &f, mean, unit_quat, v_conic, v_slopes, v_det, v_mean2d, v_depth, &v);
+#else
+    footprint_vjp(camera, &f, mean, unit_quat, v_cov, v_mean2d, v_depth, &v);
+#endif
     v.quat = normalize_quat_vjp(quat, v.quat);
 
     const reals3 offset = lens_offset(camera, mean), direction = normalized3(offset);
@@ -416,22 +468,35 @@ static inline void coefficients_grad(const reals *basis, reals3 v_color, int fir
         transpose(values + LANES * k);
 }
 
-__kernel VECTORS void project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
-                                  const __global real *means, const __global real *log_scales,
-                                  const __global real *quats, const __global real *logit_opacities,
-                                  const __global real *sh, const __global real *conics, const __global real *extents,
-                                  const __global real *colors, const __global real *v_means2d,
-                                  const __global real *v_conics, const __global real *v_opacities,
-                                  const __global real *v_colors, __global real *v_means, __global real *v_log_scales,
-                                  __global real *v_quats, __global real *v_logit_opacities, __global real *v_sh
+__kernel VECTORS void
+project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree, const __global real *means,
+            const __global real *log_scales, const __global real *quats, const __global real *logit_opacities,
+            const __global real *sh, const __global real *conics, const __global real *extents,
+            const __global real *colors, const __global real *v_means2d, const __global real *v_conics,
+#if RAYS
+            const __global real *v_slopes,
+#endif
+            const __global real *v_opacities, const __global real *v_colors, __global real *v_means,
+            __global real *v_log_scales, __global real *v_quats, __global real *v_logit_opacities, __global real *v_sh
 #if CAMERA_GRAD
-                                  ,
-                                  __global real *v_camera
+            ,
+            __global real *v_camera
 #endif
 ) {
     const size_t i = LANES * get_global_id(0);
     const GaussianArrays gaussians = {means, log_scales, quats, logit_opacities, sh};
-    const SplatArrays splats = {conics, extents, colors, v_means2d, v_conics, v_opacities, v_colors};
+    const SplatArrays splats = {
+        conics,
+        extents,
+        colors,
+        v_means2d,
+        v_conics,
+#if RAYS
+        v_slopes,
+#endif
+        v_opacities,
+        v_colors
+    };
     reals basis[16];
     const GaussianGrad v = gaussian_vjp(i, n, &camera, sh_stride, sh_degree, gaussians, splats, basis);
 #if CAMERA_GRAD
@@ -492,23 +557,39 @@ static inline void update_vectors3(const Adam *adam, real rate, reals3 g, size_t
 }
 
 // project_bwd and the step of Adam (adam.cl) in one pass, with the gradients in registers.
-__kernel VECTORS void
-project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const int sh_degree, const Adam adam,
-                 __global real *means, __global real *log_scales, __global real *quats,
-                 __global real *logit_opacities, __global real *sh, __global real *means_1,
-                 __global real *log_scales_1, __global real *quats_1, __global real *logit_opacities_1,
-                 __global real *sh_1, __global real *means_2, __global real *log_scales_2, __global real *quats_2,
-                 __global real *logit_opacities_2, __global real *sh_2, const __global real *conics,
-                 const __global real *extents, const __global real *colors, const __global real *v_means2d,
-                 const __global real *v_conics, const __global real *v_opacities, const __global real *v_colors
+__kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
+                                       const Adam adam, __global real *means, __global real *log_scales,
+                                       __global real *quats, __global real *logit_opacities, __global real *sh,
+                                       __global real *means_1, __global real *log_scales_1, __global real *quats_1,
+                                       __global real *logit_opacities_1, __global real *sh_1, __global real *means_2,
+                                       __global real *log_scales_2, __global real *quats_2,
+                                       __global real *logit_opacities_2, __global real *sh_2,
+                                       const __global real *conics, const __global real *extents,
+                                       const __global real *colors, const __global real *v_means2d,
+                                       const __global real *v_conics,
+#if RAYS
+                                       const __global real *v_slopes,
+#endif
+                                       const __global real *v_opacities, const __global real *v_colors
 #if CAMERA_GRAD
-                 ,
-                 __global real *v_camera
+                                       ,
+                                       __global real *v_camera
 #endif
 ) {
     const size_t i = LANES * get_global_id(0);
     const GaussianArrays gaussians = {means, log_scales, quats, logit_opacities, sh};
-    const SplatArrays splats = {conics, extents, colors, v_means2d, v_conics, v_opacities, v_colors};
+    const SplatArrays splats = {
+        conics,
+        extents,
+        colors,
+        v_means2d,
+        v_conics,
+#if RAYS
+        v_slopes,
+#endif
+        v_opacities,
+        v_colors
+    };
     reals basis[16];
     GaussianGrad v = gaussian_vjp(i, n, &camera, sh_stride, sh_degree, gaussians, splats, basis);
 #if CAMERA_GRAD

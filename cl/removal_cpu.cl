@@ -23,6 +23,7 @@
 // -DTILE=8|16   edge of a tile, px
 // -DCHANNELS    number of colour channels, 1 or more
 // -DLANES=8|16  number of pixels of a block
+// -DRAYS=0|1|2  as in composite_cpu.cl
 #include "common.h"
 #include "composite_blocks.h"
 #include "removal_sums.h"
@@ -31,14 +32,15 @@
 
 __kernel void removal(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
                       const __global uint *tile_ranges, const __global uint *slots, const __global real *background,
-                      const __global real *residuals, const __global uchar *mask, __global real *records) {
+                      const __global real *residuals, const __global uchar *mask, __global real *records DIRECTIONS) {
     const uint t = get_global_id(0);
     const int tiles_x = (width + TILE - 1) / TILE;
     const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
     const int rows = LESSER(TILE, height - y0), columns = LESSER(TILE, width - x0);
 
     // `counts` is 1 in pixels that count and 0 elsewhere.
-    const Grid grid = pixel_grid();
+    Grid grid = pixel_grid();
+    LOAD_DIRECTIONS(grid)
     REALV transmittance[BLOCKS], behind[BLOCKS][CHANNELS], residual[BLOCKS][CHANNELS], counts[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) {
         transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
@@ -74,13 +76,14 @@ __kernel void removal(const int width, const int height, const __global Splat *s
         const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
         for (uint j = 0; j < count; ++j) {
             const Splat *s = &batch[j].splat;
-            const real to_x = x0 - s->x, to_y = y0 - s->y;
+            const Corner corner = corner_from(s, x0, y0);
             REALV difference = 0, agreement = 0, weights = 0, squares = 0, pulls[CHANNELS];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pulls[k] = 0;
             for (uint blocks = unfinished & batch[j].blocks; blocks;) {
                 const uint b = take_block(&blocks);
-                const REALV dx = grid.x[b % COLUMNS] + to_x, dy = grid.y[b / COLUMNS] + to_y;
-                const REALV exponent = splat_exponent(s, dx, dy);
+                const Offset o = offset_in(&grid, b, s, corner);
+                Bend bend;
+                const REALV exponent = splat_exponent(s, &o, &bend);
                 REALV alpha = POWERV(exponent);
                 MASKV live;
                 const REALV weight = splat_over(splat_seen(s, exponent), STOP, &alpha, &live, &transmittance[b]);

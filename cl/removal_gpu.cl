@@ -16,6 +16,7 @@
 // -DCHANNELS    number of colour channels, 1 or more
 // -DSTOP        transmittance at which a pixel is finished
 // -DBATCH       number of splats per batch, 1 or more; the work-group has BATCH work-items
+// -DRAYS=0|1|2  as in composite_cpu.cl
 // -DSUBGROUPS=0|1   1: the device has the functions of subgroups, by cl_khr_subgroups or OpenCL 2.1 and later
 #include "common.h"
 
@@ -28,7 +29,7 @@
 __kernel __attribute__((reqd_work_group_size(BATCH, 1, 1))) void
 removal(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
         const __global uint *tile_ranges, const __global uint *slots, const __global real *image,
-        const __global real *residuals, const __global uchar *mask, __global real *records) {
+        const __global real *residuals, const __global uchar *mask, __global real *records DIRECTIONS) {
     __local real transmittance[PIXELS], behind[CHANNELS][PIXELS], residual[CHANNELS][PIXELS];
     __local uchar counts[PIXELS];
     __local int unfinished;
@@ -70,7 +71,9 @@ removal(const int width, const int height, const __global Splat *splats, const _
             const uint p = step - lane; // wraps to a value beyond PIXELS while no pixel has reached this work-item
             if (lane < count && p < PIXELS && transmittance[p] > 0) {
                 const int2 pixel = pixel_of(x0, y0, p);
-                const real t = splat_exponent(&s, pixel.x + (real)0.5 - s.x, pixel.y + (real)0.5 - s.y);
+                const Offset offset = offset_of(pixel, DIRECTIONS_OF((size_t)pixel.y * width + pixel.x), &s);
+                Bend bend;
+                const real t = splat_exponent(&s, &offset, &bend);
                 real alpha = exp2(t), after = transmittance[p];
                 int live;
                 const real weight = splat_over(splat_seen(&s, t), (real)STOP, &alpha, &live, &after);

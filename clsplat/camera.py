@@ -1,7 +1,7 @@
 """Cameras in OpenCV axes: pinhole, orthographic, fisheye and equirectangular."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal, get_args
 
 import numpy as np
@@ -213,6 +213,33 @@ class Camera:
         return cls(
             viewmat, width / (2 * np.pi), height / np.pi, width / 2, height / 2, width, height, "equirectangular"
         )
+
+
+def pixel_rays(camera: Camera) -> NDArray[np.float64]:
+    """Compute the viewing directions of all pixels' centres; they are kept for the next camera with the same lens.
+
+    Returns
+    -------
+    (H, W, 3) float64
+        Unit vectors in camera coordinates; 0 where no direction is projected. Read-only.
+    """
+    size = camera.width, camera.height
+    return _pixel_rays(camera.model, (camera.fx, camera.fy, camera.cx, camera.cy), camera.distortion, size)
+
+
+@lru_cache(maxsize=2)
+def _pixel_rays(
+    model: CameraModel,
+    intrinsics: tuple[float, ...],
+    distortion: tuple[float, float, float, float],
+    size: tuple[int, int],
+) -> NDArray[np.float64]:
+    fx, fy, cx, cy = intrinsics
+    camera = Camera(np.eye(4), fx, fy, cx, cy, *size, model=model, distortion=distortion)
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.nan_to_num(camera.rays(u, v))
+    rays.flags.writeable = False
+    return rays
 
 
 def _fisheye_radius(angle: ArrayLike, distortion: tuple[float, ...]) -> NDArray[np.float64]:

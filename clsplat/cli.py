@@ -21,6 +21,7 @@ from clsplat.commands.console import warn
 from clsplat.commands.files import Export, Frames, Sfm
 from clsplat.commands.info import Info
 from clsplat.commands.listing import Devices
+from clsplat.commands.meshes import Mesh
 from clsplat.commands.rendering import Eval, Render
 from clsplat.commands.train import Demo, Train
 from clsplat.commands.viewing import View
@@ -54,7 +55,9 @@ DESCRIPTION = """3D Gaussian Splatting on any OpenCL device. COMMAND --help show
 --help-all shows all. Every command accepts -q (--quiet: only warnings and errors) and -v (--verbose: also messages of
 structure from motion and of the driver's compiler, and tracebacks of errors). --version prints the version."""
 
-COMMANDS = Train | View | Export | Render | Eval | Compact | Info | Frames | Sfm | Block | Devices | Demo | Bench
+COMMANDS = (
+    Train | View | Export | Render | Mesh | Eval | Compact | Info | Frames | Sfm | Block | Devices | Demo | Bench
+)
 
 
 def set_loudness(arguments: list[str]) -> list[str]:

@@ -46,6 +46,9 @@ class RenderConfig:
     within each tile afterwards (per_tile). Both give the same image; auto takes global, which was faster wherever it
     was measured. pixel sorts in each pixel by the points where its ray meets the Gaussians: nothing pops when the
     camera turns, but it is slower (StopThePop)."""
+    projection: Literal["affine", "ray"] = "affine"
+    """affine: the paper's local affine approximation of the camera. Its error grows with the angle from the axis and
+    with the size of a Gaussian. ray: exact along the ray of each pixel, for wide angles, fisheyes and panoramas."""
     near: Annotated[float | None, within(above=0)] = None
     """Depth up to which nothing is drawn, world units. Default: three tenths of the depth of the nearest points in
     each photo for a dataset's cameras, 0.01 for others. Without it, Gaussians very close to a camera spread over its
@@ -86,6 +89,9 @@ class DataConfig:
     random_background: bool = False
     """Train each iteration with another background colour. Dark areas then become opaque instead of transparent in
     front of a black background. Evaluation uses `background`."""
+    panoramas: Literal["faces", "whole"] = "faces"
+    """Equirectangular photos become six pinhole photos each, the faces of a cube, or stay as they are. whole needs
+    `--projection ray`, and weighs the pixels at the poles as those at the horizon."""
     masks: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder of masks, named as the photos are (NAME.png or NAME.jpg.png): white pixels train, black ones do not."""
     invert_masks: bool = False
@@ -294,6 +300,9 @@ class TrainConfig:
     exposure: bool = False
     """Learn an affine map of the colours of each training photo, for photos with different exposure or white
     balance."""
+    response: bool = False
+    """With --exposure, also learn a curve of each photo's response, and the vignetting that all photos share: for
+    cameras that change contrast, and for lenses that darken the corners."""
     filter_3d: bool = False
     """Keep every Gaussian at least as thick as the photos resolve (Mip-Splatting's 3D filter), for scenes that will
     be seen from closer or at a larger size than they were photographed, and with --mode antialiased also from farther

@@ -9,7 +9,7 @@ from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer, download, fetch
-from clsplat.stages import Bins, Image, SplatGrads, Splats
+from clsplat.stages import AnyGrads, AnySplats, Bins, Image
 
 Array = NDArray[Any]
 
@@ -23,8 +23,8 @@ class RasterPass(NamedTuple):
     """
 
     camera: Camera
-    splats: Splats
-    colored: Splats
+    splats: AnySplats
+    colored: AnySplats
     bins: Bins
     image: Image
     render: Array
@@ -143,7 +143,7 @@ class Rasterization(_Outputs):
 
 def _to_splats(
     renderer: Renderer, run: RasterPass, v_image: Array, v_alpha: Array, harmonics: bool
-) -> tuple[SplatGrads, Array]:
+) -> tuple[AnyGrads, Array]:
     """Gradients with respect to the splats with RGB and depth, and to the values (N, D) that were composited."""
     v_image, v_cover = v_image.copy(), v_alpha[:, :, 0].copy()
     if "ED" in run.render_mode:  # the accumulated depth over alpha

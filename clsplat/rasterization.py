@@ -12,7 +12,7 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
 from clsplat.raster_gradients import Rasterization, RasterPass
 from clsplat.renderer import Renderer, default_device, download
-from clsplat.stages import Splats
+from clsplat.stages import AnySplats
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -143,7 +143,7 @@ def rasterization(
     return result
 
 
-def _clipped(renderer: Renderer, splats: Splats, radius_clip: float) -> Splats:
+def _clipped(renderer: Renderer, splats: AnySplats, radius_clip: float) -> AnySplats:
     """The splats without those whose half widths are at most `radius_clip`, px."""
     if not radius_clip >= 0:
         raise InputError(f"radius_clip: expected a number, 0 or more, found {radius_clip}")
@@ -210,7 +210,7 @@ def _cameras(
 
 def _composited(
     renderer: Renderer,
-    splats: Splats,
+    splats: AnySplats,
     camera: Camera,
     values: NDArray[Any],
     behind: NDArray[Any],

@@ -12,9 +12,10 @@ from clsplat.camera import Camera, default_near
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.renderer import BLACK, Gradients, Pass, Renderer, download, fetch
+from clsplat.renderer import BLACK, Gradients, Pass, Renderer, along_rays, download, fetch
 from clsplat.scene import Color
-from clsplat.stages import Image
+from clsplat.stages import Image, RaySplats
+from clsplat.surface import Surface, surface_of
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -46,6 +47,23 @@ class Rendering:
     def _repr_png_(self) -> bytes:
         return display.png(self.rgb)
 
+    def surface(self) -> Surface:
+        """Find the surface in the image: median depths and normals. They have no gradient.
+
+        Raises
+        ------
+        InputError
+            As `backward`, which needs the same parts of the rendering.
+        """
+        if self._run is None:
+            self._check(None, None, None, False)
+            height, width = self.alpha.shape
+            ids, zeros = np.full((height, width), -1, np.int32), np.zeros((height, width, 4))
+            return Surface(ids, zeros[:, :, 0], zeros[:, :, 1:])
+        run = self._run
+        ids = download(self._renderer.stages.median_splats(run.drawn, run.bins))
+        return surface_of(fetch(self._gaussians), run.camera, np.where(ids < len(self._gaussians), ids, -1))
+
     def backward(
         self,
         v_rgb: Array | None = None,
@@ -75,7 +93,7 @@ class Rendering:
             If a shape does not fit, v_depth is given though no depth was rendered, or the rendering was made without
             gradients.
         """
-        self._check(v_rgb, v_alpha, v_depth)
+        self._check(v_rgb, v_alpha, v_depth, intrinsics_grad)
         if self._run is None:
             zeros = Gaussians(**{k: np.zeros_like(a) for k, a in self._gaussians.arrays().items()})
             result = Gradients(zeros, np.zeros((0, 2)), np.zeros((4, 4)), np.zeros(4))
@@ -89,12 +107,20 @@ class Rendering:
             intrinsics=result.intrinsics if intrinsics_grad else None,
         )
 
-    def _check(self, v_rgb: Array | None, v_alpha: Array | None, v_depth: Array | None) -> None:
+    def _check(
+        self, v_rgb: Array | None, v_alpha: Array | None, v_depth: Array | None, intrinsics_grad: bool
+    ) -> None:
         if self._run is None and len(self._gaussians):
             raise InputError(
                 "gradients: expected a rendering made with gradients=True of a camera that is not equirectangular, "
-                "found another"
+                'or along its rays (projection="ray"), found another'
             )
+        if intrinsics_grad and self._run and isinstance(self._run.splats, RaySplats):
+            if self._run.camera.model != "pinhole":
+                raise InputError(
+                    "intrinsics_grad: expected a pinhole camera for the projection along rays, found one of model "
+                    f"{self._run.camera.model}"
+                )
         for name, v, shape in (
             ("v_rgb", v_rgb, self.rgb.shape),
             ("v_alpha", v_alpha, self.alpha.shape),
@@ -134,7 +160,8 @@ def render(
     gaussians : Gaussians
         Pre-activation, on the host.
     camera : Camera
-        An equirectangular one is resampled from six faces of a cube, and has no gradients.
+        With the affine projection, an equirectangular one is resampled from six faces of a cube, and has no
+        gradients.
     config : RenderConfig
     device : Device, "reference" or None
         None takes the default OpenCL device, opened once and kept; "reference" the float64 twins, which are exact,
@@ -237,7 +264,7 @@ def _rendered(
         behind = np.array([*renderer.background, *[0.0] * depth], renderer.real)
         image: Array = np.broadcast_to(behind, (camera.height, camera.width, len(behind)))
         return None, image, np.zeros(image.shape[:2], renderer.real)
-    if camera.model == "equirectangular":
+    if camera.model == "equirectangular" and not along_rays(renderer.config, camera):
         layers = []
         for face in panorama.faces(camera):
             _, image, alpha = _rendered(renderer, gaussians, face, degree, depth, gradients=False)

@@ -14,7 +14,7 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.ranges import check
 from clsplat.scene import Color
-from clsplat.stages import Bins, Dropout, Image, SplatGrads, Splats, Stages
+from clsplat.stages import AnyGrads, AnySplats, Bins, Dropout, Image, Stages
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -49,8 +49,8 @@ class Pass:
     gaussians: Gaussians
     camera: Camera
     sh_degree: int
-    splats: Splats
-    drawn: Splats
+    splats: AnySplats
+    drawn: AnySplats
     bins: Bins
     image: Image
     disparities: Any = None
@@ -98,6 +98,11 @@ class Renderer:
         backdrop: Gaussians | None = None,
     ):
         check(config)
+        if config.projection == "ray" and config.sort == "pixel":
+            raise InputError(
+                "sort: expected auto, global or per_tile for the projection along rays, found pixel; it needs the "
+                "affine projection"
+            )
         check_color("background", background)
         self.config, self.background = config, background
         self.device: Device | None = None
@@ -162,7 +167,7 @@ class Renderer:
         gaussians : Gaussians of N >= 1 rows
             On the host or where the stages run.
         camera : Camera
-            Of a model that kernels project to: not equirectangular.
+            An equirectangular one needs the projection along rays.
         sh_degree : int, optional
             Highest degree of the spherical harmonics evaluated; default: all that are stored.
         background : (3,) floats, optional
@@ -189,7 +194,7 @@ class Renderer:
         drawn = splats
         if self.backdrop is not None:
             others = self._project(self.backdrop, camera, self.backdrop.sh_degree, len(behind))
-            drawn = Splats(*map(self.stages.join_rows, splats, others))
+            drawn = self._joined(splats, others)
         # The reference works splat by splat and gains nothing from tiles.
         tile_size = max(camera.width, camera.height) if self.device is None else config.tile_size
         by_pixel = config.sort == "pixel"
@@ -204,17 +209,23 @@ class Renderer:
         image = self.stages.composite_fwd(drawn, bins, behind, compositor=config.compositor, disparities=disparities)
         return Pass(gaussians, camera, degree, splats, drawn, bins, image, disparities, dropout)
 
-    def _project(self, gaussians: Gaussians, camera: Camera, sh_degree: int, channels: int) -> Splats:
-        antialiased = self.config.mode == "antialiased"
-        return self.stages.project_fwd(gaussians, camera, sh_degree, antialiased=antialiased, channels=channels)
+    def _project(self, gaussians: Gaussians, camera: Camera, sh_degree: int, channels: int) -> AnySplats:
+        options = {"antialiased": self.config.mode == "antialiased", "rays": along_rays(self.config, camera)}
+        return self.stages.project_fwd(gaussians, camera, sh_degree, channels=channels, **options)
 
-    def backward_to_splats(self, run: Pass, v_image: Image) -> SplatGrads:
+    def _joined(self, splats: AnySplats, others: AnySplats) -> AnySplats:
+        """Splats of two scenes. The directions of rays belong to the camera, not to a splat."""
+        rows = zip(splats._asdict().items(), others, strict=True)
+        joined = {name: a if name == "directions" else self.stages.join_rows(a, b) for (name, a), b in rows}
+        return type(splats)(**joined)
+
+    def backward_to_splats(self, run: Pass, v_image: Image) -> AnyGrads:
         """Gradients with respect to the splats: the first half of `backward`."""
         v_splats = self.stages.composite_bwd(
             run.drawn, run.bins, run.image, v_image, compositor=self.config.compositor, disparities=run.disparities
         )
         if run.drawn is not run.splats:
-            v_splats = SplatGrads(*(v[: len(run.gaussians)] for v in v_splats))
+            v_splats = type(v_splats)(*(v[: len(run.gaussians)] for v in v_splats))
         if run.dropout:
             self.stages.dropout_bwd(v_splats, run.dropout)
         return v_splats
@@ -241,6 +252,11 @@ class Renderer:
             camera_grad=camera_grad,
         )
         return Gradients(v_gaussians, v_splats.means2d, *(v_camera or (None, None)))
+
+
+def along_rays(config: RenderConfig, camera: Camera) -> bool:
+    """Whether Gaussians are evaluated along rays. For an orthographic camera, the affine projection is exact."""
+    return config.projection == "ray" and camera.model != "orthographic"
 
 
 def check_color(name: str, color: Any) -> None:

@@ -5,8 +5,9 @@ containers. N Gaussians, M intersections of a splat with a tile, T tiles, C colo
 """
 
 from collections.abc import Iterable
-from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from clsplat.field_stages import FieldStages
 
 if TYPE_CHECKING:
     from clsplat.camera import Camera
@@ -21,10 +22,6 @@ ERANK_SLACK = 1e-5
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
 """Slope and centre of the sigmoid of the opacity that fades out the noise on the means (original code of Kheradmand
 et al. 2024)."""
-
-
-EXPONENT_MAX = 15.0
-"""Largest exponent of a field's density, which is exp of a network's result (code of Müller et al. 2022)."""
 
 
 class Splats(NamedTuple):
@@ -43,6 +40,25 @@ class Splats(NamedTuple):
     colors: Any
 
 
+class RaySplats(NamedTuple):
+    """Gaussians projected for evaluation along rays; the first six fields are those of `Splats`.
+
+    means2d, conics and extents are the outline, outside of which alpha < ALPHA_MIN: an ellipse, or where the conic is
+    0 the box of the extents. rays (N, 8 or 17): the terms of the exponent (cl/gaussian_rays.h): the centre in a chart,
+    Q (xx, xy, yy), the slopes of lambda and k; 17 with the axes of a chart of its own. directions (H, W, 3): unit
+    vectors of the pixels' rays in the camera's frame, for such charts; otherwise (1, 1, 3) zeros.
+    """
+
+    means2d: Any
+    conics: Any
+    depths: Any
+    extents: Any
+    opacities: Any
+    colors: Any
+    rays: Any
+    directions: Any
+
+
 class SplatGrads(NamedTuple):
     """Gradients with respect to the fields of `Splats` that compositing reads, of the same shapes."""
 
@@ -50,6 +66,27 @@ class SplatGrads(NamedTuple):
     conics: Any
     opacities: Any
     colors: Any
+
+
+class RayGrads(NamedTuple):
+    """Gradients with respect to what compositing reads of `RaySplats`.
+
+    means2d (N, 2): by the centre in the chart, px^-1; conics (N, 3) and slopes (N, 3): by Q, and by the slopes and k;
+    opacities and colors as in `SplatGrads`.
+    """
+
+    means2d: Any
+    conics: Any
+    slopes: Any
+    opacities: Any
+    colors: Any
+
+
+AnySplats = Splats | RaySplats
+"""Projected Gaussians of either projection."""
+
+AnyGrads = SplatGrads | RayGrads
+"""Gradients with respect to them."""
 
 
 class CameraGrads(NamedTuple):
@@ -123,65 +160,6 @@ class Removal(NamedTuple):
     pulls: Any
 
 
-class RayColors(NamedTuple):
-    """Result of compositing samples along R rays.
-
-    rgb (R, 3), background included; transmittances (S,): light that reaches each sample, 0 behind the end of its ray;
-    behind (R,): light that reaches the background.
-    """
-
-    rgb: Any
-    transmittances: Any
-    behind: Any
-
-
-class Marching(NamedTuple):
-    """How rays are sampled: every max(step, cone t) from t = near to t = far, lengths in the field's coordinates.
-
-    Without `contracted`, rays begin and end at the unit cube; with it, space is contracted to a ball of radius 2.
-    """
-
-    step: float
-    cone: float
-    near: float
-    far: float
-    contracted: bool
-
-
-class Samples(NamedTuple):
-    """Samples of R rays, S in all; a device array has at least one entry.
-
-    positions (S, 3) in the unit cube; deltas (S,), lengths that they stand for; rays_of (S,) uint32; first (R + 1,)
-    uint32: ray r has the samples first[r] to first[r + 1], front to back; total: S.
-    """
-
-    positions: Any
-    deltas: Any
-    rays_of: Any
-    first: Any
-    total: int
-
-
-class HashLevels(NamedTuple):
-    """Levels of a hash grid, from coarse to fine.
-
-    resolutions: cells along an edge of each level; offsets: first entry of each level in the table, and the number of
-    all entries at the end. A level has an entry for each corner of its cells, unless that exceeds the largest size.
-    """
-
-    resolutions: tuple[int, ...]
-    offsets: tuple[int, ...]
-
-    @classmethod
-    def geometric(cls, count: int, coarsest: int, finest: int, entries: int) -> "HashLevels":
-        """Make `count` levels whose resolutions are a geometric sequence, of at most `entries` entries each (Müller
-        et al. 2022, equations 2 and 3)."""
-        growth = (finest / coarsest) ** (1 / max(count - 1, 1))
-        resolutions = tuple(round(coarsest * growth**level) for level in range(count))
-        sizes = (min((resolution + 1) ** 3, entries) for resolution in resolutions)
-        return cls(resolutions, tuple(accumulate(sizes, initial=0)))
-
-
 class AdamStep(NamedTuple):
     """One step of the optimiser: its number, counted from 1, and its constants.
 
@@ -200,7 +178,7 @@ class AdamStep(NamedTuple):
     penalties: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-class Stages(Protocol):
+class Stages(FieldStages, Protocol):
     """The functions of all stages, on a device (`clsplat.ops.Launches`) or in NumPy (the module `clsplat.reference`).
 
     This is the only list of their names. Each function's docstring is with its launch in `clsplat.ops`.
@@ -214,16 +192,17 @@ class Stages(Protocol):
         *,
         antialiased: bool = False,
         channels: int = 3,
-    ) -> Splats: ...
+        rays: bool = False,
+    ) -> AnySplats: ...
     def join_rows(self, first: Array, second: Array) -> Array: ...
-    def project_disparities(self, gaussians: "Gaussians", camera: "Camera", splats: Splats) -> Array: ...
+    def project_disparities(self, gaussians: "Gaussians", camera: "Camera", splats: AnySplats) -> Array: ...
     def project_bwd(
         self,
         gaussians: "Gaussians",
         camera: "Camera",
         sh_degree: int,
-        splats: Splats,
-        v_splats: SplatGrads,
+        splats: AnySplats,
+        v_splats: AnyGrads,
         *,
         antialiased: bool = False,
         camera_grad: bool = False,
@@ -233,18 +212,18 @@ class Stages(Protocol):
         gaussians: "Gaussians",
         moments: tuple["Gaussians", "Gaussians"],
         camera: "Camera",
-        splats: Splats,
-        v_splats: SplatGrads,
+        splats: AnySplats,
+        v_splats: AnyGrads,
         step: AdamStep,
         *,
         antialiased: bool = False,
         camera_grad: bool = False,
     ) -> CameraGrads | None: ...
-    def dropout_fwd(self, splats: Splats, dropout: Dropout) -> None: ...
-    def dropout_bwd(self, v_splats: SplatGrads, dropout: Dropout) -> None: ...
+    def dropout_fwd(self, splats: AnySplats, dropout: Dropout) -> None: ...
+    def dropout_bwd(self, v_splats: AnyGrads, dropout: Dropout) -> None: ...
     def bin_splats(
         self,
-        splats: Splats,
+        splats: AnySplats,
         width: int,
         height: int,
         tile_size: int,
@@ -253,21 +232,28 @@ class Stages(Protocol):
         scheme: str = "auto",
     ) -> Bins: ...
     def composite_fwd(
-        self, splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto", disparities: Array = None
+        self,
+        splats: AnySplats,
+        bins: Bins,
+        background: Any,
+        *,
+        compositor: str = "auto",
+        disparities: Array = None,
     ) -> Image: ...
     def composite_bwd(
         self,
-        splats: Splats,
+        splats: AnySplats,
         bins: Bins,
         image: Image,
         v_image: Image,
         *,
         compositor: str = "auto",
         disparities: Array = None,
-    ) -> SplatGrads: ...
-    def count_pairs(self, splats: Splats, bins: Bins) -> tuple[Array, Array]: ...
+    ) -> AnyGrads: ...
+    def count_pairs(self, splats: AnySplats, bins: Bins) -> tuple[Array, Array]: ...
+    def median_splats(self, splats: AnySplats, bins: Bins) -> Array: ...
     def removal(
-        self, splats: Splats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
+        self, splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
     ) -> Removal: ...
     def exposure_fwd(self, image: Array, affine: Any, photo: Array) -> Array: ...
     def exposure_bwd(self, image: Array, affine: Any, photo: Array, v_image: Array) -> Any: ...
@@ -304,31 +290,9 @@ class Stages(Protocol):
         self, keys: Array, bits: int, method: str = "auto", *, values: Array = None
     ) -> tuple[Array, Array]: ...
     def argsort_segments(self, keys: Array, bits: int, ranges: Array, values: Array = None) -> Array: ...
-    def rays_fwd(self, sigmas: Array, colors: Array, deltas: Array, first: Array, background: Any) -> RayColors: ...
-    def rays_bwd(
-        self,
-        sigmas: Array,
-        colors: Array,
-        deltas: Array,
-        first: Array,
-        background: Any,
-        transmittances: Array,
-        v_rgb: Array,
-    ) -> tuple[Array, Array]: ...
-    def hashgrid_fwd(self, positions: Array, table: Array, levels: HashLevels) -> Array: ...
-    def hashgrid_bwd(self, positions: Array, v_features: Array, levels: HashLevels) -> Array: ...
-    def march(
-        self, origins: Array, directions: Array, offsets: Array, occupied: Array, marching: Marching
-    ) -> Samples: ...
-    def heads_join(self, features: Array, directions: Array, rays_of: Array) -> Array: ...
-    def heads_fwd(self, features: Array, outputs: Array) -> tuple[Array, Array]: ...
-    def heads_bwd(self, colors: Array, v_colors: Array) -> Array: ...
-    def heads_join_bwd(self, v_inputs: Array, features: Array, sigmas: Array, v_sigmas: Array) -> Array: ...
-    def mlp_fwd(self, inputs: Array, weights: Array, widths: tuple[int, ...]) -> tuple[Array, Array]: ...
-    def mlp_bwd(
-        self, inputs: Array, weights: Array, widths: tuple[int, ...], hidden: Array, v_outputs: Array
-    ) -> tuple[Array, Array]: ...
 
 
-FUNCTIONS: tuple[str, ...] = tuple(name for name in vars(Stages) if not name.startswith("_"))
+FUNCTIONS: tuple[str, ...] = tuple(
+    name for part in (Stages, FieldStages) for name in vars(part) if not name.startswith("_")
+)
 """Names of the functions of `Stages`, in the order of the pipeline."""

@@ -38,19 +38,21 @@ def camera_struct(camera: Camera, real: Any) -> np.ndarray:
     return struct
 
 
-def lens_define(camera: Camera) -> str:
-    """Value of -DLENS (cl/lens.h) for a camera.
+def lens_define(camera: Camera, rays: bool = False) -> str:
+    """Value of -DLENS (cl/lens.h) for a camera, and whether Gaussians are evaluated along its rays.
 
     Raises
     ------
     InputError
-        If the camera is equirectangular: no kernel projects to such an image.
+        If the camera is equirectangular, and has no affine approximation; or orthographic with `rays`.
     """
-    if camera.model == "equirectangular":
+    if camera.model == "equirectangular" and not rays:
         raise InputError(
             "camera: expected a pinhole, orthographic or fisheye camera, found an equirectangular one; "
-            "`render` draws such panoramas, and datasets train on their six faces"
+            "`render` draws such panoramas, and --projection ray projects to them"
         )
+    if camera.model == "orthographic" and rays:
+        raise InputError("camera: expected a perspective one for rays=True, found an orthographic one")
     return camera.model.upper()
 
 

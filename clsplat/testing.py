@@ -24,7 +24,7 @@ from clsplat.gaussians import Gaussians, sigmoid
 from clsplat.reference import project_fwd
 from clsplat.reference.lens import lens
 from clsplat.reference.sh import sh_basis
-from clsplat.stages import Splats
+from clsplat.stages import AnySplats
 
 Array = NDArray[Any]
 
@@ -140,7 +140,7 @@ def gradcheck(
             )
 
 
-def _pixel_distances(splats: Splats, width: int, height: int) -> Iterator[tuple[int, Array]]:
+def _pixel_distances(splats: AnySplats, width: int, height: int) -> Iterator[tuple[int, Array]]:
     """Yield each splat and the distances (H, W) of its pixels from a threshold, front to back, without tiles."""
     x, y = np.arange(width)[None, :] + 0.5, np.arange(height)[:, None] + 0.5
     transmittance: Array = np.ones((height, width))
@@ -160,7 +160,7 @@ def _pixel_distances(splats: Splats, width: int, height: int) -> Iterator[tuple[
         transmittance = np.where(drawn, behind, transmittance)
 
 
-def ambiguous_pixels(splats: Splats, width: int, height: int, *, margin: float = 1e-3) -> NDArray[np.bool_]:
+def ambiguous_pixels(splats: AnySplats, width: int, height: int, *, margin: float = 1e-3) -> NDArray[np.bool_]:
     """Pixels in which rounding may decide whether a splat is drawn, is clamped, or is the last one.
 
     Parameters

@@ -26,14 +26,14 @@ LAYERS = """
     constants errors randomness display
     ranges json_lines processors
     config atomic
-    camera gaussians
+    camera gaussians field_stages
     scene stages metrics panorama programs
     buffers
     structs reference device
-    ops testing formats
+    ops testing formats surface
     renderer selftest
     render dataset demo raster_gradients fields
-    rasterization pruning
+    rasterization pruning meshing
     training show
     evaluate blocks
     bench
@@ -133,7 +133,7 @@ def test_imports_go_one_way(path):
 
 @pytest.mark.parametrize("path", [p for p in MODULES if unit_of(p) == "reference"], ids=lambda p: p.stem)
 def test_twins_import_numpy_only(path):
-    ours = {f"clsplat.{unit}" for unit in ("camera", "constants", "errors", "gaussians", "stages")}
+    ours = {f"clsplat.{unit}" for unit in ("camera", "constants", "errors", "field_stages", "gaussians", "stages")}
     for name in imports_of(path):
         allowed = name in ours or name.startswith("clsplat.reference.") or name.split(".")[0] == "numpy"
         assert allowed or name.split(".")[0] in sys.stdlib_module_names, name
@@ -215,12 +215,14 @@ def test_no_path_of_a_machine():
 DEFINES = {
     "noise": {"GATE_SLOPE": 100.0, "GATE_OPACITY": 0.005},
     "bin": {"TILE": 16, "GRADIENTS": 1},
-    "composite_cpu": {"TILE": 8, "CHANNELS": 1, "LANES": 8},
-    "composite_gpu": {"TILE": 8, "CHANNELS": 1, "ITEMS": 32, "BATCH": 16, "SUBGROUPS": 0},
+    "composite_cpu": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "RAYS": 2},
+    "composite_gpu": {"TILE": 8, "CHANNELS": 1, "ITEMS": 32, "BATCH": 16, "RAYS": 1, "SUBGROUPS": 0},
     "composite_sorted": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "WINDOW": 2},
     "count": {"TILE": 16},
+    "exposure": {"RESPONSE": 1},
     "filter": {"FILTER_VARIANCE": 0.2, "LENS": "FISHEYE"},
     "hashgrid": {"RESOLUTIONS": "4,8", "OFFSETS": "0,125,637"},
+    "voxels": {"FEATURES": 28, "TV_EPS": 1e-9},
     "heads": {"EXPONENT_MAX": 15.0},
     "march": {"CONTRACTED": 1},
     "loss": {
@@ -228,9 +230,13 @@ DEFINES = {
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
     },
     "mlp_cpu": {"WIDTHS": "32,64,16", "WIDEST": 64, "ROWS": 6},
-    "project": {"CHANNELS": 4, "ANTIALIASED": 1, "CAMERA_GRAD": 1, "GROUP": 32, "LENS": "FISHEYE", "LANES": 1},
-    "removal_cpu": {"TILE": 8, "CHANNELS": 1, "LANES": 16},
-    "removal_gpu": {"TILE": 8, "CHANNELS": 1, "STOP": 1e-6, "BATCH": 16, "SUBGROUPS": 0},
+    "median": {"TILE": 16, "CHANNELS": 3, "RAYS": 1},
+    "project": {
+        **{"CHANNELS": 4, "ANTIALIASED": 1, "CAMERA_GRAD": 1, "GROUP": 32},
+        **{"LENS": "FISHEYE", "RAYS": 0, "LANES": 1},
+    },
+    "removal_cpu": {"TILE": 8, "CHANNELS": 1, "LANES": 16, "RAYS": 2},
+    "removal_gpu": {"TILE": 8, "CHANNELS": 1, "STOP": 1e-6, "BATCH": 16, "RAYS": 0, "SUBGROUPS": 0},
     "roof": {"WIDTH": 16, "HALVES": 1},
     "scan": {"GROUP": 32},
     "sort": {
@@ -244,6 +250,7 @@ FORBIDDEN = [
     ("composite_cpu", "TILE", 12),
     ("composite_cpu", "CHANNELS", 0),
     ("composite_cpu", "LANES", 4),
+    ("composite_cpu", "RAYS", 3),
     ("composite_gpu", "TILE", 32),
     ("composite_gpu", "CHANNELS", 0),
     ("composite_gpu", "ITEMS", 48),
@@ -253,18 +260,25 @@ FORBIDDEN = [
     ("composite_sorted", "CHANNELS", 0),
     ("composite_sorted", "WINDOW", 0),
     ("count", "TILE", 0),
-    ("filter", "LENS", 4),
+    ("exposure", "RESPONSE", 2),
+    ("filter", "LENS", 5),
     ("loss", "RADIUS", 0),
     ("loss", "LANES", 8),
     ("loss", "VECTORS", 0),
     ("loss", "GROUP", 0),
+    ("median", "TILE", 0),
+    ("median", "CHANNELS", 0),
+    ("median", "RAYS", 3),
     ("march", "CONTRACTED", 2),
+    ("voxels", "FEATURES", 0),
     ("mlp_cpu", "WIDEST", 272),
     ("mlp_cpu", "ROWS", 8),
     ("project", "CHANNELS", 5),
     ("project", "ANTIALIASED", 2),
     ("project", "CAMERA_GRAD", 2),
     ("project", "LENS", "MIRROR"),
+    ("project", "LENS", "EQUIRECTANGULAR"),
+    ("project", "RAYS", 2),
     ("project", "GROUP", 0),
     ("removal_cpu", "TILE", 12),
     ("removal_cpu", "CHANNELS", 0),

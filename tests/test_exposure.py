@@ -8,6 +8,7 @@ from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.config import OptimConfig
+from clsplat.reference.exposure import squared_radius
 from clsplat.testing import assert_matches, gradcheck
 from clsplat.training import photo_exposures as exposure
 
@@ -15,10 +16,13 @@ from clsplat.training import photo_exposures as exposure
 SIZES = [(1, 1), (5, 7), (64, 64), (65, 64), (97, 131)]
 
 
-def inputs(height, width):
+COLUMNS = pytest.mark.parametrize("columns", [4, 6], ids=["affine", "response"])
+
+
+def inputs(height, width, columns=4):
     """Image, map, photo and gradient, exact in single precision; a third of the photo each is black and white."""
     rng = np.random.default_rng(height)
-    arrays = rng.uniform(0, 1, (height, width, 3)), rng.normal(size=(3, 4)), rng.normal(size=(height, width, 3))
+    arrays = rng.uniform(0, 1, (height, width, 3)), rng.normal(size=(3, columns)), rng.normal(size=(height, width, 3))
     image, affine, v_image = (a.astype(np.float32).astype(np.float64) for a in arrays)
     return [image, affine, rng.choice([0, 128, 255], image.shape).astype(np.uint8), v_image]
 
@@ -65,18 +69,20 @@ def test_what_the_camera_clips_counts_as_clipped(any_device):
         np.testing.assert_array_equal(v_affine[:, 3], [4 + 7, 5 + 8, 3 + 6 + 9])
 
 
+@COLUMNS
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_matches_twin(any_device, height, width):
-    check(any_device, height, width)
+def test_matches_twin(any_device, height, width, columns):
+    check(any_device, height, width, columns)
 
 
+@COLUMNS
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_matches_twin_as_cpu_and_gpu(configured_device, height, width):
-    check(configured_device, height, width)
+def test_matches_twin_as_cpu_and_gpu(configured_device, height, width, columns):
+    check(configured_device, height, width, columns)
 
 
-def check(device, height, width):
-    given = inputs(height, width)
+def check(device, height, width, columns):
+    given = inputs(height, width, columns)
     tolerances = DOUBLE if device.real == np.float64 else FLOAT
     for name, found, expected in zip(
         ("image", "v_image", "v_affine"), by_kernel(device, *given), by_twin(*given), strict=True
@@ -84,15 +90,60 @@ def check(device, height, width):
         assert_matches(name, found, expected, tolerances)
 
 
-def test_gradients_by_central_differences(device64):
-    image, affine, photo, v = inputs(9, 11)
+@COLUMNS
+def test_gradients_by_central_differences(device64, columns):
+    image, affine, photo, v = inputs(9, 11, columns)
     _, v_image, v_affine = by_kernel(device64, image, affine, photo, v)
-    assert (v_image == 0).any()
+    assert (v_image == 0).any() or columns == 6
     gradcheck(
         lambda image, affine: float((by_kernel(device64, image, affine, photo, v)[0] * v).sum()),
         {"image": image, "affine": affine},
         {"image": v_image, "affine": v_affine},
     )
+
+
+def test_curve_and_vignetting_in_numbers(any_device):
+    """The corner of an image is darker by the whole falloff, its middle by nothing; the curve vanishes at 0 and 1."""
+    image = np.full((3, 3, 3), 0.5)
+    image[0, 1], image[1, 0] = 0, 1
+    affine = np.concatenate([np.eye(3, 4), [[0.4, -0.25], [0.4, -0.25], [0.4, -0.5]]], axis=1)
+    photo = np.full(image.shape, 128, np.uint8)
+    for run in (by_twin, partial(by_kernel, any_device)):
+        adjusted, _, v_affine = run(image, affine, photo, np.ones_like(image))
+        np.testing.assert_allclose(adjusted[1, 1], 0.5 + 0.4 * 0.25, rtol=1e-6)
+        # Of a side of 3 pixels, the centres of the corner pixels are two thirds of the way to the corners.
+        np.testing.assert_allclose(adjusted[0, 0], 0.6 - np.array([0.25, 0.25, 0.5]) * (2 / 3) ** 2 * 0.5, rtol=1e-6)
+        np.testing.assert_allclose(adjusted[0, 1], 0, atol=1e-6)
+        np.testing.assert_allclose(v_affine[:, 4], 7 * 0.25, rtol=1e-6)
+        np.testing.assert_allclose(v_affine[:, 5], 4 / 9 * 4 * 0.5 + 2 / 9 * (1 + 2 * 0.5), rtol=1e-6)
+
+
+def test_photos_find_their_curves_and_the_common_vignetting():
+    rng = np.random.default_rng(0)
+    image, photo = rng.uniform(0, 1, (8, 8, 3)), np.full((8, 8, 3), 128, np.uint8)
+    truth = {}
+    for k, curve in enumerate((-0.2, 0.0, 0.2)):
+        truth[f"{k}.png"] = np.concatenate([np.eye(3, 4), np.full((3, 1), curve), np.full((3, 1), -0.3)], axis=1)
+    exposures, config = exposure.start(list(truth), response=True), OptimConfig()
+    for k in range(3000):
+        name = list(truth)[k % 3]
+        affine = exposures.of(name)
+        off = reference.exposure_fwd(image, affine, photo) - reference.exposure_fwd(image, truth[name], photo)
+        v = 2 * off / image.size
+        exposure.update(exposures, name, reference.exposure_bwd(image, affine, photo, v), k / 3000, config)
+        np.testing.assert_allclose(exposures.values.mean(axis=0)[:, :5], exposure.RESPONSE[:, :5], atol=1e-12)
+    for name, expected in truth.items():
+        np.testing.assert_allclose(exposures.of(name), expected, atol=0.03)
+
+
+def test_no_lens_brightens_the_corners():
+    image, photo = np.full((8, 8, 3), 0.5), np.full((8, 8, 3), 128, np.uint8)
+    exposures = exposure.start(["a.png", "b.png"], response=True)
+    for k in range(50):
+        affine = exposures.of("a.png")
+        v = reference.exposure_fwd(image, affine, photo) - image * (1 + 0.3 * squared_radius(8, 8))
+        exposure.update(exposures, "a.png", reference.exposure_bwd(image, affine, photo, v), k / 50, OptimConfig())
+        assert (exposures.values[:, :, 5] == 0).all()
 
 
 def test_photos_find_their_exposures_and_the_mean_stays():
@@ -117,6 +168,8 @@ def test_photos_find_their_exposures_and_the_mean_stays():
 def test_a_photo_is_seen_as_the_scene_would_show_it():
     photo = np.random.default_rng(0).integers(20, 200, (4, 5, 3), dtype=np.uint8)
     affine = np.array([[1.1, 0.02, 0, 0.01], [0, 0.9, 0.01, 0], [0, 0, 1.05, -0.02]])
-    neutral = exposure.neutral(photo, affine)
-    back = 255 * reference.exposure_fwd(neutral / 255, affine, photo)
-    np.testing.assert_allclose(back, photo, atol=0.6)  # of 255: half a step of rounding, times the gains
+    bent = np.concatenate([affine, [[0.1, -0.2], [-0.1, -0.2], [0.15, -0.3]]], axis=1)
+    for some in (affine, bent):
+        neutral = exposure.neutral(photo, some)
+        back = 255 * reference.exposure_fwd(neutral / 255, some, photo)
+        np.testing.assert_allclose(back, photo, atol=0.7)  # of 255: half a step of rounding, times the gains

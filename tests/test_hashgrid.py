@@ -5,8 +5,8 @@ import pytest
 from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
+from clsplat.field_stages import HashLevels
 from clsplat.reference.hashgrid import corners
-from clsplat.stages import HashLevels
 from clsplat.testing import assert_matches, gradcheck
 
 # Levels with an entry per corner, and levels with collisions; one size that is no power of two.

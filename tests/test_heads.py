@@ -5,7 +5,7 @@ import pytest
 from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
-from clsplat.stages import EXPONENT_MAX
+from clsplat.field_stages import EXPONENT_MAX
 from clsplat.testing import assert_matches, gradcheck
 
 
@@ -64,3 +64,44 @@ def test_gradients_by_central_differences(device64):
         return float((joined * v_inputs).sum() + sigmas @ v_sigmas + (colors * v_colors).sum())
 
     gradcheck(total, {"features": features, "outputs": outputs}, {"features": v_features, "outputs": v_outputs})
+
+
+SCALE = 7.0
+
+
+def harmonics(samples=301):
+    """Features of Plenoxels, with densities and colours on both sides of 0, and what `inputs` has besides."""
+    _, directions, _, v_sigmas, v_colors, _, rays_of = inputs(samples)
+    features = np.random.default_rng(1).normal(size=(samples, 28)).astype(np.float32).astype(np.float64)
+    return features, directions, rays_of, v_sigmas, v_colors
+
+
+def sh_by_kernel(device, features, directions, rays_of, v_sigmas, v_colors):
+    x, d, v_s, v_c = (device.upload("array", a) for a in (features, directions, v_sigmas, v_colors))
+    rays = device.upload("rays", rays_of, np.uint32)
+    results = [*ops.heads_sh_fwd(device, x, d, rays, SCALE), ops.heads_sh_bwd(device, x, d, rays, SCALE, v_s, v_c)]
+    return [a.get() for a in results]
+
+
+def test_harmonics_match_twin(any_device):
+    features, directions, rays_of, v_sigmas, v_colors = given = harmonics()
+    sigmas, colors = reference.heads_sh_fwd(features, directions, rays_of, SCALE)
+    assert (sigmas == 0).any() and (colors == 0).any() and (colors > 0).any()
+    v_features = reference.heads_sh_bwd(features, directions, rays_of, SCALE, v_sigmas, v_colors)
+    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    found = sh_by_kernel(any_device, *given)
+    for name, array, expected in zip(
+        ("sigmas", "sample colours", "v_features"), found, (sigmas, colors, v_features), strict=True
+    ):
+        assert_matches(name, array, expected, tolerances)
+
+
+def test_gradients_of_harmonics_by_central_differences(device64):
+    features, *rest = harmonics(40)
+    *_, v_sigmas, v_colors = rest
+
+    def total(features):
+        sigmas, colors, _ = sh_by_kernel(device64, features, *rest)
+        return float(sigmas @ v_sigmas + (colors * v_colors).sum())
+
+    gradcheck(total, {"features": features}, {"features": sh_by_kernel(device64, features, *rest)[2]})

@@ -5,8 +5,8 @@ import pytest
 from tolerances import DOUBLE
 
 from clsplat import ops, reference
+from clsplat.field_stages import Marching
 from clsplat.reference.march import contract
-from clsplat.stages import Marching
 from clsplat.testing import assert_matches
 
 CUBE = Marching(step=0.03, cone=0.0, near=0.0, far=10.0, contracted=False)
@@ -76,6 +76,16 @@ def test_single_precision_finds_the_same_samples(device, marching):
         own = slice(found.first[r], found.first[r + 1]), slice(expected.first[r], expected.first[r + 1])
         # A sum of up to 300 steps, each rounded.
         np.testing.assert_allclose(found.positions[own[0]], expected.positions[own[1]], atol=2e-5)
+
+
+def test_no_samples_are_one_that_no_ray_has(any_device):
+    """Other stages may read it: it has a position, and the index of a ray."""
+    origins, directions, offsets, occupied = rays(CUBE, share=0.0)
+    arrays = [any_device.upload("rays", a) for a in (origins, directions, offsets)]
+    samples = ops.march(any_device, *arrays, any_device.upload("occupied", occupied, np.uint8), CUBE)
+    assert samples.total == 0 and not samples.first.get().any()
+    for array in (samples.positions, samples.deltas, samples.rays_of):
+        assert len(array) == 1 and not array.get().any()
 
 
 def test_a_homogeneous_ball_in_contracted_space(device64):

@@ -16,7 +16,7 @@ TIMEOUT = 600
 
 
 def test_there_are_notebooks():
-    assert [path.name[:2] for path in NOTEBOOKS] == [f"{k:02}" for k in range(9)]
+    assert [path.name[:2] for path in NOTEBOOKS] == [f"{k:02}" for k in range(10)]
 
 
 @EACH_NOTEBOOK

@@ -1,20 +1,28 @@
 """Equirectangular panoramas: split into faces of a cube for training, and assembled from faces in rendering."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from clsplat.bench.stability.projection import shell
+from clsplat.bench.stability.small import CONFIG
 from clsplat.camera import Camera
-from clsplat.config import DataConfig
+from clsplat.config import DataConfig, RenderConfig
 from clsplat.constants import BLUR
 from clsplat.dataset import load_scene
 from clsplat.dataset.lenses import Intrinsics, project
+from clsplat.dataset.near_planes import with_near_planes
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.metrics import to_uint8
 from clsplat.panorama import FACES, assemble, face_size, faces
 from clsplat.render import render
+from clsplat.scene import Scene, View
+from clsplat.training.initialize import initialize
+from clsplat.training.loop import train
 
 
 def pose(seed):
@@ -115,14 +123,15 @@ DIRECTIONS = {
 }
 
 
+@pytest.mark.parametrize("projection", ["affine", "ray"])
 @pytest.mark.parametrize("where", DIRECTIONS)
-def test_gaussians_appear_where_they_are(device, where):
+def test_gaussians_appear_where_they_are(device, where, projection):
     """Centre of mass and distance of one Gaussian, also at the seam and at edges of faces."""
     camera = Camera.panorama(pose(1), 240)
     direction = np.array(DIRECTIONS[where]) / np.linalg.norm(DIRECTIONS[where])
     mean = camera.position + camera.viewmat[:3, :3].T @ direction * 5
     one = Gaussians(mean[None], np.full((1, 3), np.log(0.25)), np.eye(1, 4), np.full(1, 3.0), np.full((1, 1, 3), 1.5))
-    rendering = render(one, camera, device=device, depth=True)
+    rendering = render(one, camera, RenderConfig(projection=projection), device, depth=True)
     assert rendering.rgb.shape == (120, 240, 3)
     directions = pixel_directions(camera) @ camera.viewmat[:3, :3].T
     area = np.cos((np.arange(120) + 0.5 - 60) / camera.fy)[:, None]
@@ -133,9 +142,11 @@ def test_gaussians_appear_where_they_are(device, where):
     # to the axis of the face; at an edge each face shows the nearer half.
     assert np.average(rendering.depth[seen], weights=rendering.alpha[seen]) == pytest.approx(5, rel=0.05)
     # The integral of alpha over the sphere is 2 pi sigma^2 times the opacity in excess of ALPHA_MIN. In a corner each
-    # face shows the half that the affine approximation enlarges: by 18 % here, by 5 % at half the size.
+    # face shows the half that the affine approximation enlarges: by 18 % here, by 5 % at half the size. Along rays,
+    # the rest is alpha's dependence on the angle to second order, and the pixels.
     solid_angle = (rendering.alpha * area).sum() / camera.fx / camera.fy
-    assert solid_angle == pytest.approx(2 * np.pi * (0.05**2 + BLUR / camera.fx**2) * 0.949, rel=0.2)
+    expected = 2 * np.pi * (0.05**2 + BLUR / camera.fx**2) * 0.949
+    assert solid_angle == pytest.approx(expected, rel=0.2 if projection == "affine" else 0.02)
 
 
 def test_panoramas_have_no_gradients_and_may_be_empty():
@@ -146,3 +157,35 @@ def test_panoramas_have_no_gradients_and_may_be_empty():
         rendering.backward(np.ones_like(rendering.rgb))
     empty = render(one.take(np.zeros(0, int)), camera, background=(0.2, 0.4, 0.6), device="reference")
     np.testing.assert_array_equal(empty.rgb, np.broadcast_to([0.2, 0.4, 0.6], (20, 40, 3)))
+
+
+def test_whole_panoramas_are_trained_on_along_rays(tmp_path, device):
+    write_dataset(tmp_path, 4, masks=True)
+    scene = load_scene(tmp_path, DataConfig(test_every=0, downscale=2, panoramas="whole"))
+    assert [view.name for view in scene.train] == [f"{k}.png" for k in range(4)]
+    for k, view in enumerate(scene.train):
+        camera = Camera.panorama(pose(k), 128)
+        assert view.camera.model == "equirectangular" and (view.camera.width, view.camera.height) == (128, 64)
+        np.testing.assert_allclose([view.camera.fx, view.camera.fy], [camera.fx, camera.fy])
+        # The sky is smooth: the mean over a pixel is the value at its centre, but for the rounding.
+        np.testing.assert_allclose(view.image, sky(pixel_directions(camera)), atol=3)
+        assert view.mask is not None and 0.3 < view.mask.mean() < 0.7
+
+    truth, around = shell(60).astype(np.float32), [Camera.panorama(pose(k), 96) for k in range(3)]
+    truth.means[:] += around[0].position
+    photos = [
+        View(f"{k}", camera, to_uint8(render(truth, camera, RenderConfig(projection="ray"), device).rgb))
+        for k, camera in enumerate(around)
+    ]
+    start = truth.means + np.random.default_rng(0).normal(scale=0.1, size=truth.means.shape)
+    config = replace(CONFIG, iterations=120, max_gaussians=60, render=RenderConfig(projection="ray"))
+    scene = with_near_planes(Scene(photos, [], start, np.full((60, 3), 128, np.uint8)))
+    trained = train(scene, config, tmp_path / "out", device)
+
+    def error(gaussians):
+        images = [render(gaussians, view.camera, config.render, device).rgb for view in scene.train]
+        return np.mean([((image - view.image / 255) ** 2).mean() for image, view in zip(images, photos, strict=True)])
+
+    assert error(trained) < 0.4 * error(initialize(scene, config.init, config.seed))
+    with pytest.raises(InputError, match="projection ray"):
+        train(scene, replace(config, render=RenderConfig()), tmp_path / "affine", device)

@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from test_project import GRADIENTS, MODES, assert_cameras_match, backward, forward, random_grads
 from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
+from clsplat.camera import Camera
 from clsplat.constants import ALPHA_MIN, NEAR
 from clsplat.gaussians import Gaussians, logit
 from clsplat.render import render
@@ -150,3 +152,20 @@ def test_gradients_that_overflow_are_zero(device):
         assert not array[3].any(), name
     assert np.abs(gradients.gaussians.means).max() > 0
     assert np.isfinite(gradients.viewmat).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_gradient_of_one_number_that_overflows_is_zero(any_device, axis):
+    """A ball on the camera's axis, whose gradient moves it along one axis of the world and changes nothing else."""
+    ball = synthetic_scene(1, sh_degree=0)[0]
+    ball.means[:], ball.quats[:], ball.log_scales[:] = (0, 0, 2), (1, 0, 0, 0), np.log(0.1)
+    camera = Camera(np.eye(4), 200, 200, 32, 32, 64, 64)
+    splats = reference.project_fwd(ball, camera, 0)
+    largest = np.finfo(any_device.real).max
+    v_splats = SplatGrads(*(np.zeros(getattr(splats, name).shape) for name in GRADIENTS))
+    v_splats.means2d[0, axis] = largest / 2
+    v, _ = backward(any_device, ball, camera, splats, v_splats, degree=0)
+    assert all((array == 0).all() for array in v.arrays().values())
+    v_splats.means2d[0, axis] = largest / 1000
+    v, _ = backward(any_device, ball, camera, splats, v_splats, degree=0)
+    assert np.isfinite(v.means).all() and v.means[0, axis] > largest / 100

@@ -20,6 +20,9 @@ DOUBLE = {
     "opacities": _REORDERED,
     "colors": _REORDERED,
     "disparities": _CANCELS,
+    "rays": _CANCELS,
+    "directions": _REORDERED,
+    "v_slopes": _CANCELS,
     "filtered log_scales": _REORDERED,
     "filtered logit_opacities": _CANCELS,
     "image": _REORDERED,
@@ -56,6 +59,7 @@ DOUBLE = {
     "positions": _REORDERED,
     "deltas": _REORDERED,
     "joined": _REORDERED,
+    "variation": _CANCELS,
     "sigmas": _REORDERED,
     "sample colours": _REORDERED,
     "v_outputs": _REORDERED,
@@ -67,6 +71,12 @@ DOUBLE = {
     "v_sigmas": _CANCELS,
     "v_ray colours": _REORDERED,
     "moved world": Tolerance(1e-9, 1e-11, "float64: translations of 10 units and scales of 40 cost three digits"),
+}
+
+ALONG_RAYS = DOUBLE | {
+    "v_log_scales": Tolerance(1e-10, 1e-11, "float64: close to the camera's plane, vectors of up to 1e4 px cancel"),
+    "v_quats": Tolerance(1e-10, 1e-11, "float64: as for v_log_scales"),
+    "v_means": Tolerance(1e-10, 1e-11, "float64: as for v_log_scales"),
 }
 
 _NEEDLE = "float32: the gradient by a needle's covariance cancels along its axis"
@@ -94,6 +104,7 @@ FLOAT = {
     "outputs": Tolerance(1e-4, 5e-6, "float32: four layers of sums of up to 256 products, which cancel in part"),
     "v_inputs": Tolerance(1e-4, 5e-6, "float32: as for outputs"),
     "v_weights": Tolerance(1e-4, 5e-6, "float32: as for outputs, and sums over a thousand rows"),
+    "variation": Tolerance(1e-4, 3e-6, "float32: six quotients of differences, which cancel in part"),
     "joined": Tolerance(1e-6, 1e-6, "float32: polynomials of a direction"),
     "sigmas": Tolerance(3e-6, 1e-7, "float32: exp of up to 15"),
     "sample colours": Tolerance(1e-6, 1e-6, "float32: exp and a quotient"),
@@ -105,6 +116,7 @@ FLOAT = {
     "v_ray colours": Tolerance(3e-5, 1e-6, "float32: as for transmittances"),
     "v_means2d": Tolerance(1e-4, 2e-5, _SUM),
     "v_conics": Tolerance(1e-4, 1e-5, _SUM),
+    "v_slopes": Tolerance(1e-4, 2e-5, _SUM),
     "v_opacities": Tolerance(1e-4, 2e-5, _SUM),
     "v_colors": Tolerance(1e-5, 2e-6, _SUM),
     "v_means": Tolerance(1e-3, 2e-5, _NEEDLE),

@@ -58,7 +58,7 @@ class Kernels:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.bench.kernel_report import details, save_scaling_chart, summary
+        from clsplat.bench.kernel_report import details, networks, save_scaling_chart, summary
         from clsplat.bench.kernels import bench_kernels
         from clsplat.device import Device, select_device
 
@@ -71,7 +71,7 @@ class Kernels:
         if self.scaling is not None:
             save_scaling_chart(results, self.scaling)
             _say(f"chart: {self.scaling}")
-        print(summary(results))
+        print(f"{summary(results)}\n\n{networks(results)}")
         for workload in results["workloads"]:
             print(f"\n{details(workload)}")
 

@@ -71,14 +71,14 @@ def run_field(
             return values | {"memory_bytes": memory}
 
         def evaluate(field: Field) -> dict[str, Any]:
-            record(sample(field))
+            if field.iteration in at[:-1]:
+                record(sample(field))
             return {}
 
         def progress(now: dict[str, Any]) -> None:
             bar.update(now["iteration"] - bar.n)
 
-        options: dict[str, Any] = {"evaluate": evaluate, "evaluate_after": set(at[:-1]), "progress": progress}
-        field = train_field(scene, method, config, out, device, **options)
+        field = train_field(scene, method, config, out, device, evaluate=evaluate, progress=progress)
         values = sample(field)
     views = evenly_spaced(scene.train, TRAINING_PHOTOS)
     values |= {"train_psnr": mean_metrics_of(_images(field, views, background), views, (psnr,))["psnr"]}

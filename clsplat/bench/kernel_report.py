@@ -100,6 +100,19 @@ def summary(results: Results) -> str:
     return "\n\n".join(["\n".join(f"- {fact}" for fact in facts), table(limits), table(rows)])
 
 
+def networks(results: Results) -> str:
+    """Table of the networks of radiance fields; empty for results that have none."""
+    roof = results["roof"]["fma_gflops"]
+    rows: list[tuple[str, ...]] = [
+        ("network", "rows", "forward, GFLOP/s", "of multiply-add", "backward, GFLOP/s", "of multiply-add")
+    ]
+    for network in results.get("networks", ()):
+        rates = network["forward_gflops"], network["backward_gflops"]
+        figures = [text for rate in rates for text in (f"{rate:.4g}", _percent(rate / roof))]
+        rows.append((" - ".join(map(str, network["widths"])), f"{network['rows']:,}", *figures))
+    return table(rows) if len(rows) > 1 else ""
+
+
 def details(workload: Results) -> str:
     """Counts of a workload, and a table of its stages. A stage with several kernels is followed by a row for each."""
     counts, pixels = workload["counts"], workload["width"] * workload["height"]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from clsplat.bench.environment import describe
+from clsplat.bench.networks import bench_networks
 from clsplat.bench.roof import measure_roof
 from clsplat.bench.timing import STILL, Clock, clock, quartiles, run_step, training_of
 from clsplat.bench.workloads import Workload
@@ -202,7 +203,8 @@ def bench_kernels(
     Returns
     -------
     dict
-        Content of the file of `clsplat bench kernels -o FILE`: device, software, date, settings, roof, workloads.
+        Content of the file of `clsplat bench kernels -o FILE`: device, software, date, settings, roof, networks,
+        workloads.
     """
     results: dict[str, Any] = {
         "benchmark": "kernels",
@@ -215,6 +217,8 @@ def bench_kernels(
     for workload in workloads:
         progress(workload.name)
         timed.append(bench_workload(workload, replace(render, mode=workload.mode or render.mode), device, repeats))
+    progress("networks")
+    results["networks"] = bench_networks(device, repeats)
     progress("roof")
     results["roof"] = _better(roof, measure_roof(device))
     for result in timed:

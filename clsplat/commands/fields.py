@@ -59,9 +59,11 @@ def train_and_evaluate(
     scene = load_scene(data, replace(config.data, random_background=True))
     if not resume:
         write_json(out / CONFIG, {DATA_PATH: str(data.resolve()), **asdict(config)})
-    every = config.eval_every if scene.test else 0
+    every = config.eval_every or config.iterations
 
     def evaluated(field: "Field") -> dict[str, Any]:
+        if not scene.test or field.iteration % every or field.iteration == config.iterations:
+            return {}
         return mean_metrics_of(images_of(field, scene.test, config), scene.test)
 
     with tqdm(total=config.iterations, unit="it", dynamic_ncols=True) as bar:
@@ -78,7 +80,6 @@ def train_and_evaluate(
             device,
             resume=resume,
             evaluate=evaluated,
-            evaluate_after=range(every, config.iterations, every) if every else (),
             progress=progress,
         )
     size = (out / MODEL).stat().st_size

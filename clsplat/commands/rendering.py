@@ -4,7 +4,8 @@ import os
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -25,6 +26,13 @@ from clsplat.commands.run_folders import dataset_of, place_of, scene_file, with_
 from clsplat.config import BACKGROUNDS
 from clsplat.errors import InputError
 from clsplat.ranges import within
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from clsplat.camera import Camera
+    from clsplat.render import Rendering
+    from clsplat.surface import Surface
 
 
 @dataclass(frozen=True)
@@ -83,6 +91,9 @@ class Render:
     """Number of images of an orbit."""
     depth: bool = False
     """Also write the expected depth, as 16-bit PNG scaled to the largest depth."""
+    surface: bool = False
+    """Also write the median depth, as 16-bit PNG scaled to the largest depth, and the normals, as PNG (red to the
+    right, green up, blue to the camera)."""
     device: DeviceName = None
     """Part of the name of the platform or device."""
     data_config: Annotated[CameraOptions, tyro.conf.arg(name="")] = field(default_factory=CameraOptions)
@@ -94,15 +105,12 @@ class Render:
 
     def run(self) -> None:
         """Run the command."""
-        import numpy as np
-        from PIL import Image
         from tqdm import tqdm
 
-        from clsplat.atomic import replacing
         from clsplat.dataset import load_scene
         from clsplat.formats import load_gaussians
-        from clsplat.metrics import to_uint8
-        from clsplat.render import Rendering, render_views
+        from clsplat.render import renderings
+        from clsplat.renderer import Renderer
         from clsplat.show.camera_paths import orbit
 
         data, out = dataset_of("render", self.data), place_of(self.out, self.scene, "render")
@@ -122,26 +130,39 @@ class Render:
         config = replace(self.render, mode=mode)
         background = BACKGROUNDS[self.data_config.background]
 
-        def write(name: str, rendering: Rendering) -> None:
-            target = (out / name).with_suffix(".png")
-            new_folder(target.parent)
-            with replacing(target) as file:
-                Image.fromarray(to_uint8(rendering.rgb)).save(file, format="PNG")
-            if rendering.depth is not None:
-                depth = rendering.depth / max(float(rendering.depth.max()), 1e-12) * 65535
-                with replacing(target.with_name(f"{target.stem}_depth.png")) as file:
-                    Image.fromarray(np.rint(depth).astype(np.uint16)).save(file, format="PNG")
-
-        renderings = render_views(
-            gaussians, cameras.values(), config, device, background=background, depth=self.depth
-        )
+        renderer = Renderer(device, config, background)
+        images = renderings(renderer, gaussians, cameras.values(), depth=self.depth, gradients=self.surface)
         # PNG compression takes as long as rendering, so that other threads do it at the same time.
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             writing: deque[Future[None]] = deque()
-            for name, rendering in tqdm(zip(cameras, renderings, strict=True), unit="view", total=len(cameras)):
-                writing.append(pool.submit(write, name, rendering))
+            for (name, camera), rendering in tqdm(
+                zip(cameras.items(), images, strict=True), unit="view", total=len(cameras)
+            ):
+                surface = rendering.surface() if self.surface else None
+                writing.append(pool.submit(write_maps, out / name, rendering, surface, camera))
                 if len(writing) > 2 * (os.cpu_count() or 1):
                     writing.popleft().result()
             for image in writing:
                 image.result()
         say(f"{out}: {len(cameras)} images")
+
+
+def write_maps(path: Path, rendering: "Rendering", surface: "Surface | None", camera: "Camera") -> None:
+    """Write a rendering as PNG files: colours, the expected depth if it has one, and the surface's maps."""
+    from PIL import Image
+
+    from clsplat.atomic import replacing
+    from clsplat.metrics import to_uint8
+    from clsplat.show.frames import colored_normals, scaled_depth
+
+    maps: dict[str, NDArray[Any]] = {"": to_uint8(rendering.rgb)}
+    if rendering.depth is not None:
+        maps["_depth"] = scaled_depth(rendering.depth)
+    if surface is not None:
+        maps["_median"] = scaled_depth(surface.depth)
+        maps["_normals"] = colored_normals(surface.normals, camera)
+    target = path.with_suffix(".png")
+    new_folder(target.parent)
+    for suffix, pixels in maps.items():
+        with replacing(target.with_name(f"{target.stem}{suffix}.png")) as file:
+            Image.fromarray(pixels).save(file, format="PNG")

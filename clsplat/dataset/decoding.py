@@ -188,7 +188,11 @@ def _plan(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> _Plan:
             f"copy, found {width}x{height}"
         )
     sx, sy = width / declared.width, height / declared.height
-    if photo.face:
+    if photo.face is None and declared.model == "EQUIRECTANGULAR":
+        whole = Camera.panorama(photo.viewmat, width)
+        target, across, down = Intrinsics("", (whole.fx, whole.fy, whole.cx, whole.cy), 0, 0), width, height
+        sx = sy = 1.0  # the panorama has the size of the file
+    elif photo.face:
         # The centre of a face has as many pixels per angle as the equator of the panorama.
         edge = round(width / np.pi / dataset.reduce) * dataset.reduce
         target = Intrinsics("PINHOLE", (edge / 2 / sx, edge / 2 / sy, edge / 2 / sx, edge / 2 / sy), 0, 0)
@@ -205,6 +209,8 @@ def _plan(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> _Plan:
         if target.model == "OPENCV_FISHEYE":
             k1, k2, k3, k4 = target.params[4:]
             camera = replace(camera, model="fisheye", distortion=(k1, k2, k3, k4))
+        elif photo.face is None and declared.model == "EQUIRECTANGULAR":
+            camera = replace(camera, model="equirectangular")
     except InputError as error:
         raise InputError(f"photo {photo.name}: {error}") from error
     return _Plan(photo, camera, (width, height), upright, invert_mask)

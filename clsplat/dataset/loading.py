@@ -72,7 +72,8 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
             f"{path}: expected points with finite coordinates, as float32, found {np.abs(dataset.points).max():.3g}; "
             "remove such points"
         )
-    dataset = replace(dataset, photos=by_faces(dataset.photos))
+    if config.panoramas == "faces":
+        dataset = replace(dataset, photos=by_faces(dataset.photos))
     views = sorted(load_views(dataset, config), key=lambda view: view.name)
     train, test = _split(views, dataset, config.test_every)
     if not train:

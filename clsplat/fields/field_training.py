@@ -2,7 +2,9 @@
 
 import json
 import time
-from collections.abc import Callable, Container
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,8 +37,7 @@ def train_field(
     device: "Device",
     *,
     resume: bool = False,
-    evaluate: Callable[[Field], dict[str, Any]] | None = None,
-    evaluate_after: Container[int] = (),
+    evaluate: Callable[[Field], dict[str, Any]] = lambda field: {},
     progress: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> Field:
     """Train a field on a scene's photos.
@@ -54,9 +55,8 @@ def train_field(
     device : Device
     resume : bool
         Continue from the checkpoint in `out`, to the same bits as a training that was never interrupted.
-    evaluate : callable, optional
-        Called with the field after the iterations in `evaluate_after`; what it returns is logged. Its time does not
-        count.
+    evaluate : callable
+        Called with the field after every iteration; what it returns, if anything, is logged. Its time does not count.
     progress : callable
         Called after every iteration with iteration, iterations, loss and rays. If it raises KeyboardInterrupt, a
         checkpoint is written.
@@ -75,44 +75,58 @@ def train_field(
     ClsplatError
         If the loss stops being finite.
     """
-    iterations, seconds = config.iterations or method.iterations, 0.0
+    config, seconds = replace(config, iterations=config.iterations or method.iterations), 0.0
     if resume:
         field, seconds = load_checkpoint(out / CHECKPOINT, method, config, device)
     else:
         field = method(Space.of(scene.train), device, config.seed)
-    pixels = Pixels(scene.train, field.space, BACKGROUNDS[config.data.background])
+    pixels, clock = Pixels(scene.train, field.space, BACKGROUNDS[config.data.background]), _Clock(seconds)
     log = _Log(out / "log.jsonl", field.iteration)
-    started = time.perf_counter() - seconds
-    losses: list[float] = []
     try:
-        while field.iteration < iterations:
-            batch = pixels.draw(stream(config.seed, "pixels of a batch", field.iteration + 1), field.rays)
-            losses.append(field.step(batch, field.iteration / iterations))
-            iteration = field.iteration
-            if not np.isfinite(losses[-1]):
-                raise ClsplatError(f"iteration {iteration}: expected a finite loss, found {losses[-1]}")
-            record = {
-                "iteration": iteration,
-                "seconds": time.perf_counter() - started,
-                "loss": float(np.mean(losses)),
-            }
-            before = time.perf_counter()
-            if evaluate and iteration in evaluate_after:
-                record |= evaluate(field)
-            if iteration % LOG_EVERY == 0 or iteration == iterations or len(record) > 3:
-                log.append(record)
-                losses = []
-            progress({"iteration": iteration, "iterations": iterations, "loss": record["loss"], "rays": field.rays})
-            started += time.perf_counter() - before
-            if iteration % config.checkpoint_every == 0 and iteration < iterations:
-                save_checkpoint(out / CHECKPOINT, field, config, time.perf_counter() - started)
+        while field.iteration < config.iterations:
+            loss = _advance(field, pixels, config)
+            with clock.stopped():
+                now = {"iteration": field.iteration, "seconds": clock.seconds, "loss": loss}
+                log.record(now, evaluate(field), last=field.iteration == config.iterations)
+                progress(now | {"iterations": config.iterations, "rays": field.rays})
+                if field.iteration % config.checkpoint_every == 0 and field.iteration < config.iterations:
+                    save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
     except KeyboardInterrupt:
-        save_checkpoint(out / CHECKPOINT, field, config, time.perf_counter() - started)
+        save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
         raise
-    save_checkpoint(out / CHECKPOINT, field, config, time.perf_counter() - started)
+    save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
     field.finish()
     save_field(out / MODEL, field)
     return field
+
+
+def _advance(field: Field, pixels: Pixels, config: TrainConfig) -> float:
+    """Take the next step of a field. Returns the loss, which is finite."""
+    rng = stream(config.seed, "pixels of a batch", field.iteration + 1)
+    loss = field.step(pixels.draw(rng, field.rays), field.iteration / config.iterations)
+    if not np.isfinite(loss):
+        raise ClsplatError(f"iteration {field.iteration}: expected a finite loss, found {loss}")
+    return loss
+
+
+class _Clock:
+    """Training time in seconds, which stands still while it is stopped."""
+
+    def __init__(self, seconds: float):
+        self._started, self._stopped_at = time.perf_counter() - seconds, 0.0
+
+    @property
+    def seconds(self) -> float:
+        return (self._stopped_at or time.perf_counter()) - self._started
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        self._stopped_at = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._started += time.perf_counter() - self._stopped_at
+            self._stopped_at = 0.0
 
 
 class _Log:
@@ -126,7 +140,14 @@ class _Log:
                 line for line in lines if line.endswith("\n") and json.loads(line)["iteration"] <= iteration
             )
         path.write_text(kept, encoding="utf-8")
+        self._losses: list[float] = []
 
-    def append(self, record: dict[str, Any]) -> None:
+    def record(self, now: dict[str, Any], found: dict[str, Any], last: bool) -> None:
+        """Write a line every `LOG_EVERY` iterations, after an evaluation and at the end."""
+        self._losses.append(now["loss"])
+        if now["iteration"] % LOG_EVERY and not found and not last:
+            return
+        line = now | {"loss": float(np.mean(self._losses))} | found
+        self._losses = []
         with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(record, allow_nan=False) + "\n")
+            file.write(json.dumps(line, allow_nan=False) + "\n")

@@ -5,13 +5,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from clsplat.field_stages import HashLevels, Samples
 from clsplat.fields.field import Array, Field
 from clsplat.fields.occupancy import CELLS, EVERY, THRESHOLD, Occupancy
 from clsplat.fields.pixels import Batch
 from clsplat.fields.space import Space
 from clsplat.randomness import stream
 from clsplat.scene import Color
-from clsplat.stages import AdamStep, HashLevels, Samples
+from clsplat.stages import AdamStep
 
 if TYPE_CHECKING:
     from clsplat.device import Device

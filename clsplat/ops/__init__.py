@@ -16,9 +16,10 @@ from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.ops.finite import count_not_finite
 from clsplat.ops.hashgrid import hashgrid_bwd, hashgrid_fwd
-from clsplat.ops.heads import heads_bwd, heads_fwd, heads_join, heads_join_bwd
+from clsplat.ops.heads import heads_bwd, heads_fwd, heads_join, heads_join_bwd, heads_sh_bwd, heads_sh_fwd
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.march import march
+from clsplat.ops.median import median_splats
 from clsplat.ops.mlp import mlp_bwd, mlp_fwd
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import observe
@@ -27,6 +28,7 @@ from clsplat.ops.rays import rays_bwd, rays_fwd
 from clsplat.ops.removal import removal
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
+from clsplat.ops.voxels import voxels_bwd, voxels_fwd, voxels_tv
 
 
 class Launches:
@@ -44,6 +46,7 @@ class Launches:
         self.composite_fwd = partial(composite_fwd, device)
         self.composite_bwd = partial(composite_bwd, device)
         self.count_pairs = partial(count_pairs, device)
+        self.median_splats = partial(median_splats, device)
         self.removal = partial(removal, device)
         self.exposure_fwd = partial(exposure_fwd, device)
         self.exposure_bwd = partial(exposure_bwd, device)
@@ -70,3 +73,8 @@ class Launches:
         self.heads_bwd = partial(heads_bwd, device)
         self.heads_join_bwd = partial(heads_join_bwd, device)
         self.adam_array = partial(adam_array, device)
+        self.heads_sh_fwd = partial(heads_sh_fwd, device)
+        self.heads_sh_bwd = partial(heads_sh_bwd, device)
+        self.voxels_fwd = partial(voxels_fwd, device)
+        self.voxels_bwd = partial(voxels_bwd, device)
+        self.voxels_tv = partial(voxels_tv, device)

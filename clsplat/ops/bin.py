@@ -9,14 +9,14 @@ from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.ops.scan import checked_total, queue_scan
 from clsplat.ops.sort import argsort, argsort_segments
-from clsplat.stages import Bins, Splats
+from clsplat.stages import AnySplats, Bins
 
 WHAT = "intersections of Gaussians and tiles"
 
 
 def bin_splats(
     device: Device,
-    splats: Splats,
+    splats: AnySplats,
     width: int,
     height: int,
     tile_size: int,

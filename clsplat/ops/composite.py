@@ -4,7 +4,7 @@ from typing import Any
 
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
-from clsplat.stages import Bins, Image, SplatGrads, Splats
+from clsplat.stages import AnyGrads, AnySplats, Bins, Image, RayGrads, RaySplats, SplatGrads
 
 # Number of splats per batch of the GPU variant without subgroups. Each is a work-item of the backward kernel. Known
 # GPUs run 16 or 32 work-items in lockstep.
@@ -43,7 +43,19 @@ def variant(device: Device, compositor: str = "auto", disparities: Any = None) -
     return f"composite_{compositor}"
 
 
-def _defines(device: Device, bins: Bins, channels: int, stage: str) -> dict[str, Any]:
+def ray_charts(splats: AnySplats) -> int:
+    """Value of -DRAYS (cl/composite_cpu.cl): 0, or 1 and 2 for splats along rays in the image or in own charts."""
+    if not isinstance(splats, RaySplats):
+        return 0
+    return 1 if splats.rays.shape[1] == 8 else 2
+
+
+def directions_of(splats: AnySplats) -> list[Any]:
+    """The last argument of kernels that composite along rays in charts of the splats."""
+    return [splats.directions] if isinstance(splats, RaySplats) and ray_charts(splats) == 2 else []
+
+
+def _defines(device: Device, bins: Bins, channels: int, stage: str, rays: int = 0) -> dict[str, Any]:
     own: dict[str, dict[str, int]] = {
         "composite_cpu": {"LANES": device.vector_width},
         "composite_gpu": {
@@ -53,47 +65,60 @@ def _defines(device: Device, bins: Bins, channels: int, stage: str) -> dict[str,
         },
         "composite_sorted": {"LANES": device.vector_width, "WINDOW": WINDOW},
     }
-    return {"TILE": bins.tile_size, "CHANNELS": channels} | own[stage]
+    along = {} if stage == "composite_sorted" else {"RAYS": rays}
+    return {"TILE": bins.tile_size, "CHANNELS": channels} | own[stage] | along
 
 
-def packed(device: Device, splats: Splats, bins: Bins, stage: str) -> Any:
+HEADS = (8, 16, 23)
+"""Numbers of a packed splat besides its colours, by the value of -DRAYS (cl/composite.h, cl/composite_rays.h)."""
+
+
+def packed(device: Device, splats: AnySplats, bins: Bins, stage: str) -> Any:
     """Splats in the layout that the kernels read: SPLAT_REALS each (cl/composite.h)."""
-    n, channels = splats.colors.shape
-    result = device.empty("packed splats", (n, -(-(8 + channels) // 4) * 4))
-    geometry = [splats.means2d, splats.conics, splats.extents, splats.opacities, splats.colors]
-    device.launch(
-        stage, "composite_pack", (n,), [n, *geometry, result], defines=_defines(device, bins, channels, stage)
-    )
+    (n, channels), rays = splats.colors.shape, ray_charts(splats)
+    result = device.empty("packed splats", (n, -(-(HEADS[rays] + channels) // 4) * 4))
+    arguments = [n, splats.means2d, splats.conics, splats.extents, splats.opacities, splats.colors]
+    if isinstance(splats, RaySplats):
+        arguments.append(splats.rays)
+    defines = _defines(device, bins, channels, stage, rays)
+    device.launch(stage, "composite_pack", (n,), [*arguments, result], defines=defines)
     if bins.slots is not None:
         device.keep("packed splats", splats, result)  # for the backward pass
     return result
 
 
 def _launch(
-    device: Device, stage: str, kernel: str, bins: Bins, channels: int, arguments: list[Any], **changes: Any
+    device: Device,
+    stage: str,
+    kernel: str,
+    bins: Bins,
+    splats: AnySplats,
+    arguments: list[Any],
+    **changes: Any,
 ) -> None:
     tiles = bins.tile_ranges.shape[0]
     group = 1
     if stage == "composite_gpu":
         group = device.group(bins.tile_size**2) if kernel == "composite_fwd" else gpu_batch(device)
     arguments = [bins.width, bins.height, arguments[0], bins.gauss_ids, bins.tile_ranges, *arguments[1:]]
-    defines = _defines(device, bins, channels, stage) | changes
+    arguments += directions_of(splats)
+    defines = _defines(device, bins, splats.colors.shape[1], stage, ray_charts(splats)) | changes
     device.launch(stage, kernel, (tiles * group,), arguments, defines=defines, group=(group,))
 
 
-def composite_until(device: Device, pack: Any, bins: Bins, background: Any, stop: float) -> Any:
+def composite_until(device: Device, splats: AnySplats, pack: Any, bins: Bins, background: Any, stop: float) -> Any:
     """Image (H, W, C) by the GPU variant, whose pixels stop at another transmittance than TRANSMITTANCE_MIN."""
     channels = len(background)
     result = device.empty("image", (bins.height, bins.width, channels))
     alpha = device.empty("alpha", (bins.height, bins.width))
     arguments = [pack, device.constant("background", background), result, alpha]
-    _launch(device, "composite_gpu", "composite_fwd", bins, channels, arguments, TRANSMITTANCE_MIN=stop)
+    _launch(device, "composite_gpu", "composite_fwd", bins, splats, arguments, TRANSMITTANCE_MIN=stop)
     return result
 
 
 def composite_fwd(
     device: Device,
-    splats: Splats,
+    splats: AnySplats,
     bins: Bins,
     background: Any,
     *,
@@ -104,7 +129,7 @@ def composite_fwd(
 
     Parameters
     ----------
-    splats : Splats with C colour channels
+    splats : Splats or RaySplats with C colour channels
     bins : Bins of the same splats
     background : (C,) array on the host
     compositor : {"auto", "cpu", "gpu"}
@@ -123,20 +148,20 @@ def composite_fwd(
         check_private(device, bins.tile_size, channels)
     arguments = [packed(device, splats, bins, stage), device.constant("background", background), *result]
     arguments += [] if disparities is None else [disparities]
-    _launch(device, stage, "composite_fwd", bins, channels, arguments)
+    _launch(device, stage, "composite_fwd", bins, splats, arguments)
     return result
 
 
 def composite_bwd(
     device: Device,
-    splats: Splats,
+    splats: AnySplats,
     bins: Bins,
     image: Image,
     v_image: Image,
     *,
     compositor: str = "auto",
     disparities: Any = None,
-) -> SplatGrads:
+) -> AnyGrads:
     """Gradients with respect to the splats.
 
     Parameters
@@ -159,20 +184,22 @@ def composite_bwd(
         )
     n, channels = splats.colors.shape
     m = bins.gauss_ids.shape[0]
-    records = device.empty("gradients per intersection", (max(m, 1), 6 + channels))
+    moments = 10 if isinstance(splats, RaySplats) else 6
+    records = device.empty("gradients per intersection", (max(m, 1), moments + channels))
     stage = variant(device, compositor, disparities)
     pack = device.kept("packed splats", splats)
     if pack is None:
         pack = packed(device, splats, bins, stage)
     arguments = [pack, bins.slots, *image, *v_image, records]
     arguments += [] if disparities is None else [disparities]
-    _launch(device, stage, "composite_bwd", bins, channels, arguments)
-    v = SplatGrads(
-        device.empty("v_means2d", (n, 2)),
-        device.empty("v_conics", (n, 3)),
-        device.empty("v_opacities", n),
-        device.empty("v_colors", (n, channels)),
-    )
-    arguments = [n, bins.order, bins.first_slots, splats.conics, splats.opacities, records, *v]
-    device.launch(stage, "composite_sum", (n,), arguments, defines=_defines(device, bins, channels, stage))
+    _launch(device, stage, "composite_bwd", bins, splats, arguments)
+    geometry = device.empty("v_means2d", (n, 2)), device.empty("v_conics", (n, 3))
+    rest = device.empty("v_opacities", n), device.empty("v_colors", (n, channels))
+    v: AnyGrads = SplatGrads(*geometry, *rest)
+    conics = splats.conics
+    if isinstance(splats, RaySplats):
+        v, conics = RayGrads(*geometry, device.empty("v_slopes", (n, 3)), *rest), splats.rays
+    arguments = [n, bins.order, bins.first_slots, conics, splats.opacities, records, *v]
+    defines = _defines(device, bins, channels, stage, ray_charts(splats))
+    device.launch(stage, "composite_sum", (n,), arguments, defines=defines)
     return v

@@ -6,10 +6,10 @@ import numpy as np
 from pyopencl.array import Array
 
 from clsplat.device import Device
-from clsplat.stages import Bins, Splats
+from clsplat.stages import AnySplats, Bins
 
 
-def count_pairs(device: Device, splats: Splats, bins: Bins) -> tuple[Array, Array]:
+def count_pairs(device: Device, splats: AnySplats, bins: Bins) -> tuple[Array, Array]:
     """Count the pairs of a splat and a pixel that compositing evaluates and draws.
 
     Parameters

@@ -3,10 +3,10 @@
 import numpy as np
 
 from clsplat.device import Device
-from clsplat.stages import Dropout, SplatGrads, Splats
+from clsplat.stages import AnyGrads, AnySplats, Dropout
 
 
-def dropout_fwd(device: Device, splats: Splats, dropout: Dropout) -> None:
+def dropout_fwd(device: Device, splats: AnySplats, dropout: Dropout) -> None:
     """Drop random splats and make the others more opaque, in place.
 
     Parameters
@@ -21,7 +21,7 @@ def dropout_fwd(device: Device, splats: Splats, dropout: Dropout) -> None:
     device.launch("dropout", "dropout_fwd", (n,), [*scalars, splats.extents, splats.opacities])
 
 
-def dropout_bwd(device: Device, v_splats: SplatGrads, dropout: Dropout) -> None:
+def dropout_bwd(device: Device, v_splats: AnyGrads, dropout: Dropout) -> None:
     """Turn gradients by the splats after `dropout_fwd` into gradients by those before it, in place.
 
     Gradients of dropped splats are 0.

@@ -20,8 +20,9 @@ def exposure_fwd(device: Device, image: Array, affine: NDArray[Any], photo: Arra
     Parameters
     ----------
     image : (H, W, 3) real
-    affine : (3, 4) array on the host
-        A and b of A x + b, in the first three columns and in the last one.
+    affine : (3, 4) or (3, 6) array on the host
+        A and b of A x + b, in the first three columns and in the fourth one. Two more columns are c and f, per
+        channel, of the terms c x (1 - x) and f r^2 x, where r is 1 in the corners of the image and 0 in its middle.
     photo : (H, W, 3) uint8
         The result is at most 1 where the photo is 255, and at least 0 where the photo is 0: the camera clips values
         beyond.
@@ -32,7 +33,9 @@ def exposure_fwd(device: Device, image: Array, affine: NDArray[Any], photo: Arra
     """
     pixels = image.size // 3
     adjusted = device.empty("adjusted image", image.shape)
-    device.launch("exposure", "exposure_fwd", (pixels,), [pixels, _packed(device, affine), image, photo, adjusted])
+    packed, response, defines = _packed(device, image, affine)
+    arguments = [pixels, packed, image, photo, adjusted, *response]
+    device.launch("exposure", "exposure_fwd", (pixels,), arguments, defines=defines)
     return adjusted
 
 
@@ -50,20 +53,26 @@ def exposure_bwd(
 
     Returns
     -------
-    v_affine : (3, 4) float64, on the host
+    v_affine : float64, on the host, of the shape of `affine`
     """
     pixels = image.size // 3
     if device.is_cpu:
         items, first, step, count = -(-pixels // CPU_PIXELS), CPU_PIXELS, 1, CPU_PIXELS
     else:
         items, first, step, count = GPU_ITEMS, 1, GPU_ITEMS, -(-pixels // GPU_ITEMS)
-    parts = device.empty("v_affine", (items, 12))
-    arguments = [pixels, items, first, step, count, _packed(device, affine), image, photo, v_image, parts]
-    device.launch("exposure", "exposure_bwd", (items,), arguments)
-    return np.asarray(parts.get().sum(axis=0, dtype=np.float64).reshape(3, 4))
+    packed, response, defines = _packed(device, image, affine)
+    parts = device.empty("v_affine", (items, affine.size))
+    arguments = [pixels, items, first, step, count, packed, image, photo, v_image, parts, *response]
+    device.launch("exposure", "exposure_bwd", (items,), arguments, defines=defines)
+    total = parts.get().sum(axis=0, dtype=np.float64)
+    return np.concatenate([total[:12].reshape(3, 4), total[12:].reshape(-1, 3).T], axis=1)
 
 
-def _packed(device: Device, affine: NDArray[Any]) -> NDArray[Any]:
-    packed = np.zeros(16, device.real)
-    packed[:12] = affine.ravel()
-    return packed
+def _packed(device: Device, image: Array, affine: NDArray[Any]) -> tuple[NDArray[Any], list[Any], dict[str, Any]]:
+    """The map as the kernels read it: `affine`, the arguments for its columns beyond the fourth, and the defines."""
+    packed, response = np.zeros(16, device.real), np.zeros(8, device.real)
+    packed[:12] = affine[:, :4].ravel()
+    if affine.shape[1] == 4:
+        return packed, [], {"RESPONSE": 0}
+    response[:6] = affine[:, 4:].T.ravel()
+    return packed, [response, image.shape[1], image.shape[0]], {"RESPONSE": 1}

@@ -10,7 +10,7 @@ from clsplat.camera import Camera
 from clsplat.constants import FILTER_VARIANCE
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.structs import camera_struct, lens_define
+from clsplat.structs import camera_struct
 
 # Defines of the kernels that use no camera. LENS is required, since all kernels of the file are built together.
 DEFINES = {"FILTER_VARIANCE": FILTER_VARIANCE, "LENS": "PINHOLE"}
@@ -35,7 +35,7 @@ def pixel_sizes(device: Device, gaussians: Gaussians, cameras: Iterable[Camera])
     result = device.upload("pixel sizes", np.full(n, np.inf))
     for camera in cameras:
         arguments = [n, camera_struct(camera, device.real), gaussians.means, result]
-        device.launch("filter", "pixel_sizes", (n,), arguments, defines=DEFINES | {"LENS": lens_define(camera)})
+        device.launch("filter", "pixel_sizes", (n,), arguments, defines=DEFINES | {"LENS": camera.model.upper()})
     sizes = result.get()
     seen = np.isfinite(sizes)
     if not seen.all():

@@ -6,8 +6,8 @@ import numpy as np
 from pyopencl.array import Array
 
 from clsplat.device import Device
+from clsplat.field_stages import HashLevels
 from clsplat.ops.sort import argsort
-from clsplat.stages import HashLevels
 
 # Number of points per work-item of the forward kernel on a CPU.
 CPU_POINTS = 512

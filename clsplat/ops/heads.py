@@ -3,7 +3,7 @@
 from pyopencl.array import Array
 
 from clsplat.device import Device
-from clsplat.stages import EXPONENT_MAX
+from clsplat.field_stages import EXPONENT_MAX
 
 DEFINES = {"EXPONENT_MAX": EXPONENT_MAX}
 
@@ -79,4 +79,50 @@ def heads_join_bwd(device: Device, v_inputs: Array, features: Array, sigmas: Arr
     v_features = device.empty("v_features", (samples, 16))
     arguments = [samples, v_inputs, features, sigmas, v_sigmas, v_features]
     device.launch("heads", "heads_join_bwd", (samples,), arguments, defines=DEFINES)
+    return v_features
+
+
+def heads_sh_fwd(
+    device: Device, features: Array, directions: Array, rays_of: Array, density_scale: float
+) -> tuple[Array, Array]:
+    """Densities and colours of Plenoxels (Fridovich-Keil et al. 2022, section 3.1).
+
+    Parameters
+    ----------
+    features : (S, 28) real
+        A density, of which the positive part counts, and nine coefficients of spherical harmonics of each colour.
+    directions : (R, 3) real
+        Of the rays; of length 1.
+    rays_of : (S,) uint32
+        Ray of each sample.
+    density_scale : float
+        Factor on the densities.
+
+    Returns
+    -------
+    sigmas : (S,) real
+    colors : (S, 3) real
+        At least 0.
+    """
+    samples = features.shape[0]
+    sigmas, colors = device.empty("sigmas", samples), device.empty("colours of samples", (samples, 3))
+    arguments = [samples, float(density_scale), features, directions, rays_of, sigmas, colors]
+    device.launch("heads", "heads_sh_fwd", (samples,), arguments, defines=DEFINES)
+    return sigmas, colors
+
+
+def heads_sh_bwd(
+    device: Device,
+    features: Array,
+    directions: Array,
+    rays_of: Array,
+    density_scale: float,
+    v_sigmas: Array,
+    v_colors: Array,
+) -> Array:
+    """Gradient of `heads_sh_fwd` with respect to the features, (S, 28), from v_sigmas (S,) and v_colors (S, 3)."""
+    samples = features.shape[0]
+    v_features = device.empty("v_features", features.shape)
+    arguments = [samples, float(density_scale), features, directions, rays_of, v_sigmas, v_colors, v_features]
+    device.launch("heads", "heads_sh_bwd", (samples,), arguments, defines=DEFINES)
     return v_features

@@ -4,8 +4,8 @@ import numpy as np
 from pyopencl.array import Array
 
 from clsplat.device import Device
+from clsplat.field_stages import Marching, Samples
 from clsplat.ops.scan import exclusive_scan
-from clsplat.stages import Marching, Samples
 
 
 def march(
@@ -40,8 +40,10 @@ def march(
     counts = device.empty("samples of rays", rays, np.uint32)
     device.launch("march", "march_count", (rays,), [*shared, counts], defines=defines)
     first, total = exclusive_scan(device, counts, "samples of rays")
-    # At least one entry: drivers refuse empty buffers.
-    positions, deltas = device.empty("positions", (max(total, 1), 3)), device.empty("deltas", max(total, 1))
-    rays_of = device.empty("rays of samples", max(total, 1), np.uint32)
+    if not total:  # drivers refuse empty buffers: one sample of no length, which no ray has
+        positions, deltas = device.upload("positions", np.zeros((1, 3))), device.upload("deltas", np.zeros(1))
+        return Samples(positions, deltas, device.upload("rays of samples", [0], np.uint32), first, 0)
+    positions, deltas = device.empty("positions", (total, 3)), device.empty("deltas", total)
+    rays_of = device.empty("rays of samples", total, np.uint32)
     device.launch("march", "march_samples", (rays,), [*shared, first, positions, deltas, rays_of], defines=defines)
     return Samples(positions, deltas, rays_of, first, total)

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from clsplat.camera import Camera
+from clsplat.camera import Camera, pixel_rays
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.stages import AdamStep, CameraGrads, SplatGrads, Splats
+from clsplat.stages import AdamStep, AnyGrads, AnySplats, CameraGrads, RaySplats, Splats
 from clsplat.structs import adam_struct, camera_struct, lens_define
 
 CAMERA_GROUP = 64
@@ -26,7 +26,8 @@ def project_fwd(
     *,
     antialiased: bool = False,
     channels: int = 3,
-) -> Splats:
+    rays: bool = False,
+) -> AnySplats:
     """Project Gaussians into a camera.
 
     Parameters
@@ -39,10 +40,13 @@ def project_fwd(
         True to compensate the opacity for the blur of the 2D covariance.
     channels : {3, 4}
         Number of colour channels. The fourth one is the depth.
+    rays : bool
+        True to evaluate Gaussians along rays instead of by an affine approximation; not for orthographic cameras,
+        whose affine projection is exact.
 
     Returns
     -------
-    Splats
+    Splats, or RaySplats with `rays`
     """
     n = len(gaussians)
     splats = Splats(
@@ -55,9 +59,15 @@ def project_fwd(
     )
     g = gaussians
     arguments = [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree, *g.arrays().values(), *splats]
-    defines = _defines(device, camera, channels, antialiased)
-    _launch(device, "project_fwd", n, arguments, defines)
-    return splats
+    defines = _defines(device, camera, channels, antialiased, rays=rays)
+    if not rays:
+        _launch(device, "project_fwd", n, arguments, defines)
+        return splats
+    own_charts = camera.model != "pinhole"
+    terms = device.empty("rays", (n, 17 if own_charts else 8))
+    _launch(device, "project_fwd", n, [*arguments, terms], defines)
+    directions = pixel_rays(camera) if own_charts else np.zeros((1, 1, 3))
+    return RaySplats(*splats, terms, device.constant("directions", directions))
 
 
 def join_rows(device: Device, first: Any, second: Any) -> Any:
@@ -80,7 +90,7 @@ def join_rows(device: Device, first: Any, second: Any) -> Any:
     return result
 
 
-def project_disparities(device: Device, gaussians: Gaussians, camera: Camera, splats: Splats) -> Any:
+def project_disparities(device: Device, gaussians: Gaussians, camera: Camera, splats: AnySplats) -> Any:
     """Disparity of each Gaussian's maximum along the rays of pixels, as a linear function over the image.
 
     Parameters
@@ -109,8 +119,8 @@ def project_bwd(
     gaussians: Gaussians,
     camera: Camera,
     sh_degree: int,
-    splats: Splats,
-    v_splats: SplatGrads,
+    splats: AnySplats,
+    v_splats: AnyGrads,
     *,
     antialiased: bool = False,
     camera_grad: bool = False,
@@ -121,9 +131,9 @@ def project_bwd(
     ----------
     gaussians, camera, sh_degree, antialiased
         As given to `project_fwd`.
-    splats : Splats
+    splats : Splats or RaySplats
         Its result.
-    v_splats : SplatGrads
+    v_splats : SplatGrads or RayGrads
         Gradients with respect to it.
 
     Returns
@@ -137,20 +147,22 @@ def project_bwd(
     v = Gaussians(**empty)
     arguments = [n, camera_struct(camera, device.real), g.sh.shape[1], sh_degree, *g.arrays().values()]
     arguments += [splats.conics, splats.extents, splats.colors, *v_splats, *v.arrays().values()]
-    defines = _defines(device, camera, splats.colors.shape[1], antialiased, camera_grad)
+    rays = isinstance(splats, RaySplats)
+    defines = _defines(device, camera, splats.colors.shape[1], antialiased, camera_grad, rays)
     return v, _backward(device, "project_bwd", n, arguments, defines)
 
 
 def _defines(
-    device: Device, camera: Camera, channels: int, antialiased: bool, camera_grad: bool = False
+    device: Device, camera: Camera, channels: int, antialiased: bool, camera_grad: bool = False, rays: bool = False
 ) -> dict[str, Any]:
-    """Defines of the kernels for a camera. With those of a fisheye, a work-item takes one Gaussian (cl/lens.h)."""
+    """Defines of the kernels for a camera. With those of a wide lens, a work-item takes one Gaussian (cl/lens.h)."""
     return {
         "CHANNELS": channels,
         "ANTIALIASED": int(antialiased),
         "CAMERA_GRAD": int(camera_grad),
-        "LENS": lens_define(camera),
-        "LANES": LANES if device.is_cpu and camera.model != "fisheye" else 1,
+        "LENS": lens_define(camera, rays),
+        "RAYS": int(rays),
+        "LANES": LANES if device.is_cpu and camera.model in ("pinhole", "orthographic") else 1,
     }
 
 
@@ -190,8 +202,8 @@ def project_bwd_adam(
     gaussians: Gaussians,
     moments: tuple[Gaussians, Gaussians],
     camera: Camera,
-    splats: Splats,
-    v_splats: SplatGrads,
+    splats: AnySplats,
+    v_splats: AnyGrads,
     step: AdamStep,
     *,
     antialiased: bool = False,
@@ -223,5 +235,6 @@ def project_bwd_adam(
         *arrays,
         *fields,
     ]
-    defines = _defines(device, camera, splats.colors.shape[1], antialiased, camera_grad)
+    rays = isinstance(splats, RaySplats)
+    defines = _defines(device, camera, splats.colors.shape[1], antialiased, camera_grad, rays)
     return _backward(device, "project_bwd_adam", len(gaussians), arguments, defines)

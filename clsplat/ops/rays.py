@@ -5,7 +5,7 @@ from typing import Any
 from pyopencl.array import Array
 
 from clsplat.device import Device
-from clsplat.stages import RayColors
+from clsplat.field_stages import RayColors
 
 
 def rays_fwd(device: Device, sigmas: Array, colors: Array, deltas: Array, first: Array, background: Any) -> RayColors:

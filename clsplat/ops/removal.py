@@ -6,12 +6,17 @@ import numpy as np
 
 from clsplat.device import Device
 from clsplat.errors import InputError
-from clsplat.ops.composite import composite_until, gpu_batch, packed, variant
-from clsplat.stages import Bins, Removal, Splats
+from clsplat.ops.composite import composite_until, directions_of, gpu_batch, packed, ray_charts, variant
+from clsplat.stages import AnySplats, Bins, Removal
 
 
 def removal(
-    device: Device, splats: Splats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
+    device: Device,
+    splats: AnySplats,
+    bins: Bins,
+    background: Any,
+    residuals: Any = None,
+    mask: Any = None,
 ) -> Removal:
     """Change of an image's squared error if a single splat is removed or changes its colour.
 
@@ -50,16 +55,16 @@ def removal(
     ]
     stage = "removal_cpu" if device.is_cpu else "removal_gpu"
     pack = packed(device, splats, bins, variant(device))
-    defines = {"TILE": bins.tile_size, "CHANNELS": channels}
+    defines = {"TILE": bins.tile_size, "CHANNELS": channels, "RAYS": ray_charts(splats)}
     if device.is_cpu:
         group, behind = 1, device.constant("background", background)
         defines |= {"LANES": device.vector_width}
     else:
         stop = device.model["TRANSMITTANCE_MIN"] * (1 - device.model["ALPHA_MAX"])  # see cl/removal_cpu.cl
-        group, behind = gpu_batch(device), composite_until(device, pack, bins, background, stop)
+        group, behind = gpu_batch(device), composite_until(device, splats, pack, bins, background, stop)
         defines |= {"STOP": stop, "BATCH": group, "SUBGROUPS": int(device.subgroup_size > 0)}
     lists = [bins.gauss_ids, bins.tile_ranges, bins.slots]
-    arguments = [bins.width, bins.height, pack, *lists, behind, *pixels, records]
+    arguments = [bins.width, bins.height, pack, *lists, behind, *pixels, records, *directions_of(splats)]
     device.launch(stage, "removal", (tiles * group,), arguments, defines=defines, group=(group,))
     arguments = [n, bins.order, bins.first_slots, records, sums]
     device.launch(stage, "removal_sum", (n,), arguments, defines=defines)

@@ -18,7 +18,7 @@ from clsplat.camera import Camera
 from clsplat.constants import ALPHA_MIN
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.renderer import Pass, Renderer, download
+from clsplat.renderer import Pass, Renderer, along_rays, download
 from clsplat.scene import View
 from clsplat.stages import Removal
 
@@ -161,8 +161,9 @@ def _color_changes(renderer: Renderer, run: Pass) -> Array:
     """Changes (N, D, 3) of the colours in a view if the bands above d = 0 to D - 1 are dropped."""
     antialiased = renderer.config.mode == "antialiased"
     colors = download(run.splats.colors)
+    rays = along_rays(renderer.config, run.camera)
     fewer = [
-        renderer.stages.project_fwd(run.gaussians, run.camera, degree, antialiased=antialiased).colors
+        renderer.stages.project_fwd(run.gaussians, run.camera, degree, antialiased=antialiased, rays=rays).colors
         for degree in range(run.sh_degree)
     ]
     return np.stack([download(other) - colors for other in fewer], axis=1)

@@ -13,9 +13,10 @@ from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.reference.finite import count_not_finite
 from clsplat.reference.hashgrid import hashgrid_bwd, hashgrid_fwd
-from clsplat.reference.heads import heads_bwd, heads_fwd, heads_join, heads_join_bwd
+from clsplat.reference.heads import heads_bwd, heads_fwd, heads_join, heads_join_bwd, heads_sh_bwd, heads_sh_fwd
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.march import march
+from clsplat.reference.median import median_splats
 from clsplat.reference.mlp import mlp_bwd, mlp_fwd
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import observe
@@ -24,3 +25,4 @@ from clsplat.reference.rays import rays_bwd, rays_fwd
 from clsplat.reference.removal import removal
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
+from clsplat.reference.voxels import voxels_bwd, voxels_fwd, voxels_tv

@@ -3,11 +3,11 @@
 import numpy as np
 
 from clsplat.constants import ALPHA_MIN, EXTENT_SLACK
-from clsplat.stages import Bins, Splats
+from clsplat.stages import AnySplats, Bins
 
 
 def bin_splats(
-    splats: Splats,
+    splats: AnySplats,
     width: int,
     height: int,
     tile_size: int,
@@ -43,7 +43,7 @@ def bin_splats(
     return Bins(gauss[slots], ranges, order, first, slot, tile_size, width, height)
 
 
-def _tiles_of(splats: Splats, g: int, width: int, height: int, tile_size: int) -> list[tuple[int, int]]:
+def _tiles_of(splats: AnySplats, g: int, width: int, height: int, tile_size: int) -> list[tuple[int, int]]:
     (mx, my), (ex, ey) = splats.means2d[g], splats.extents[g]
     a, b, c = splats.conics[g]
     r2 = 2 * (np.log(splats.opacities[g] / ALPHA_MIN) + EXTENT_SLACK)
@@ -55,9 +55,11 @@ def _tiles_of(splats: Splats, g: int, width: int, height: int, tile_size: int) -
         if lo > hi:
             continue
         # dx has its extremes at dy = -+(b/c) ex, or at the nearer end of [lo, hi].
-        left, right = np.clip(b / c * ex, lo, hi), np.clip(-b / c * ex, lo, hi)
-        x_min = (-b * left - np.sqrt(a * r2 * max(1 - (left / ey) ** 2, 0))) / a
-        x_max = (-b * right + np.sqrt(a * r2 * max(1 - (right / ey) ** 2, 0))) / a
+        x_min, x_max = -ex, ex
+        if a > 0:  # otherwise the splat has a whole box
+            left, right = np.clip(b / c * ex, lo, hi), np.clip(-b / c * ex, lo, hi)
+            x_min = (-b * left - np.sqrt(a * r2 * max(1 - (left / ey) ** 2, 0))) / a
+            x_max = (-b * right + np.sqrt(a * r2 * max(1 - (right / ey) ** 2, 0))) / a
         first = max(0, int(np.ceil(mx + x_min - 0.5)))
         last = min(width - 1, int(np.floor(mx + x_max - 0.5)))
         if first <= last:

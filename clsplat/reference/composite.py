@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from clsplat.stages import Bins, Image, SplatGrads, Splats
+from clsplat.reference.gaussian_rays import chart_offsets, ray_exponents, ray_exponents_bwd
+from clsplat.stages import AnyGrads, AnySplats, Bins, Image, RayGrads, RaySplats, SplatGrads
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,7 @@ class Hit(NamedTuple):
     alpha: Array  # not clamped; 0 where the splat is not drawn
     before: Array  # transmittance in front of the splat
     live: NDArray[np.bool_]  # True where compositing has not stopped before this splat
+    bend: Any  # along rays: the offsets in the chart, and the factors r and h; otherwise None
 
 
 class Layer(NamedTuple):
@@ -40,7 +42,7 @@ class Layer(NamedTuple):
 
 
 def hits(
-    splats: Splats, bins: Bins, transmittance: Array, transmittance_min: float = TRANSMITTANCE_MIN
+    splats: AnySplats, bins: Bins, transmittance: Array, transmittance_min: float = TRANSMITTANCE_MIN
 ) -> Iterator[Hit]:
     """Yield hits tile by tile, front to back. `transmittance` (H, W) is set to 1 and updated to its final value."""
     transmittance[:] = 1
@@ -58,8 +60,15 @@ def hits(
             box = (slice(y0, y1), slice(x0, x1))
             dx = np.arange(x0, x1)[None, :] + 0.5 - centre[0]
             dy = np.arange(y0, y1)[:, None] + 0.5 - centre[1]
-            a, b, c = splats.conics[g]
-            sigma = 0.5 * (a * dx**2 + c * dy**2) + b * dx * dy
+            bend = None
+            if isinstance(splats, RaySplats):
+                columns, rows = np.arange(x0, x1)[None, :], np.arange(y0, y1)[:, None]
+                offsets = chart_offsets(splats.rays[g], splats.directions, columns, rows)
+                sigma, ratio, share = ray_exponents(splats.rays[g], offsets)
+                bend = offsets, (ratio, share)
+            else:
+                a, b, c = splats.conics[g]
+                sigma = 0.5 * (a * dx**2 + c * dy**2) + b * dx * dy
             alpha = splats.opacities[g] * np.exp(-sigma)
             before, was_live = transmittance[box].copy(), live[box].copy()
             behind = before * (1 - np.minimum(alpha, ALPHA_MAX))
@@ -67,10 +76,10 @@ def hits(
             drawn = reached & (behind > transmittance_min)
             live[box] &= ~reached | drawn
             transmittance[box] = np.where(drawn, behind, before)
-            yield Hit(int(g), box, dx, dy, np.where(drawn, alpha, 0), before, was_live)
+            yield Hit(int(g), box, dx, dy, np.where(drawn, alpha, 0), before, was_live, bend)
 
 
-def layers(splats: Splats, bins: Bins, disparities: Array, transmittance: Array) -> Iterator[Layer]:
+def layers(splats: AnySplats, bins: Bins, disparities: Array, transmittance: Array) -> Iterator[Layer]:
     """Yield the splats of all pixels by disparity: first the nearest of each pixel, then the second, and so on.
 
     `transmittance` is updated as in `hits`.
@@ -100,7 +109,7 @@ def layers(splats: Splats, bins: Bins, disparities: Array, transmittance: Array)
 
 
 def composite_fwd(
-    splats: Splats, bins: Bins, background: Any, *, compositor: str = "auto", disparities: Any = None
+    splats: AnySplats, bins: Bins, background: Any, *, compositor: str = "auto", disparities: Any = None
 ) -> Image:
     """Composite splats front to back. Arguments and result as for `clsplat.ops.composite_fwd`."""
     transmittance = np.empty((bins.height, bins.width))
@@ -117,16 +126,19 @@ def composite_fwd(
 
 
 def composite_bwd(
-    splats: Splats,
+    splats: AnySplats,
     bins: Bins,
     image: Image,
     v_image: Image,
     *,
     compositor: str = "auto",
     disparities: Any = None,
-) -> SplatGrads:
+) -> AnyGrads:
     """Gradients of `composite_fwd`. Arguments and result as for `clsplat.ops.composite_bwd`."""
-    v = SplatGrads(*(np.zeros_like(a) for a in (splats.means2d, splats.conics, splats.opacities, splats.colors)))
+    shapes = {"slopes": splats.conics}
+    fields = RayGrads._fields if isinstance(splats, RaySplats) else SplatGrads._fields
+    found = {name: np.zeros_like(shapes[name] if name in shapes else getattr(splats, name)) for name in fields}
+    v: Any = RayGrads(**found) if isinstance(splats, RaySplats) else SplatGrads(**found)
     transmittance = np.empty((bins.height, bins.width))
     behind = (image.rgb * v_image.rgb).sum(axis=2) - (1 - image.alpha) * v_image.alpha
     if disparities is None:
@@ -134,9 +146,15 @@ def composite_bwd(
             g, dx, dy, v_pixels = hit.splat, hit.dx, hit.dy, v_image.rgb[hit.box]
             u = v_pixels @ splats.colors[g]
             v_sigma, weight, behind[hit.box] = _v_sigma(hit.alpha, hit.before, u, behind[hit.box])
-            a, b, c = splats.conics[g]
-            v.means2d[g] -= [(v_sigma * (a * dx + b * dy)).sum(), (v_sigma * (b * dx + c * dy)).sum()]
-            v.conics[g] += [(v_sigma * square).sum() for square in (0.5 * dx**2, dx * dy, 0.5 * dy**2)]
+            if isinstance(splats, RaySplats):
+                offsets, factors = hit.bend
+                parts = ray_exponents_bwd(splats.rays[g], offsets, factors, v_sigma)
+                for array, part in zip((v.means2d, v.conics, v.slopes), parts, strict=True):
+                    array[g] += part
+            else:
+                a, b, c = splats.conics[g]
+                v.means2d[g] -= [(v_sigma * (a * dx + b * dy)).sum(), (v_sigma * (b * dx + c * dy)).sum()]
+                v.conics[g] += [(v_sigma * square).sum() for square in (0.5 * dx**2, dx * dy, 0.5 * dy**2)]
             v.opacities[g] -= v_sigma.sum() / splats.opacities[g]
             v.colors[g] += np.einsum("hw,hwc->c", weight, v_pixels)
     else:

@@ -4,10 +4,10 @@ import numpy as np
 
 from clsplat.constants import ALPHA_MIN, EXTENT_SLACK
 from clsplat.reference.noise import philox
-from clsplat.stages import Dropout, SplatGrads, Splats
+from clsplat.stages import AnyGrads, AnySplats, Dropout
 
 
-def dropout_fwd(splats: Splats, dropout: Dropout) -> None:
+def dropout_fwd(splats: AnySplats, dropout: Dropout) -> None:
     """Drop random splats, in place. Arguments as for `clsplat.ops.dropout_fwd`."""
     n = len(splats.opacities)
     counters = np.zeros((n, 4), np.uint32)
@@ -22,6 +22,6 @@ def dropout_fwd(splats: Splats, dropout: Dropout) -> None:
     splats.opacities[shown] = after
 
 
-def dropout_bwd(v_splats: SplatGrads, dropout: Dropout) -> None:
+def dropout_bwd(v_splats: AnyGrads, dropout: Dropout) -> None:
     """Gradients of `dropout_fwd`, in place. Arguments as for `clsplat.ops.dropout_bwd`."""
     v_splats.opacities[:] *= dropout.gain

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.stages import HashLevels
+from clsplat.field_stages import HashLevels
 
 Array = NDArray[Any]
 

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.field_stages import EXPONENT_MAX
 from clsplat.reference.sh import sh_basis
-from clsplat.stages import EXPONENT_MAX
 
 Array = NDArray[Any]
 
@@ -34,3 +34,30 @@ def heads_join_bwd(v_inputs: Array, features: Array, sigmas: Array, v_sigmas: Ar
     v_features = v_inputs[:, 16:].copy()
     v_features[:, 0] += np.where(np.abs(features[:, 0]) < EXPONENT_MAX, v_sigmas * sigmas, 0)
     return v_features
+
+
+def _sh_colors(features: Array, directions: Array, rays_of: Array) -> tuple[Array, Array]:
+    """Basis (S, 9), and colours (S, 3) before the limit at 0."""
+    basis = sh_basis(directions, 2)[rays_of]
+    return basis, 0.5 + np.einsum("sb,skb->sk", basis, features[:, 1:].reshape(-1, 3, 9))
+
+
+def heads_sh_fwd(features: Array, directions: Array, rays_of: Array, density_scale: float) -> tuple[Array, Array]:
+    """Densities and colours of Plenoxels. Arguments and results as for `clsplat.ops.heads_sh_fwd`."""
+    colors = _sh_colors(features, directions, rays_of)[1]
+    return density_scale * np.maximum(features[:, 0], 0), np.maximum(colors, 0)
+
+
+def heads_sh_bwd(
+    features: Array,
+    directions: Array,
+    rays_of: Array,
+    density_scale: float,
+    v_sigmas: Array,
+    v_colors: Array,
+) -> Array:
+    """Gradient of `heads_sh_fwd`. Arguments and result as for `clsplat.ops.heads_sh_bwd`."""
+    basis, colors = _sh_colors(features, directions, rays_of)
+    v_density = np.where(features[:, 0] > 0, density_scale * v_sigmas, 0)
+    v_harmonics = np.where(colors > 0, v_colors, 0)[:, :, None] * basis[:, None]
+    return np.concatenate([v_density[:, None], v_harmonics.reshape(-1, 27)], axis=1)

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.constants import FRUSTUM_MARGIN
-from clsplat.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -25,10 +24,11 @@ def lens(camera: Camera, points: Array) -> dict[str, Any]:
         means2d (N, 2) px; jacobian (N, 2, 3) of the local affine approximation; hessian (N, 2, 3, 3), the derivative
         of jacobian by the point; slope_jacobian (N, 2, 3), the derivative of means2d, which differs from jacobian
         where that of a pinhole is clamped; means2d_by (N, 2, 4) and jacobian_by (N, 2, 3, 4), the derivatives by fx,
-        fy, cx, cy; depths (N,), and onward (N, 3), their gradient; seen (N,) bool, False for culled points.
+        fy, cx, cy; depths (N,), and onward (N, 3), their gradient; seen (N,) bool, False for culled points. Without
+        derivatives for an equirectangular camera.
     """
     if camera.model == "equirectangular":
-        raise InputError("camera: expected a pinhole, orthographic or fisheye one, found an equirectangular one")
+        return _sphere(camera, points)
     n, focal = len(points), np.array([camera.fx, camera.fy])
     x, y, z = points.T
     hessian, means2d_by, jacobian_by = np.zeros((n, 2, 3, 3)), np.zeros((n, 2, 4)), np.zeros((n, 2, 3, 4))
@@ -76,6 +76,17 @@ def lens(camera: Camera, points: Array) -> dict[str, Any]:
         means2d=slopes * focal + [camera.cx, camera.cy], jacobian=jacobian, hessian=hessian,
         slope_jacobian=focal[:, None] * slope_jacobian, means2d_by=means2d_by, jacobian_by=jacobian_by,
         depths=depths, onward=onward, seen=seen,
+    )  # fmt: skip
+
+
+def _sphere(camera: Camera, points: Array) -> dict[str, Any]:
+    """Image positions, depths and visibility for an equirectangular camera, which projects along rays alone."""
+    x, y, z = points.T
+    depths = np.linalg.norm(points, axis=1)
+    angles = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=1)
+    return dict(
+        means2d=angles * [camera.fx, camera.fy] + [camera.cx, camera.cy], depths=depths,
+        onward=points / depths[:, None], seen=depths > camera.near_depth,
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.stages import Marching, Samples
+from clsplat.field_stages import Marching, Samples
 
 Array = NDArray[Any]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.constants import TRANSMITTANCE_MIN
-from clsplat.stages import RayColors
+from clsplat.field_stages import RayColors
 
 Array = NDArray[Any]
 

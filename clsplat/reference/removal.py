@@ -6,13 +6,13 @@ import numpy as np
 
 from clsplat.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 from clsplat.reference.composite import hits
-from clsplat.stages import Bins, Removal, Splats
+from clsplat.stages import AnySplats, Bins, Removal
 
 # Transmittance at which compositing stops here. Without one splat of the largest alpha it would be TRANSMITTANCE_MIN.
 STOP = TRANSMITTANCE_MIN * (1 - ALPHA_MAX)
 
 
-def removal(splats: Splats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None) -> Removal:
+def removal(splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None) -> Removal:
     """Change of the squared error. Arguments and result as for `clsplat.ops.removal`."""
     n, channels = splats.colors.shape
     transmittance = np.empty((bins.height, bins.width))

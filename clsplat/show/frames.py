@@ -124,6 +124,20 @@ def normals(depth: NDArray[Any], camera: Camera) -> NDArray[np.float64]:
     return np.asarray(result / np.maximum(np.linalg.norm(result, axis=2, keepdims=True), 1e-300))
 
 
+def scaled_depth(depth: NDArray[Any]) -> NDArray[np.uint16]:
+    """Depths (H, W) as 16-bit levels of the largest one."""
+    return np.rint(depth / max(float(depth.max()), 1e-12) * 65535).astype(np.uint16)
+
+
+def colored_normals(normals: NDArray[Any], camera: Camera) -> NDArray[np.uint8]:
+    """Normals (H, W, 3) in world coordinates as colours: red to the right, green up, blue to the camera.
+
+    Black where there is none.
+    """
+    frame = to_uint8(0.5 + 0.5 * (normals @ camera.viewmat[:3, :3].T) * [1, -1, -1])
+    return np.where(normals.any(axis=2, keepdims=True), frame, 0).astype(np.uint8)
+
+
 def _colored(values: NDArray[Any]) -> NDArray[np.uint8]:
     from matplotlib import colormaps
 

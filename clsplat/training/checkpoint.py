@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -83,13 +84,17 @@ def _rows_arrays(rows: Rows, prefix: str) -> dict[str, Any]:
 def write_photos(path: Path, state: State, scene: Scene) -> None:
     """Write photos.json: the learned parameters of each training photo, by name.
 
-    colours: the rows of the (3, 4) map from the scene's RGB, in [0, 1], to the photo's; viewmat: the refined one,
-    world to camera, in the dataset's coordinates.
+    colours: the rows of the (3, 4) map from the scene's RGB, in [0, 1], to the photo's; curve and falloff, with
+    ``--response``: the terms that docs/stages/exposure.md defines, per channel; viewmat: the refined one, world to
+    camera, in the dataset's coordinates.
     """
     content: dict[str, dict[str, Any]] = {view.name: {} for view in scene.train}
     for view in scene.train:
         if state.exposures:
-            content[view.name]["colours"] = state.exposures.of(view.name).tolist()
+            learned = state.exposures.of(view.name)
+            content[view.name]["colours"] = learned[:, :4].tolist()
+            if learned.shape[1] > 4:
+                content[view.name] |= {"curve": learned[:, 4].tolist(), "falloff": learned[:, 5].tolist()}
         if state.poses:
             camera = refined(view.camera, state.poses.of(view.name)).translated(-scene.offset)
             content[view.name]["viewmat"] = camera.viewmat.tolist()
@@ -175,6 +180,7 @@ def _to_state(arrays: Arrays, extent: float, config: TrainConfig) -> State:
     pixels = arrays.get("pixels")
     if pixels is not None and (pixels.dtype != np.float32 or pixels.shape != (len(rows.gaussians),)):
         raise ValueError(f"pixels of type {pixels.dtype} and shape {pixels.shape}")
+    exposures_of = partial(photo_exposures.start, response=config.response)
     return State(
         iteration=int(iteration),
         seconds=float(arrays["seconds"]),
@@ -183,7 +189,7 @@ def _to_state(arrays: Arrays, extent: float, config: TrainConfig) -> State:
         intersections=float(arrays["intersections"]),
         losses=[float(loss) for loss in arrays["losses"]],
         search=search,
-        exposures=_to_photo_parameters(arrays, "exposures.", photo_exposures.start) if config.exposure else None,
+        exposures=_to_photo_parameters(arrays, "exposures.", exposures_of) if config.exposure else None,
         poses=_to_photo_parameters(arrays, "poses.", photo_poses.start) if config.poses else None,
         filter=SmoothingFilter(pixels) if config.filter_3d else None,
     )

@@ -10,7 +10,7 @@ from clsplat import reference
 from clsplat.config import OptimConfig
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Pass, Renderer, download, fetch
-from clsplat.stages import AdamStep, CameraGrads, SplatGrads, Stages
+from clsplat.stages import AdamStep, AnyGrads, CameraGrads, Stages
 from clsplat.training.smoothing_filter import SmoothingFilter
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class Optimizer:
         moments: Moments,
         smoothing: SmoothingFilter | None,
         run: Pass,
-        v_splats: SplatGrads,
+        v_splats: AnyGrads,
         settings: AdamStep,
         *,
         camera_grad: bool = False,

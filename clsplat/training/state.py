@@ -116,7 +116,7 @@ def initial_state(scene: Scene, config: TrainConfig, gaussians: Gaussians | None
         extent=scene.extent,
         rows=Rows(gaussians, Moments.zeros(gaussians), strategy),
         search=rule.start(scene, len(gaussians), config) if searches else None,
-        exposures=photo_exposures.start(names) if config.exposure else None,
+        exposures=photo_exposures.start(names, config.response) if config.exposure else None,
         poses=photo_poses.start(names) if config.poses else None,
         filter=SmoothingFilter() if config.filter_3d else None,
     )

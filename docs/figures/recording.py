@@ -23,7 +23,7 @@ OUT = Path(__file__).parents[1] / "_static" / "recording.gif"
 COLUMNS, LINES, POINTS = 100, 22, 15
 
 COMMANDS = (
-    ("clsplat train photos -o scene", None),
+    ("clsplat train photos -o scene --iterations 1000", None),
     ("clsplat view scene --port 8090", b"http://"),
     ("clsplat export scene scene.html", None),
 )

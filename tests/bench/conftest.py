@@ -7,7 +7,7 @@ import pytest
 from cli_runs import write_dataset
 from small_cells import SMALL
 
-from clsplat.bench import roof
+from clsplat.bench import networks, roof
 
 
 @pytest.fixture(scope="module")
@@ -26,3 +26,4 @@ def quick_roof(monkeypatch):
     """Micro-benchmarks that take milliseconds."""
     for name, value in {"SECONDS": 1e-4, "RUNS": 1, "LAUNCHES": 5, "BUFFER_BYTES": 2**20}.items():
         monkeypatch.setattr(roof, name, value)
+    monkeypatch.setattr(networks, "OPERATIONS", 2**17)

@@ -15,9 +15,10 @@ from matplotlib.figure import Figure
 
 import clsplat
 from clsplat import ops, reference
+from clsplat.bench import networks as network_bench
 from clsplat.bench import roof
 from clsplat.bench.environment import commit
-from clsplat.bench.kernel_report import chart_title, details, scaling_chart, summary
+from clsplat.bench.kernel_report import chart_title, details, networks, scaling_chart, summary
 from clsplat.bench.kernels import _watched, bench_kernels, stage_bytes
 from clsplat.bench.timing import STILL, training_of
 from clsplat.bench.workloads import DEFAULT, from_files, scaling_names, synthetic
@@ -39,6 +40,7 @@ def results(device):
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"SECONDS": 1e-4, "RUNS": 1, "LAUNCHES": 5, "BUFFER_BYTES": 2**20}.items():
             patch.setattr(roof, name, value)
+        patch.setattr(network_bench, "OPERATIONS", 2**17)
         return bench_kernels([synthetic("300-40x32"), synthetic("200-56x24")], RenderConfig(), device, 3)
 
 
@@ -49,6 +51,17 @@ def test_the_reference_workload_has_the_documented_counts(device):
     # The scene was tuned to 62.0 pairs per pixel and 0.365 M intersections. Rounding changes single pairs.
     assert accepted.mean() == pytest.approx(62.0, abs=0.2)
     assert run.bins.gauss_ids.shape[0] == pytest.approx(365_000, rel=2e-3)
+
+
+def test_networks_are_timed_and_reported(results):
+    """Each network with its rates, as fractions of the roof; older files have no networks."""
+    timed = results["networks"]
+    assert [tuple(network["widths"]) for network in timed] == list(network_bench.WIDTHS)
+    text = networks(results)
+    for network in timed:
+        share = network["backward_gflops"] / results["roof"]["fma_gflops"]
+        assert f"{network['forward_gflops']:.4g}" in text and f"{100 * share:.3g} %" in text
+    assert networks({"roof": results["roof"]}) == ""
 
 
 class TestWorkloads:
@@ -270,7 +283,7 @@ class TestPage:
     """docs/benchmarks.md shows the content of docs/results: its tables are made from these files."""
 
     def test_results_are_complete(self, measured, results):
-        assert set(measured) == set(results)
+        assert set(measured) | {"networks"} == set(results)  # the page shows no networks
         assert set(measured["roof"]) == set(results["roof"])
         assert {w["name"] for w in measured["workloads"]} == {*DEFAULT, *scaling_names()}
         assert set(measured["workloads"][0]) == set(results["workloads"][0])

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_runs import SIZE, TRAIN, fails, read_image, run
+from plyfile import PlyData
 
 from clsplat.cli import main
 from clsplat.config import DataConfig, FewViewsConfig, TrainConfig
@@ -89,9 +90,24 @@ def test_render_writes_views_and_orbits(trained: Path, dataset: Path, tmp_path: 
     picture, expected = read_image(tmp_path / "test" / "8.png"), read_image(trained / "eval" / "render" / "8.png")
     assert np.abs(picture.astype(int) - expected).max() <= 1
     assert read_image(tmp_path / "test" / "8_depth.png").max() == 65535
+    run("render", trained / "scene.ply", dataset, "-o", tmp_path / "surface", "--surface")
+    median = read_image(tmp_path / "surface" / "8_median.png")
+    normals = read_image(tmp_path / "surface" / "8_normals.png")
+    assert median.max() == 65535 and normals.shape == picture.shape
+    np.testing.assert_array_equal(normals.any(axis=2), median > 0)
     run("render", trained / "scene.ply", dataset, "-o", tmp_path / "orbit", "--path", "orbit", "--frames", 3)
     assert sorted(p.name for p in (tmp_path / "orbit").iterdir()) == ["0000.png", "0001.png", "0002.png"]
     assert read_image(tmp_path / "orbit" / "0000.png").shape[:2] == SIZE[::-1]
+
+
+def test_mesh_of_a_run(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run("mesh", trained, "-o", tmp_path / "mesh.ply", "--resolution", 16)
+    assert "triangles" in capsys.readouterr().err
+    vertices = PlyData.read(tmp_path / "mesh.ply")["vertex"]
+    run("mesh", trained, "-o", tmp_path / "part.ply", "--resolution", 24, "--box", -1, -1, -1, 1, 1, 1)
+    assert len(vertices) > 10 and np.isfinite(vertices["x"]).all()
+    assert "expected the suffix .ply" in fails(capsys, "mesh", trained, "-o", tmp_path / "mesh.obj")
+    assert "expected six numbers" in fails(capsys, "mesh", trained, "-o", tmp_path / "b.ply", "--box", 1, 2, 3)
 
 
 def test_export_keeps_the_scene(trained: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ball_photos import ball
-from small_fields import SmallIngp
+from small_fields import SmallIngp, SmallPlenoxels
 
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.errors import InputError
@@ -23,7 +23,7 @@ WHITE = BACKGROUNDS["white"]
 CONFIG = TrainConfig(iterations=250, data=DataConfig(background="white"))
 
 
-SMALL = [SmallIngp]
+SMALL = [SmallIngp, SmallPlenoxels]
 EACH = pytest.mark.parametrize("method", SMALL, ids=lambda m: m.name)
 
 
@@ -91,6 +91,17 @@ def test_another_configuration_does_not_resume(device, scene, method, tmp_path):
         load_checkpoint(tmp_path / CHECKPOINT, method, replace(config, seed=1), device)
 
 
+def test_rays_without_samples_see_the_background(device, scene, monkeypatch):
+    """Plenoxels with one transparent cell in a corner, rendered row by row: most rows have no sample."""
+    monkeypatch.setattr("clsplat.fields.field.RENDERED_RAYS", 24)
+    field = SmallPlenoxels(Space.of(scene.train), device, 0)
+    occupied = np.zeros((8, 8, 8), np.uint8)
+    occupied[0, 0, 0] = 1
+    field._place(occupied, np.zeros((8, 28)))
+    image = field.image(scene.test[0].camera, WHITE)
+    np.testing.assert_array_equal(image, np.ones_like(image))
+
+
 def test_damaged_files_are_refused(device, tmp_path):
     path = tmp_path / MODEL
     with pytest.raises(InputError, match="found no file"):
@@ -99,7 +110,7 @@ def test_damaged_files_are_refused(device, tmp_path):
     with pytest.raises(InputError, match="damaged"):
         load_field(path, METHODS, device)
     np.savez(path, about=json.dumps({"method": "nerd"}))
-    with pytest.raises(InputError, match="expected a field of ingp-base"):
+    with pytest.raises(InputError, match="expected a field of plenoxels, ingp-base"):
         load_field(path, METHODS, device)
 
 

@@ -47,7 +47,7 @@ LIMITS = "tests/test_composite_limits.py"
 COMPOSITE = ("tests/test_composite.py", "tests/test_composite_gpu.py", "tests/test_composite_sorted.py", LIMITS)
 REMOVAL = ("tests/test_removal.py",)
 TESTS: dict[str, tuple[str, ...]] = {
-    "common": ("tests/test_programs.py", "tests/test_composite.py", *PROJECT),
+    "common": (*(f"tests/test_{name}.py" for name in ("programs", "observe", "dropout", "composite")), *PROJECT),
     "composite": COMPOSITE,
     "composite_blocks": COMPOSITE,
     "composite_cpu": (COMPOSITE[0], LIMITS),

@@ -10,6 +10,7 @@ import pytest
 
 from clsplat.bench.stability.small import CONFIG, small_scene, with_train
 from clsplat.evaluate import mean_metrics
+from clsplat.reference.exposure import squared_radius
 from clsplat.renderer import Renderer
 from clsplat.training import photo_poses as poses
 from clsplat.training.checkpoint import load_state
@@ -53,8 +54,31 @@ def test_gains_of_photos_cost_little(scene, plain, device, tmp_path):
     assert found[True] > plain - 0.3
 
 
-def test_photos_that_agree_lose_nothing(scene, plain, device, tmp_path):
-    assert held_out(train(scene, replace(CONFIG, exposure=True), tmp_path, device), scene, device) > plain - 0.2
+def bent(view, rng):
+    """Another contrast and white balance for each photo, and a lens that darkens the corners by 40 %."""
+    x = view.image / 255
+    curve, gains = rng.uniform(-0.3, 0.3), rng.uniform(0.85, 1.15, 3)
+    y = gains * (x + curve * x * (1 - x)) * (1 - 0.4 * squared_radius(*x.shape[:2]))
+    return replace(view, image=np.clip(np.rint(255 * y), 0, 255).astype(np.uint8))
+
+
+def test_curves_and_vignetting_cost_little(scene, plain, device, tmp_path):
+    changed = with_train(scene, bent)
+    found = {}
+    for name, options in CORRECTIONS.items():
+        found[name] = held_out(train(changed, replace(CONFIG, **options), tmp_path, device), scene, device)
+    # Measured: 29.1 dB with unchanged photos, 27.3 dB without a remedy, 28.0 dB with affine maps, 28.7 dB with both.
+    assert found["response"] > found["exposure"] + 0.3 > found["none"] + 0.6
+    assert found["response"] > plain - 0.7
+
+
+CORRECTIONS = {"none": {}, "exposure": {"exposure": True}, "response": {"exposure": True, "response": True}}
+
+
+@pytest.mark.parametrize("name", ["exposure", "response"])
+def test_photos_that_agree_lose_nothing(scene, plain, device, tmp_path, name):
+    found = held_out(train(scene, replace(CONFIG, **CORRECTIONS[name]), tmp_path, device), scene, device)
+    assert found > plain - 0.2
 
 
 def test_poses_that_are_off_are_found(scene, plain, device, tmp_path):

@@ -1,0 +1,134 @@
+"""The stages of radiance fields: their functions, and the containers of arrays that flow between them.
+
+They belong to `clsplat.stages.Stages`. R rays, S samples, L levels.
+"""
+
+from itertools import accumulate
+from typing import Any, NamedTuple, Protocol
+
+Array = Any
+"""An array of the device, or of NumPy."""
+
+EXPONENT_MAX = 15.0
+"""Largest exponent of a field's density, which is exp of a network's result (code of Müller et al. 2022)."""
+
+
+NO_ROW = 0xFFFFFFFF
+"""Mark of a corner of a sparse grid that has no row in its table."""
+
+TV_EPS = 1e-9
+"""Constant under the root of the total variation, which keeps its gradient finite (code of Fridovich-Keil et al.
+2022)."""
+
+
+class RayColors(NamedTuple):
+    """Result of compositing samples along R rays.
+
+    rgb (R, 3), background included; transmittances (S,): light that reaches each sample, 0 behind the end of its ray;
+    behind (R,): light that reaches the background.
+    """
+
+    rgb: Any
+    transmittances: Any
+    behind: Any
+
+
+class Marching(NamedTuple):
+    """How rays are sampled: every max(step, cone t) from t = near to t = far, lengths in the field's coordinates.
+
+    Without `contracted`, rays begin and end at the unit cube; with it, space is contracted to a ball of radius 2.
+    """
+
+    step: float
+    cone: float
+    near: float
+    far: float
+    contracted: bool
+
+
+class Samples(NamedTuple):
+    """Samples of R rays, S in all.
+
+    positions (S, 3) in the unit cube; deltas (S,), lengths that they stand for; rays_of (S,) uint32; first (R + 1,)
+    uint32: ray r has the samples first[r] to first[r + 1], front to back; total: S. Where
+    that is 0, arrays of the device have one entry, of no length, which belongs to no ray.
+    """
+
+    positions: Any
+    deltas: Any
+    rays_of: Any
+    first: Any
+    total: int
+
+
+class HashLevels(NamedTuple):
+    """Levels of a hash grid, from coarse to fine.
+
+    resolutions: cells along an edge of each level; offsets: first entry of each level in the table, and the number of
+    all entries at the end. A level has an entry for each corner of its cells, unless that exceeds the largest size.
+    """
+
+    resolutions: tuple[int, ...]
+    offsets: tuple[int, ...]
+
+    @classmethod
+    def geometric(cls, count: int, coarsest: int, finest: int, entries: int) -> "HashLevels":
+        """Make `count` levels whose resolutions are a geometric sequence, of at most `entries` entries each (Müller
+        et al. 2022, equations 2 and 3)."""
+        growth = (finest / coarsest) ** (1 / max(count - 1, 1))
+        resolutions = tuple(round(coarsest * growth**level) for level in range(count))
+        sizes = (min((resolution + 1) ** 3, entries) for resolution in resolutions)
+        return cls(resolutions, tuple(accumulate(sizes, initial=0)))
+
+
+class FieldStages(Protocol):
+    """The functions of the stages of fields. Each function's docstring is with its launch in `clsplat.ops`."""
+
+    def march(
+        self, origins: Array, directions: Array, offsets: Array, occupied: Array, marching: Marching
+    ) -> Samples: ...
+    def hashgrid_fwd(self, positions: Array, table: Array, levels: HashLevels) -> Array: ...
+    def hashgrid_bwd(self, positions: Array, v_features: Array, levels: HashLevels) -> Array: ...
+    def mlp_fwd(self, inputs: Array, weights: Array, widths: tuple[int, ...]) -> tuple[Array, Array]: ...
+    def mlp_bwd(
+        self, inputs: Array, weights: Array, widths: tuple[int, ...], hidden: Array, v_outputs: Array
+    ) -> tuple[Array, Array]: ...
+    def voxels_fwd(self, positions: Array, index: Array, table: Array) -> Array: ...
+    def voxels_bwd(self, positions: Array, index: Array, rows: int, v_features: Array) -> Array: ...
+    def voxels_tv(
+        self,
+        index: Array,
+        corners: Array,
+        table: Array,
+        v_table: Array,
+        weights: tuple[float, float],
+        first: int,
+        count: int,
+    ) -> None: ...
+    def heads_join(self, features: Array, directions: Array, rays_of: Array) -> Array: ...
+    def heads_join_bwd(self, v_inputs: Array, features: Array, sigmas: Array, v_sigmas: Array) -> Array: ...
+    def heads_fwd(self, features: Array, outputs: Array) -> tuple[Array, Array]: ...
+    def heads_bwd(self, colors: Array, v_colors: Array) -> Array: ...
+    def heads_sh_fwd(
+        self, features: Array, directions: Array, rays_of: Array, density_scale: float
+    ) -> tuple[Array, Array]: ...
+    def heads_sh_bwd(
+        self,
+        features: Array,
+        directions: Array,
+        rays_of: Array,
+        density_scale: float,
+        v_sigmas: Array,
+        v_colors: Array,
+    ) -> Array: ...
+    def rays_fwd(self, sigmas: Array, colors: Array, deltas: Array, first: Array, background: Any) -> RayColors: ...
+    def rays_bwd(
+        self,
+        sigmas: Array,
+        colors: Array,
+        deltas: Array,
+        first: Array,
+        background: Any,
+        transmittances: Array,
+        v_rgb: Array,
+    ) -> tuple[Array, Array]: ...

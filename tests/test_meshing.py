@@ -1,0 +1,74 @@
+"""Meshes: of a ball made of flat Gaussians, and of the still life, against their known surfaces."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.meshing import make_mesh, save_mesh
+from clsplat.renderer import Renderer
+
+
+def ball(n=1500):
+    """Flat Gaussians on the unit sphere: red where x > 0, green elsewhere."""
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
+    normals = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+    # The quaternion that turns e_z to the normal.
+    quats = np.stack([1 + z, -normals[:, 1], normals[:, 0], np.zeros(n)], axis=1)
+    scales = np.tile(np.log([0.06, 0.06, 1e-3]), (n, 1))
+    colors = np.where(normals[:, :1] > 0, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    sh = ((colors - 0.5) / 0.28209479177387814)[:, None]
+    return Gaussians(normals, scales, quats, np.full(n, 4.0), sh).astype(np.float32)
+
+
+def around(count=12, size=64):
+    turns = 2 * np.pi * np.arange(count) / count
+    eyes = [[3 * np.cos(a), 3 * np.sin(a), 2.5 * (-1) ** k] for k, a in enumerate(turns)]
+    return [Camera.look_at(eye, [0, 0, 0], [0, 0, 1], size, size, size) for eye in eyes]
+
+
+@pytest.mark.parametrize("resolution", [32, 48])
+def test_the_mesh_of_a_ball_is_a_sphere(device, tmp_path, resolution):
+    mesh = make_mesh(ball(), around(), Renderer(device), resolution=resolution)
+    voxel = 2.2 / resolution
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    assert abs(radii - 1).mean() < 0.3 * voxel and abs(radii - 1).max() < 2 * voxel
+    corners = mesh.vertices[mesh.faces]
+    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    assert areas.sum() == pytest.approx(4 * np.pi, rel=0.1)
+    # Triangles turn their front to the outside.
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * corners.mean(axis=1)
+    assert (outward.sum(axis=1) > 0).mean() > 0.99
+    clear = abs(mesh.vertices[:, 0]) > 0.2
+    red = mesh.vertices[clear, 0] > 0
+    assert (mesh.colors[clear, 0] > 128).astype(int).tolist() == red.astype(int).tolist()
+
+    save_mesh(tmp_path / "ball.ply", mesh)
+    ply = PlyData.read(tmp_path / "ball.ply")
+    np.testing.assert_allclose(np.stack([ply["vertex"][k] for k in "xyz"], axis=1), mesh.vertices, atol=1e-6)
+    np.testing.assert_array_equal(ply["vertex"]["red"], mesh.colors[:, 0])
+    np.testing.assert_array_equal(np.stack(ply["face"]["vertex_indices"]), mesh.faces)
+
+
+def test_a_box_cuts_the_mesh(device):
+    mesh = make_mesh(ball(), around(), Renderer(device), resolution=32, box=([0, -1.2, -1.2], [1.2, 1.2, 1.2]))
+    assert mesh.vertices[:, 0].min() > -0.01 and mesh.vertices[:, 1].min() < -0.9
+
+
+def test_meshes_need_pinholes_and_surfaces(device):
+    renderer, cameras = Renderer(device), around(2)
+    with pytest.raises(InputError, match="pinhole cameras"):
+        make_mesh(ball(), [replace(cameras[0], model="orthographic")], renderer)
+    faint = ball()
+    faint.logit_opacities[:] = -6
+    with pytest.raises(InputError, match="half of the light"):
+        make_mesh(faint, cameras, renderer)
+    with pytest.raises(InputError, match="found none"):
+        make_mesh(ball(), cameras, renderer, resolution=16, box=([5, 5, 5], [6, 6, 6]))
+    with pytest.raises(InputError, match="positive size"):
+        make_mesh(ball(), cameras, renderer, resolution=16, box=([5, 5, 5], [5, 5, 5]))
