@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat import reference
+from clsplat import field_selftest, reference
 from clsplat.camera import Camera
 from clsplat.config import OptimConfig
 from clsplat.gaussians import SHAPES, Gaussians
@@ -178,6 +178,12 @@ def test_loss(b: Bench) -> Found:
     yield v_image, v_expected
 
 
+def test_median(b: Bench) -> Found:
+    found = b.stages.median_splats(b.up(b.splats), b.lists()).get()
+    same = found == reference.median_splats(b.splats, b.bins)
+    yield np.array(same.mean() > 0.99, int), np.array(1)  # rounding decides where the transmittance is nearly 1/2
+
+
 def test_noise(b: Bench) -> Found:
     found, expected = b.up(b.gaussians), copied(b.gaussians)
     b.stages.add_noise(found, 2.0, 5, 9)
@@ -232,7 +238,9 @@ def test_sort(b: Bench) -> Found:
 
 
 TESTS: dict[str, Callable[[Bench], Found]] = {
-    name.removeprefix("test_"): function for name, function in globals().copy().items() if name.startswith("test_")
+    name.removeprefix("test_"): function
+    for name, function in (globals() | vars(field_selftest)).items()
+    if name.startswith("test_")
 }
 """The test of each stage."""
 
