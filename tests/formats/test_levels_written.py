@@ -1,6 +1,7 @@
 """Levels of detail as files: a streamed SOG and 3D Tiles, read back, bounded, and found broken in one sentence."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -19,20 +20,28 @@ from clsplat.pruning.levels import detail_tree
 OFFSET = np.array([1000.0, -2000.0, 0.5])
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def scene():
     return random_gaussians(700, 2)
 
 
-@pytest.fixture
-def written(scene, tmp_path):
-    writers = [kind(tmp_path, "antialiased", OFFSET) for kind in (StreamedSogWriter, TilesWriter)]
+@pytest.fixture(scope="module")
+def folder(scene, tmp_path_factory):
+    """Both formats in one folder; tests must not change it."""
+    folder = tmp_path_factory.mktemp("levels")
+    writers = [kind(folder, "antialiased", OFFSET) for kind in (StreamedSogWriter, TilesWriter)]
     for node in detail_tree(scene):
         for writer in writers:
             writer.add(node)
     for writer in writers:
         writer.finish()
-    return tmp_path
+    return folder
+
+
+@pytest.fixture
+def written(folder, tmp_path):
+    """A copy that a test may change."""
+    return shutil.copytree(folder, tmp_path / "copy")
 
 
 @pytest.mark.parametrize(("name", "error"), [(LOD_META, 1e-3), (TILESET, 1e-6)])
