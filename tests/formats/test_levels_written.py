@@ -11,10 +11,11 @@ from foreign_code import splat_transform
 
 from clsplat.errors import InputError
 from clsplat.formats import anatomy_of, load_gaussians, save_gaussians
+from clsplat.formats.axes import LEFT_UP_FORWARD, turned
 from clsplat.formats.gltf import load_glb
 from clsplat.formats.sog import load_sog
 from clsplat.formats.streamed_sog import LOD_META, StreamedSogWriter
-from clsplat.formats.tiles_3d import TILESET, Z_UP, TilesWriter
+from clsplat.formats.tiles_3d import TILESET, TilesWriter
 from clsplat.pruning.levels import detail_tree
 
 OFFSET = np.array([1000.0, -2000.0, 0.5])
@@ -84,7 +85,8 @@ def test_the_tree_of_tiles(written):
         centre, half = numbers[:3], numbers[3:].reshape(3, 3)
         gaussians = load_glb(written / tile["content"]["uri"])[0]
         seen.append(len(gaussians))
-        inside = np.abs((gaussians.means @ Z_UP.T - centre) @ np.linalg.inv(half).T)
+        x, y, z = turned(gaussians, LEFT_UP_FORWARD).means.T  # as in the file, whose y viewers turn to z
+        inside = np.abs((np.stack([x, -z, y], axis=1) - centre) @ np.linalg.inv(half).T)
         assert inside.max() <= 1 + 1e-5  # single precision
         assert tile["refine"] == "REPLACE" and tile["geometricError"] <= parent
         children = tile.get("children", [])
