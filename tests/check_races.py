@@ -236,6 +236,15 @@ def pipeline(device, compositor, tile_size):
         np.testing.assert_allclose(v_found.viewmat, v_expected.viewmat, rtol=1e-7)
 
 
+def networks(device):
+    """Rows beyond the last tile, and two layers, forward and backward."""
+    widths, rng = (32, 48, 16), np.random.default_rng(0)
+    x, v = (device.upload("rows", rng.normal(size=(70, width))) for width in (32, 16))
+    weights = device.upload("weights", rng.normal(size=32 * 48 + 48 * 16))
+    _, hidden = ops.mlp_fwd(device, x, weights, widths)
+    ops.mlp_bwd(device, x, weights, widths, hidden, v)[1].get()
+
+
 CASES = {
     "control": control,
     "sort": sort,
@@ -247,6 +256,7 @@ CASES = {
     "adam": adam,
     "noise": noise,
     "fused": fused,
+    "networks": networks,
     "removal": removal,
     "gpu-8": lambda device: pipeline(device, "gpu", 8),
     "gpu-16": lambda device: pipeline(device, "gpu", 16),

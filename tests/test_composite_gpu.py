@@ -126,6 +126,17 @@ def test_splats_behind_an_early_stop_get_zeros(device64, tile_size, n):
         assert_matches(name, found[name], expected[name], DOUBLE)
 
 
+@pytest.mark.parametrize("largest", [100, 16])
+def test_a_work_item_may_have_several_pixels(largest):
+    """On devices whose groups are smaller than a tile: some Mali and Adreno, Apple's CPU device."""
+    device = open_device(np.float64)
+    device.largest_group = largest  # shadows the cached property
+    splats, bins = listed_scene(16, 3)
+    found, expected = composite_gpu(device, splats, bins), composite_twin(splats, bins)
+    for name in expected:
+        assert_matches(name, found[name], expected[name], DOUBLE)
+
+
 @pytest.mark.parametrize("batch", [1, 48, 128])
 def test_the_batch_changes_no_bit(device64, monkeypatch, batch):
     """Also where a batch exceeds the 64 pixels of a tile, or is a single splat."""

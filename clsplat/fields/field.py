@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-RENDERED_RAYS = 8192
-"""Number of rays that are rendered at once. With 200 samples each, Instant-NGP takes 1 GB for them."""
+RENDERED_RAYS = 1024
+"""Number of rays that are rendered at once. With 500 samples each, Instant-NGP takes half a gigabyte for them."""
 
 
 class Field(ABC):
