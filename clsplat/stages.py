@@ -44,9 +44,9 @@ class RaySplats(NamedTuple):
     """Gaussians projected for evaluation along rays; the first six fields are those of `Splats`.
 
     means2d, conics and extents are the outline, outside of which alpha < ALPHA_MIN: an ellipse, or where the conic is
-    0 the box of the extents. rays (N, 8 or 17): the terms of the exponent (cl/gaussian_rays.h): the centre in a chart,
-    Q (xx, xy, yy), the slopes of lambda and k; 17 with the axes of a chart of its own. directions (H, W, 3): unit
-    vectors of the pixels' rays in the camera's frame, for such charts; otherwise (1, 1, 3) zeros.
+    0 the box of the extents. rays (N, 8 or 17): the terms of the exponent (cl/gaussian_rays.h), which are the centre
+    in a chart, Q (xx, xy, yy), the slopes of lambda and k; 17 with the axes of a chart of its own. directions
+    (H, W, 3): unit vectors of the pixels' rays in the camera's frame, for such charts; otherwise (1, 1, 3) zeros.
     """
 
     means2d: Any

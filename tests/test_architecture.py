@@ -31,7 +31,8 @@ LAYERS = """
     buffers
     structs reference device
     ops testing formats surface
-    renderer selftest
+    renderer field_selftest
+    selftest
     render dataset demo raster_gradients fields
     rasterization pruning meshing
     training show

@@ -1,7 +1,7 @@
 """Gaussians along rays in float64: twin of cl/gaussian_rays.h and cl/composite_rays.h.
 
 The squared distance of a ray from a Gaussian's centre, in standard deviations, is q/(lambda^2 + k q); the header
-explains this. Here the three vectors b_i are the rows of a matrix B, and B B^T is the covariance of (dx, dy, depth/z).
+explains this. Here the three vectors b_i are the rows of a matrix B; B B^T is the covariance of (dx, dy, depth/z).
 """
 
 from typing import Any, NamedTuple
