@@ -14,7 +14,7 @@ from clsplat import field_selftest, reference
 from clsplat.camera import Camera
 from clsplat.config import OptimConfig
 from clsplat.gaussians import SHAPES, Gaussians
-from clsplat.stages import AdamStep, Bins, Dropout, Image, SplatGrads, Splats
+from clsplat.stages import AdamStep, Bins, Dropout, Image, RaySplats, SplatGrads, Splats
 from clsplat.testing import synthetic_scene
 
 if TYPE_CHECKING:
@@ -144,16 +144,16 @@ def test_dropout(b: Bench) -> Found:
 
 
 def test_exposure(b: Bench) -> Found:
-    affine, photo = b.rng.normal(size=(3, 4)), b.rng.choice([0, 128, 255], b.image.rgb.shape).astype(np.uint8)
-    affine = b.rounded(affine)
+    first, photo = b.random(3, 4), b.rng.choice([0, 128, 255], b.image.rgb.shape).astype(np.uint8)
     image, v = b.image.rgb, b.v_image.rgb
-    yield b.stages.exposure_fwd(b.up(image), affine, b.up(photo)), reference.exposure_fwd(image, affine, photo)
-    found, expected = b.up(v), v.copy()
-    yield (
-        b.stages.exposure_bwd(b.up(image), affine, b.up(photo), found),
-        reference.exposure_bwd(image, affine, photo, expected),
-    )
-    yield found, expected
+    for affine in (first, np.concatenate([first, first[:, :2]], axis=1)):
+        yield b.stages.exposure_fwd(b.up(image), affine, b.up(photo)), reference.exposure_fwd(image, affine, photo)
+        found, expected = b.up(v), v.copy()
+        yield (
+            b.stages.exposure_bwd(b.up(image), affine, b.up(photo), found),
+            reference.exposure_bwd(image, affine, photo, expected),
+        )
+        yield found, expected
 
 
 def test_filter(b: Bench) -> Found:
@@ -179,9 +179,11 @@ def test_loss(b: Bench) -> Found:
 
 
 def test_median(b: Bench) -> Found:
-    found = b.stages.median_splats(b.up(b.splats), b.lists()).get()
-    same = found == reference.median_splats(b.splats, b.bins)
-    yield np.array(same.mean() > 0.99, int), np.array(1)  # rounding decides where the transmittance is nearly 1/2
+    along = reference.project_fwd(b.gaussians, b.camera, 3, rays=True)
+    for splats in (b.splats, RaySplats(*map(b.rounded, along))):
+        found = b.stages.median_splats(b.up(splats), b.stages.bin_splats(b.up(splats), WIDTH, HEIGHT, TILE)).get()
+        same = found == reference.median_splats(splats, reference.bin_splats(splats, WIDTH, HEIGHT, TILE))
+        yield np.array(same.mean() > 0.99, int), np.array(1)  # rounding decides where the transmittance is nearly 1/2
 
 
 def test_noise(b: Bench) -> Found:

@@ -29,11 +29,14 @@ PER_GAUSSIAN = {
     "composite": 12 + 9,  # packed splats; v_means2d 2, v_conics 3, v_opacities, v_colors 3
     "observe": 2,  # grad_sum, seen
 }
+PER_GAUSSIAN_RAYS = 8 + 8 + 3  # rays; packed splats are larger; v_slopes
+PER_GAUSSIAN_CHARTS = 9 + 8  # in charts of their own, rays and packed splats are larger still
 JOINED = 12  # the splats once more, followed by those of the backdrop
 PER_INTERSECTION = {
     "bin": 2,  # intersections twice
     "composite": 9,  # gradients per intersection
 }
+PER_INTERSECTION_RAYS = 4  # gradients per intersection
 PER_INTERSECTION_GPU = 5  # bin: intersections once more, sort keys and sort order twice
 PER_INTERSECTION_PER_TILE = 4  # bin: list keys; of the sorts, what is not shared with the sort by depth
 PER_PIXEL = {
@@ -42,6 +45,7 @@ PER_PIXEL = {
     "photo": 1,  # 3 bytes, and one of a mask
 }
 PER_PIXEL_EXPOSURE = 3  # the image with the colours of its photo
+PER_PIXEL_CHARTS = 3  # directions of rays
 PER_ROW = 3 * 416  # derivatives of SSIM: rows have margins, and end with a work-item
 
 COPIES = 3
@@ -71,6 +75,8 @@ class Footprint:
         Whether ``--exposure`` is used.
     backdrop : int
         Number of Gaussians of the renderer's backdrop, which are drawn and do not train.
+    rays : int
+        With ``--projection ray`` 1, or 2 if a photo is not of a pinhole; otherwise 0.
     """
 
     width: int
@@ -80,6 +86,7 @@ class Footprint:
     per_tile: bool = False
     exposure: bool = False
     backdrop: int = 0
+    rays: int = 0
 
     @classmethod
     def of(cls, scene: Scene, config: TrainConfig, device: "Device", backdrop: int = 0) -> "Footprint":
@@ -87,11 +94,14 @@ class Footprint:
         cameras = [view.camera for view in scene.train + scene.test]
         width, height = max(c.width for c in cameras), max(c.height for c in cameras)
         per_tile = config.render.sort == "per_tile"
-        return cls(width, height, config.init.sh_degree, not device.is_cpu, per_tile, config.exposure, backdrop)
+        own_charts = any(camera.model != "pinhole" for camera in cameras)
+        rays = (config.render.projection == "ray") * (1 + own_charts)
+        return cls(width, height, config.init.sh_degree, not device.is_cpu, per_tile, config.exposure, backdrop, rays)
 
     def per_gaussian(self, intersections: float = INTERSECTIONS) -> float:
         """Bytes per Gaussian, if each meets `intersections` tiles."""
         values = COPIES * self._parameters + sum(PER_GAUSSIAN.values()) + intersections * self._per_intersection
+        values += (self.rays > 0) * PER_GAUSSIAN_RAYS + (self.rays > 1) * PER_GAUSSIAN_CHARTS
         return REAL * ROUNDING * (values + (JOINED if self.backdrop else 0))
 
     @property
@@ -100,13 +110,14 @@ class Footprint:
 
     @property
     def _per_intersection(self) -> int:
-        per_intersection = sum(PER_INTERSECTION.values())
+        per_intersection = sum(PER_INTERSECTION.values()) + (self.rays > 0) * PER_INTERSECTION_RAYS
         return per_intersection + self.gpu * PER_INTERSECTION_GPU + self.per_tile * PER_INTERSECTION_PER_TILE
 
     @property
     def fixed(self) -> int:
         """Bytes that do not depend on the number of Gaussians."""
         per_pixel = sum(PER_PIXEL.values()) + self.exposure * PER_PIXEL_EXPOSURE
+        per_pixel += (self.rays > 1) * PER_PIXEL_CHARTS
         return round(REAL * ROUNDING * self.height * (self.width * per_pixel + PER_ROW))
 
     def still(self, intersections: float = INTERSECTIONS) -> int:

@@ -104,6 +104,21 @@ def test_a_backdrop_is_predicted(tmp_path: Path) -> None:
     assert abs(need.most_gaussians(need.total(5000)) - 5000) <= 1
 
 
+@pytest.mark.parametrize("model", ["pinhole", "fisheye"])
+def test_the_projection_along_rays_is_predicted(tmp_path: Path, model: Literal["pinhole", "fisheye"]) -> None:
+    scene, device = make_scene(5000, 160, 120), Device()
+    views = [replace(view, camera=replace(view.camera, model=model)) for view in scene.train]
+    scene = replace(scene, train=views, test=[])
+    render = RenderConfig(projection="ray")
+    config = TrainConfig(strategy="adc", size="fixed", iterations=6, adc=FIXED_N, eval_every=0, render=render)
+    training = Training(scene, config, device, initial_state(scene, config))
+    complete(training, tmp_path)
+    photos = sum(view.image.nbytes for view in scene.train)
+    met = training.state.intersections
+    assert device.memory_peak <= training.need.total(5000, met) + photos <= 1.2 * device.memory_peak
+    assert replace(training.need, rays=0).total(5000, met) + photos < device.memory_peak
+
+
 def test_a_million_gaussians_fit_4_gb() -> None:
     """At 1280x720, with intersections to spare and an evaluation's copy."""
     for gpu in (False, True):
