@@ -26,6 +26,12 @@
 #error "-DROWS must be 6 or 12"
 #endif
 
+// Rows of a block of the gradient of the weights: they divide 16.
+#if ROWS == 12
+#define INPUTS 16
+#else
+#define INPUTS 4
+#endif
 #define CHUNK 96 // rows: a multiple of both values of ROWS. Those of a layer of 64 take 24 KiB
 
 __constant uint WIDTH[] = {WIDTHS};
@@ -64,25 +70,25 @@ static inline void product(const uint rows, const uint from, const uint to, cons
     }
 }
 
-// v_w += x^T v_y
+// v_w += x^T v_y, in blocks of INPUTS rows and 16 columns of v_w.
 static inline void product_of_columns(const uint rows, const uint from, const uint to, const __global real *x,
                                       const __global real *v_y, __global real *v_w) {
-    for (uint i = 0; i < from; i += 4)
+    for (uint begin = 0; begin < from; begin += INPUTS)
         for (uint column = 0; column < to; column += 16) {
-            real16 a = load16(v_w + i * to + column), b = load16(v_w + (i + 1) * to + column),
-                   c = load16(v_w + (i + 2) * to + column), d = load16(v_w + (i + 3) * to + column);
+            real16 sum[INPUTS];
+#pragma unroll
+            for (uint i = 0; i < INPUTS; ++i)
+                sum[i] = load16(v_w + (begin + i) * to + column);
             for (uint r = 0; r < rows; ++r) {
                 const real16 v = load16(v_y + r * to + column);
-                const __global real *own = x + r * from + i;
-                a += own[0] * v;
-                b += own[1] * v;
-                c += own[2] * v;
-                d += own[3] * v;
+                const __global real *own = x + r * from + begin;
+#pragma unroll
+                for (uint i = 0; i < INPUTS; ++i)
+                    sum[i] += own[i] * v;
             }
-            store16(v_w + i * to + column, a);
-            store16(v_w + (i + 1) * to + column, b);
-            store16(v_w + (i + 2) * to + column, c);
-            store16(v_w + (i + 3) * to + column, d);
+#pragma unroll
+            for (uint i = 0; i < INPUTS; ++i)
+                store16(v_w + (begin + i) * to + column, sum[i]);
         }
 }
 

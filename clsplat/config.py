@@ -57,11 +57,14 @@ class RenderConfig:
 
 @dataclass(frozen=True)
 class SfmConfig:
-    """Settings of structure from motion (pycolmap: SIFT, matching, incremental mapping)."""
+    """Settings of structure from motion (pycolmap: SIFT, matching, mapping)."""
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Pairs of photos that are matched. exhaustive: all. sequential: neighbours by file name. auto: sequential for
     frames that clsplat extracted from a video, exhaustive otherwise."""
+    mapper: Literal["incremental", "global"] = "incremental"
+    """incremental: photos are added one after the other. global: all poses are found at once, in less time for many
+    photos (GLOMAP)."""
     camera_model: Annotated[str, name_in("clsplat.dataset.lenses:camera_models")] = "OPENCV"
     """COLMAP camera model to fit; photos are undistorted when they are loaded."""
     single_camera: bool = True

@@ -53,8 +53,8 @@ class Train:
     """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians, such as scene.spz, which is
     written as well; its name without the suffix becomes the folder."""
     method: Annotated[str, name_in("clsplat.fields:method_names")] = "gaussians"
-    """What is trained: Gaussians, or a radiance field to compare them with, for which only --iterations, --seed, the
-    settings of the photos, of evaluations and of checkpoints, --device and --memory-limit count."""
+    """Gaussians, or a radiance field to compare them with. For a field only --iterations, --seed, the settings of the
+    photos, of evaluations and of checkpoints, --device and --memory-limit count."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
     viewer: bool = False
@@ -64,7 +64,7 @@ class Train:
     preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
     """Named settings to start from instead of the defaults; flags override them."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """The config.json of an earlier run, or a part of one, to start from; flags override it."""
+    """A run's config.json, or a part of one, to start from; flags override it."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def base(self) -> "Train | None":

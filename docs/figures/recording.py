@@ -79,6 +79,7 @@ class Recording:
         process, terminal = pty.fork()
         if not process:
             os.chdir(folder)
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell ignores it for commands in the background
             os.environ |= {"COLUMNS": str(COLUMNS), "LINES": str(LINES), "TERM": "xterm"}
             os.execvp("sh", ["sh", "-c", f"stty cols {COLUMNS} rows {LINES}; exec {command}"])
         said, due = b"", time.monotonic() + STEP

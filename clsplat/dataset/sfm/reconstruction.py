@@ -1,7 +1,7 @@
 """Recover cameras and sparse points from photos, by COLMAP through pycolmap.
 
 Structure from motion consists of SIFT on the CPU, matching and incremental mapping: Schoenberger and Frahm 2016,
-doi:10.1109/CVPR.2016.445.
+doi:10.1109/CVPR.2016.445; global mapping: Pan et al. 2024, "Global structure-from-motion revisited".
 """
 
 import hashlib
@@ -31,7 +31,8 @@ from clsplat.dataset.photos import (
     read_photo,
     write_upright_png,
 )
-from clsplat.dataset.sfm.matching import SEED, extract, is_sliver, match, quiet
+from clsplat.dataset.sfm.mapping import map_globally, map_incrementally
+from clsplat.dataset.sfm.matching import extract, is_sliver, match, quiet
 from clsplat.errors import InputError, unwritable
 from clsplat.ranges import check
 
@@ -280,7 +281,6 @@ def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path
 def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig, verbose: bool) -> Any:
     """Detect features, match them and run the mapper; None if no pair of photos can start a model."""
     import pycolmap
-    from tqdm import tqdm
 
     database = work / "database.db"
     pycolmap.Database.open(database).close()
@@ -299,29 +299,10 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
         else:
             pairs = pycolmap.SequentialPairGenerator(pycolmap.SequentialPairingOptions(), opened).all_pairs()
     match(database, pairs, verbose)
-
-    options = pycolmap.IncrementalPipelineOptions(
-        min_model_size=config.min_registered, random_seed=SEED, num_threads=1
-    )
     (work / "models").mkdir()
-    with tqdm(total=len(names), desc="poses", unit="photo", dynamic_ncols=True) as bar:
-        # Called for each model: COLMAP starts another one with photos that do not fit the first.
-        def start() -> None:
-            bar.n = 2
-            bar.refresh()
-
-        pycolmap.set_random_seed(SEED)
-        models = pycolmap.incremental_mapping(
-            database,
-            folder,
-            work / "models",
-            options=options,
-            initial_image_pair_callback=start,
-            next_image_callback=bar.update,
-        )
-        largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
-        bar.n = 0 if largest is None else largest.num_reg_images()
-    return largest
+    mapped = map_globally if config.mapper == "global" else map_incrementally
+    models = mapped(database, folder, work / "models", len(names), config.min_registered)
+    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
 def _turn_upright(model: Any) -> None:
