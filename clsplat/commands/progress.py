@@ -52,6 +52,7 @@ class Progress:
         self._began, self._shown = began, False
         self._bar: tqdm[Any] | None = None
         self._begun = threading.Event()
+        self._waits = threading.Thread(target=self._wait, daemon=True)
         self._interrupted = threading.Event()
         self._facts: dict[str, str] = {}  # lines of the viewer's panel
         self._psnr: float | None = None
@@ -61,21 +62,24 @@ class Progress:
         """Show in the block what the training waits for and then its progress; Ctrl-C ends it after an iteration."""
         if self._viewer:
             self._viewer.wait(WAITING)
-        waits = threading.Thread(target=self._wait, daemon=True)
-        waits.start()
+        self._waits.start()
         before = signal.signal(signal.SIGINT, self._interrupt)
         try:
             yield
         finally:
             signal.signal(signal.SIGINT, before)
-            self._begun.set()
-            waits.join()
+            self._end_wait()
             if self._bar is not None:
                 self._bar.close()
 
     def _interrupt(self, *_: object) -> None:
         self._interrupted.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)  # the second Ctrl-C does not wait
+
+    def _end_wait(self) -> None:
+        """Remove the line about what the training waits for."""
+        self._begun.set()
+        self._waits.join()
 
     def _wait(self) -> None:
         """Say what the training waits for; on a terminal, count the seconds."""
@@ -110,7 +114,7 @@ class Progress:
         """Replace what the training waited for by a bar, whose estimate does not contain the wait."""
         from tqdm import tqdm
 
-        self._begun.set()
+        self._end_wait()  # two bars would take two lines
         say(f"first iteration: done {time.perf_counter() - STARTED:.1f} s after the start")
         first = record["iteration"]
         self._bar = tqdm(total=self._config.iterations, initial=first, unit="it", dynamic_ncols=True)

@@ -82,7 +82,7 @@ class Recording:
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell ignores it for commands in the background
             os.environ |= {"COLUMNS": str(COLUMNS), "LINES": str(LINES), "TERM": "xterm"}
             os.execvp("sh", ["sh", "-c", f"stty cols {COLUMNS} rows {LINES}; exec {command}"])
-        said, due = b"", time.monotonic() + STEP
+        said, due, ends = b"", time.monotonic() + STEP, until is None
         while True:
             if select.select([terminal], [], [], STEP)[0]:
                 try:
@@ -100,7 +100,7 @@ class Recording:
                 self.show(LAST)
                 os.kill(process, signal.SIGINT)
                 until = None
-        if os.waitpid(process, 0)[1]:
+        if os.waitpid(process, 0)[1] and ends:
             sys.exit(f"{command} failed:\n{said.decode(errors='replace')[-2000:]}")
         self.show(LAST)
 
