@@ -22,7 +22,7 @@ ALPHA_MINS = (0.5 * ALPHA_MIN, 2 * ALPHA_MIN, 4 * ALPHA_MIN, 8 * ALPHA_MIN)
 TRANSMITTANCE_MINS = (0.1 * TRANSMITTANCE_MIN, 10 * TRANSMITTANCE_MIN, 100 * TRANSMITTANCE_MIN)
 """Values other than the default: one more accurate, the others less and less accurate."""
 
-RENDER_KNOBS = ("tile_size", "sort", "compositor", "mode")
+RENDER_KNOBS = ("tile_size", "sort", "compositor", "mode", "projection")
 """Fields of RenderConfig that are knobs. Each of their values is a setting."""
 
 WARM_UP = 1
