@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,14 +110,16 @@ def test_without_a_driver_it_says_how_to_get_one(tmp_path: Path) -> None:
 def test_a_buffer_beyond_the_device_is_named(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from clsplat.device import Device
+    from clsplat.buffers import Buffers
 
-    check = Device._check_size
-    monkeypatch.setattr(
-        Device,
-        "_check_size",
-        lambda self, what, nbytes: check(self, what, nbytes << (50 if what == "gradients per intersection" else 0)),
-    )
+    empty = Buffers.empty
+
+    def larger(self: Buffers, what: str, shape: tuple[int, ...], dtype: Any) -> Any:
+        return empty(
+            self, what, (shape[0] << 50, *shape[1:]) if what == "gradients per intersection" else shape, dtype
+        )
+
+    monkeypatch.setattr(Buffers, "empty", larger)
     message = fails(capsys, "train", dataset, "-o", tmp_path / "out", *TRAIN)
     assert "gradients per intersection: needs a buffer of" in message
     assert "MiB" in message

@@ -56,6 +56,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "composite_splats": COMPOSITE,
     "composite_tiles": (*COMPOSITE[:2], *REMOVAL),
     "ellipse": ("tests/test_bin.py", *COMPOSITE[:1], *PROJECT[:1], "tests/test_dropout.py"),
+    "composite_pixels": (*COMPOSITE[:2], "tests/test_median.py"),
+    "composite_rays": ("tests/test_gaussian_rays.py",),
     "lanes": PROJECT,
     "lens": PROJECT,
     "linalg": PROJECT,
@@ -66,6 +68,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "removal_sums": REMOVAL,
     "sh": PROJECT,
     "structs": PROJECT,
+    "mlp_cpu": ("tests/test_mlp.py",),
+    "mlp_gpu": ("tests/test_mlp.py",),
     "philox": ("tests/test_noise.py", "tests/test_dropout.py"),
 }
 """Tests by the stem of the file. Those of other stages are named after it."""

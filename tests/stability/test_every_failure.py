@@ -33,7 +33,7 @@ FAILURES = {
 }
 """Failures known from papers and issue threads, with the experiments that measure them."""
 
-OPEN = {"wide-angle", "focal-length"}
+OPEN = {"focal-length"}
 """Experiments on failures without a remedy."""
 
 

@@ -78,8 +78,8 @@ def test_what_is_left_out_stays_and_integers_are_numbers():
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({"iteration": 5}, "iteration: expected one of adc, checkpoint_every, "),
-        ({"data": {"sfm": {"match": 1}}}, "data.sfm.match: expected one of camera_model, matching, "),
+        ({"iteration": 5}, "iteration: expected one of adc, blocks, checkpoint_every, "),
+        ({"data": {"sfm": {"match": 1}}}, "data.sfm.match: expected one of camera_model, mapper, matching, "),
         ({"iterations": 5.0}, "iterations: expected an integer, 0 to 4294967295, found 5.0"),
         ({"iterations": True}, "iterations: expected an integer, 0 to 4294967295, found True"),
         ({"iterations": "5"}, "iterations: expected an integer, 0 to 4294967295, found '5'"),
