@@ -98,7 +98,7 @@ class Gaussians:
         shown = self.take(finite)
         first, middle, last = np.percentile(shown.means, [1, 50, 99], axis=0)
         rows |= {"middle": display.numbers(middle), "98 % from": display.numbers(first), "to": display.numbers(last)}
-        sizes = np.log10(np.e) * shown.log_scales.mean(axis=1)
+        sizes = shown.log_scales.mean(axis=1) / np.log(10)
         low, high = np.percentile(sizes, [0.5, 99.5])
         return display.facts(
             title,
