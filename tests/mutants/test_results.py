@@ -15,6 +15,6 @@ def test_the_page_has_the_numbers_of_the_results() -> None:
     share = 100 * (1 - len(survived) / len(results))
     assert f"**{len(results) - len(survived)} of {len(results)} are killed, {share:.1f} %**" in page
     rows = page.split("## What survived")[1].splitlines()
-    assert sum(row.startswith("| `") for row in rows) == len(survived)
+    assert sum(row.startswith("* ") for row in rows) == len(survived)
     for result in survived:
         assert f"`{result['before']}` → `{result['after']}`" in page
