@@ -148,13 +148,4 @@ __kernel void mlp_bwd(const uint rows, const uint items, const uint weight_count
     }
 }
 
-__kernel void mlp_sum(const uint weight_count, const uint items, const __global real *parts,
-                      __global real *v_weights) {
-    const size_t i = get_global_id(0);
-    if (i >= weight_count)
-        return;
-    real sum = 0;
-    for (size_t item = 0; item < items; ++item)
-        sum += parts[item * weight_count + i];
-    v_weights[i] = sum;
-}
+#include "mlp_sums.h"

@@ -73,13 +73,4 @@ mlp_columns(const uint rows, const uint slab, const uint from, const uint to, co
     parts[(size_t)get_group_id(2) * stride + place + (input + line) * to + column] = sum;
 }
 
-__kernel void mlp_sum(const uint weight_count, const uint slabs, const __global real *parts,
-                      __global real *v_weights) {
-    const size_t i = get_global_id(0);
-    if (i >= weight_count)
-        return;
-    real sum = 0;
-    for (size_t slab = 0; slab < slabs; ++slab)
-        sum += parts[slab * weight_count + i];
-    v_weights[i] = sum;
-}
+#include "mlp_sums.h"

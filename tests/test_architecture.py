@@ -24,9 +24,9 @@ STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__i
 # A unit is a package or a module of the top level. It imports only from the rows above its own.
 LAYERS = """
     constants errors randomness display
-    ranges json_lines processors
+    ranges json_lines processors event_log
     config atomic
-    camera gaussians field_stages
+    camera gaussians field_stages run_log
     scene stages metrics panorama programs
     buffers
     structs reference device

@@ -19,12 +19,12 @@ from clsplat.formats import load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import without_invisible
 from clsplat.renderer import Renderer
+from clsplat.run_log import LOG
 from clsplat.scene import Scene, View
 from clsplat.training.checkpoint import CHECKPOINT, load_state
 from clsplat.training.inputs import Inputs
 from clsplat.training.loop import complete
 from clsplat.training.preparation import open_device
-from clsplat.training.recorder import LOG
 from clsplat.training.run_folder import held
 from clsplat.training.session import Training
 from clsplat.training.state import initial_state

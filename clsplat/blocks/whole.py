@@ -28,12 +28,12 @@ from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.formats import load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
+from clsplat.run_log import LOG
 from clsplat.scene import Scene
 from clsplat.show.training_curve import read_log
 from clsplat.training.checkpoint import CHECKPOINT, FREE
 from clsplat.training.inputs import photos_of
 from clsplat.training.loop import train
-from clsplat.training.recorder import LOG
 
 if TYPE_CHECKING:
     from clsplat.device import Device

@@ -1,6 +1,5 @@
 """The training of a field: iterations, log, checkpoints and evaluations."""
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from clsplat.fields.field_files import MODEL, load_checkpoint, save_checkpoint, 
 from clsplat.fields.pixels import Pixels
 from clsplat.fields.space import Space
 from clsplat.randomness import stream
+from clsplat.run_log import LOG, LOG_EVERY, log_file
 from clsplat.scene import Scene
 
 if TYPE_CHECKING:
@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 
 CHECKPOINT = "checkpoint.npz"
 """File name of the checkpoint in the folder of a run."""
-
-LOG_EVERY = 10
-"""Iterations per line of the log; the loss of a line is their mean."""
 
 
 def train_field(
@@ -81,7 +78,7 @@ def train_field(
     else:
         field = method(Space.of(scene.train), device, config.seed)
     pixels, clock = Pixels(scene.train, field.space, BACKGROUNDS[config.data.background]), _Clock(seconds)
-    log = _Log(out / "log.jsonl", field.iteration)
+    log = _Lines(out / LOG, field.iteration)
     try:
         while field.iteration < config.iterations:
             loss = _advance(field, pixels, config)
@@ -129,17 +126,11 @@ class _Clock:
             self._stopped_at = 0.0
 
 
-class _Log:
-    """The log of a training; records after the iteration from which it resumes are removed."""
+class _Lines:
+    """The lines of the log: the mean loss since the last one, and what was found."""
 
     def __init__(self, path: Path, iteration: int):
-        self._path, kept = path, ""
-        if iteration and path.exists():
-            lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-            kept = "".join(
-                line for line in lines if line.endswith("\n") and json.loads(line)["iteration"] <= iteration
-            )
-        path.write_text(kept, encoding="utf-8")
+        self._append = log_file(path, iteration)
         self._losses: list[float] = []
 
     def record(self, now: dict[str, Any], found: dict[str, Any], last: bool) -> None:
@@ -147,7 +138,5 @@ class _Log:
         self._losses.append(now["loss"])
         if now["iteration"] % LOG_EVERY and not found and not last:
             return
-        line = now | {"loss": float(np.mean(self._losses))} | found
-        self._losses = []
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line, allow_nan=False) + "\n")
+        self._append(now | {"loss": float(np.mean(self._losses))} | found)
+        self._losses.clear()

@@ -12,6 +12,7 @@ from clsplat.errors import BuildError, DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import without_invisible
 from clsplat.renderer import fetch
+from clsplat.run_log import LOG, log_file
 from clsplat.scene import Scene
 from clsplat.training.autosize.explanation import write_report
 from clsplat.training.autosize.reduction import without_useless_bands
@@ -20,7 +21,7 @@ from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
 from clsplat.training.inputs import Inputs
 from clsplat.training.preparation import open_device
-from clsplat.training.recorder import LOG, Recorder, log_file
+from clsplat.training.recorder import Recorder
 from clsplat.training.run_folder import held
 from clsplat.training.run_length import with_iterations
 from clsplat.training.session import Training

@@ -1,32 +1,17 @@
 """Records of a training: its log, its checkpoints, its evaluations, and its training time."""
 
-import json
 import time
-from collections.abc import Callable, Container, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clsplat.atomic import replacing
-from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.run_log import LOG_EVERY, Append
 from clsplat.training.checkpoint import CHECKPOINT, save_state
 from clsplat.training.divergence import check_loss, check_state
-from clsplat.training.event_log import event_log
 from clsplat.training.session import Training
-
-LOG = "log.jsonl"
-"""File name of the log in the folder of a run."""
-
-EVENTS = "tensorboard"
-"""Name of the folder, in that of a run, of the log for TensorBoard."""
-
-LOG_EVERY = 10
-"""Iterations per line of the log; the loss of a line is their mean, since losses of single photos differ much."""
-
-Append = Callable[[dict[str, Any]], None]
 
 
 class Recorder:
@@ -112,48 +97,3 @@ class Recorder:
         training = self._training
         check_state(training.state, training.renderer.stages, self._out)
         save_state(self._out / CHECKPOINT, training.state, training.config)
-
-
-def log_file(path: Path, iteration: int) -> Append:
-    """Begin a log of JSON lines after an iteration; return the function that appends a record.
-
-    Lines of later iterations, written after the last checkpoint of an interrupted run, are dropped: the resumed run
-    writes them again.
-
-    Raises
-    ------
-    InputError
-        If the file, or the log for TensorBoard beside it, cannot be written; the function raises it too.
-    """
-    kept = []
-    if iteration and path.exists():
-        for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
-            try:
-                if json.loads(line)["iteration"] <= iteration:
-                    kept.append(line)
-            # A line cut off when the run was killed, or whose blocks the disk lost.
-            except (ValueError, KeyError, TypeError, RecursionError):
-                continue
-    with replacing(path) as file:
-        file.writelines(f"{line}\n".encode() for line in kept)
-    with _written(path.parent / EVENTS):
-        append_event = event_log(path.parent / EVENTS, iteration)
-
-    def append(record: dict[str, Any]) -> None:
-        # Opened for each line: a file that stays open would write what failed again when it is closed.
-        with _written(path), path.open("a") as log:
-            log.write(json.dumps(record) + "\n")
-        if append_event:
-            with _written(path.parent / EVENTS):
-                append_event(record)
-
-    return append
-
-
-@contextmanager
-def _written(path: Path) -> Iterator[None]:
-    """Raise the system's errors in the block as an InputError that names the path."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}") from error

@@ -70,6 +70,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "structs": PROJECT,
     "mlp_cpu": ("tests/test_mlp.py",),
     "mlp_gpu": ("tests/test_mlp.py",),
+    "mlp_sums": ("tests/test_mlp.py",),
     "philox": ("tests/test_noise.py", "tests/test_dropout.py"),
 }
 """Tests by the stem of the file. Those of other stages are named after it."""

@@ -34,10 +34,10 @@ from clsplat.dataset.sfm.summary import preview
 from clsplat.errors import InputError
 from clsplat.formats import FORMATS, READ_ONLY, load_gaussians
 from clsplat.formats.quantisation import EXPANSION_FREE
+from clsplat.run_log import log_file
 from clsplat.training.checkpoint import load_state
 from clsplat.training.initialize import initialize
 from clsplat.training.presets import load_config
-from clsplat.training.recorder import log_file
 
 PACKAGE = str(Path(clsplat.__file__).parent)
 """Folder of the code whose lines are counted."""

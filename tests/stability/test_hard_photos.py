@@ -20,7 +20,8 @@ from clsplat.dataset.photos import read_photo
 from clsplat.errors import InputError
 from clsplat.evaluate import mean_metrics
 from clsplat.renderer import Renderer
-from clsplat.training import preparation, recorder
+from clsplat.run_log import LOG
+from clsplat.training import preparation
 from clsplat.training.initialize import initialize
 from clsplat.training.loop import train
 from clsplat.training.outcome import failure
@@ -223,7 +224,7 @@ def test_a_clock_that_jumps_changes_no_bits(scene, device, tmp_path, monkeypatch
     assert calls > 40
     for name, array in found.arrays().items():
         np.testing.assert_array_equal(array, getattr(expected, name), err_msg=name)
-    lines = [json.loads(line) for line in (tmp_path / "out" / recorder.LOG).read_text().splitlines()]
+    lines = [json.loads(line) for line in (tmp_path / "out" / LOG).read_text().splitlines()]
     seconds = [line["seconds"] for line in lines]
     assert np.isfinite(seconds).all() and min(seconds) >= 0 and seconds == sorted(seconds)
 

@@ -6,6 +6,7 @@ The calls are those of Python: what pycolmap's C++ code or the driver itself ask
 import errno
 import fcntl
 import io
+import json
 import os
 import re
 import threading
@@ -308,3 +309,11 @@ def _watch_device(patch: pytest.MonkeyPatch, calls: Calls) -> None:
     patch.setattr(
         "clsplat.device.cl", SimpleNamespace(**named)
     )  # pyopencl itself asks for instances of these classes
+
+
+def is_json(line: str) -> bool:
+    """Whether a line of a log is whole."""
+    try:
+        return isinstance(json.loads(line), dict)
+    except ValueError:
+        return False

@@ -27,16 +27,16 @@ from typing import Any, NamedTuple
 import pytest
 import tyro
 from cli_runs import write_dataset
-from failing_calls import FAULTS, Calls, Point, watched
+from failing_calls import FAULTS, Calls, Point, is_json, watched
 from filelock import FileLock, Timeout
 
 from clsplat import cli
 from clsplat.atomic import PART
 from clsplat.commands.console import Out
 from clsplat.renderer import default_device
+from clsplat.run_log import LOG
 from clsplat.training import recorder
 from clsplat.training.checkpoint import CHECKPOINT
-from clsplat.training.recorder import LOG
 from clsplat.training.run_folder import LOCK
 
 PHOTOS = 5
@@ -292,14 +292,6 @@ PARSED: dict[tuple[str, ...], Any] = {}
 def digest(path: Path) -> str:
     """Digest of a file's bytes."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def is_json(line: str) -> bool:
-    """Whether a line is whole."""
-    try:
-        return isinstance(json.loads(line), dict)
-    except ValueError:
-        return False
 
 
 def prepared(root: Path) -> Path:

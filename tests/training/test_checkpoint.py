@@ -11,11 +11,11 @@ from small_run import CONFIG, same
 
 from clsplat.device import Device
 from clsplat.errors import InputError
+from clsplat.run_log import log_file
 from clsplat.scene import Scene
 from clsplat.training.checkpoint import load_state, save_state
 from clsplat.training.densify import Edit
 from clsplat.training.loop import train
-from clsplat.training.recorder import log_file
 from clsplat.training.state import State, initial_state
 
 

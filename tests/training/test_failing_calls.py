@@ -17,9 +17,9 @@ from PIL import Image
 from clsplat.camera import Camera
 from clsplat.dataset.sfm.triangulation import triangulate
 from clsplat.errors import InputError
+from clsplat.run_log import log_file
 from clsplat.scene import View
 from clsplat.training import run_folder
-from clsplat.training.recorder import log_file
 from clsplat.training.run_folder import held
 
 if sys.platform == "win32":
