@@ -19,6 +19,24 @@ BLANKS = 256
 """Number of shapes whose arrays are made by copying one. A training step has some forty."""
 
 
+class Reading:
+    """The last value of an array, copied to the host while the host queues more work.
+
+    It waits for the value when it is converted to a number, not before.
+    """
+
+    def __init__(self, array: cl.array.Array):
+        self._value, self._event = array[-1:].get_async()
+
+    def __int__(self) -> int:
+        self._event.wait()
+        return int(self._value[0])
+
+    def __float__(self) -> float:
+        self._event.wait()
+        return float(self._value[0])
+
+
 class Buffers:
     """Memory of a device.
 
@@ -80,7 +98,7 @@ class Buffers:
         """Bytes that the pool allocates for a buffer of `nbytes`: it rounds up to a size class."""
         return int(self.pool.alloc_size(self.pool.bin_number(nbytes)))
 
-    def _capacity(self, what: str, nbytes: int) -> int:
+    def capacity(self, what: str, nbytes: int) -> int:
         """Bytes to allocate for `nbytes`: the largest size of this name so far, if within `SAME_ORDER`.
 
         Lists of intersections differ in length from image to image. Blocks of one size can be reused.
@@ -96,7 +114,7 @@ class Buffers:
 
     def allocate(self, what: str, nbytes: int) -> cl.MemoryObjectHolder:
         """A block of at least `nbytes`. Errors as for `empty`."""
-        capacity = self._capacity(what, nbytes)
+        capacity = self.capacity(what, nbytes)
         if self.memory + self._block(capacity) > self._limit:
             self.pool.free_held()
             capacity = nbytes

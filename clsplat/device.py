@@ -116,6 +116,8 @@ class Device:
         Values of the constants of the rendering model.
     buffers : Buffers
         Its memory.
+    lengths : dict
+        Lengths of lists when they were last made, by name. The next ones are probably similar.
     """
 
     def __init__(
@@ -141,6 +143,7 @@ class Device:
         self.queue = cl.CommandQueue(self.context)
         self.memory_limit = min(memory_limit or self.cl_device.global_mem_size, self.cl_device.global_mem_size)
         self.buffers = Buffers(self.queue, self.label, self.memory_limit)
+        self.lengths: dict[str, int] = {}
         self._constants: dict[str, tuple[bytes, cl.array.Array]] = {}
         self._kernels: dict[tuple[str, tuple[Any, ...]], cl.Kernel] = {}
         self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}

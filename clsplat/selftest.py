@@ -174,7 +174,7 @@ def test_loss(b: Bench) -> Found:
     photo = b.rng.integers(0, 256, b.image.rgb.shape, dtype=np.uint8)
     loss, v_image = b.stages.l1_ssim(b.up(b.image.rgb), b.up(photo), 0.2)
     expected, v_expected = reference.l1_ssim(b.image.rgb, photo, 0.2)
-    yield np.array(loss), np.array(expected)
+    yield np.array(float(loss)), np.array(expected)
     yield v_image, v_expected
 
 

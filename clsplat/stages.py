@@ -5,7 +5,7 @@ containers. N Gaussians, M intersections of a splat with a tile, T tiles, C colo
 """
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, SupportsFloat
 
 from clsplat.field_stages import FieldStages
 
@@ -257,7 +257,9 @@ class Stages(FieldStages, Protocol):
     ) -> Removal: ...
     def exposure_fwd(self, image: Array, affine: Any, photo: Array) -> Array: ...
     def exposure_bwd(self, image: Array, affine: Any, photo: Array, v_image: Array) -> Any: ...
-    def l1_ssim(self, image: Array, photo: Array, ssim_weight: float, mask: Array = None) -> tuple[float, Array]: ...
+    def l1_ssim(
+        self, image: Array, photo: Array, ssim_weight: float, mask: Array = None
+    ) -> tuple[SupportsFloat, Array]: ...
     def observe(
         self, extents: Array, v_means2d: Array, width: int, height: int, grad_sum: Array, seen: Array
     ) -> None: ...

@@ -176,7 +176,7 @@ def step(training: Training, view: View) -> float:
     strategy.perturb(optimizer.stages, state.gaussians, iteration, settings.rates["means"])
     state.intersections = max(state.intersections, run.bins.gauss_ids.shape[0] / run.drawn.depths.shape[0])
     state.iteration = iteration
-    return loss
+    return float(loss)
 
 
 def view_at(iteration: int, views: list[View], seed: int) -> View:
