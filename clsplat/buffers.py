@@ -1,6 +1,5 @@
 """Device memory: blocks of a pool within a limit, and arrays of them."""
 
-from copy import copy
 from functools import lru_cache
 from math import prod
 from typing import Any
@@ -26,7 +25,9 @@ class Reading:
     """
 
     def __init__(self, array: cl.array.Array):
-        self._value, self._event = array[-1:].get_async()
+        self._value = np.empty(1, array.dtype)
+        last = array.nbytes - array.dtype.itemsize
+        self._event = cl.enqueue_copy(array.queue, self._value, array.base_data, src_offset=last, is_blocking=False)
 
     def __int__(self) -> int:
         self._event.wait()
@@ -82,9 +83,15 @@ class Buffers:
                 f"{what}: needs a buffer of {nbytes / 2**20:.0f} MiB, but {self._label} allows at most "
                 f"{self._most / 2**20:.0f} MiB per buffer; use fewer Gaussians or a smaller image (--downscale)"
             )
-        result = copy(self._blank(shape, dtype))
-        result.events = []
-        result.base_data = self.allocate(what, nbytes) if nbytes else None
+        return self._array(shape, dtype, self.allocate(what, nbytes) if nbytes else None)
+
+    def first(self, array: cl.array.Array, count: int) -> cl.array.Array:
+        """The first `count` values of a flat array, in the same memory."""
+        return array if array.shape == (count,) else self._array((count,), array.dtype, array.base_data)
+
+    def _array(self, shape: tuple[int, ...], dtype: np.dtype[Any], memory: Any) -> cl.array.Array:
+        result = cl.array.Array.__new__(cl.array.Array)
+        vars(result).update(vars(self._blank(shape, dtype)), events=[], base_data=memory)
         return result
 
     def _new_blank(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> cl.array.Array:

@@ -85,7 +85,7 @@ def bin_splats(
 
 def _list(device: Device, m: int) -> Array:
     """A list of m entries. A buffer cannot be empty, so a list without entries has one unused entry."""
-    return device.empty(LIST, max(m, 1), np.uint32)[:m]
+    return device.buffers.first(device.empty(LIST, max(m, 1), np.uint32), m)
 
 
 def _filled(device: Device, sums: Array, count: int, fill: Callable[[list[Any], list[Array]], None]) -> list[Array]:
@@ -110,8 +110,9 @@ def _filled(device: Device, sums: Array, count: int, fill: Callable[[list[Any], 
     m = checked_total(reading, WHAT)
     device.lengths[LIST] = max(m, 1)
     if m > room:
+        lists.clear()  # their memory is free before that of the others is needed
         lists = made(max(m, 1))
-    return [a[:m] for a in lists]
+    return [device.buffers.first(a, m) for a in lists]
 
 
 def _gather(device: Device, m: int, permutation: Array, values: Array, defines: dict[str, Any]) -> Array:
