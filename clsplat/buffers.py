@@ -2,7 +2,7 @@
 
 from functools import lru_cache
 from math import prod
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyopencl as cl
@@ -27,7 +27,8 @@ class Reading:
     def __init__(self, array: cl.array.Array):
         self._value = np.empty(1, array.dtype)
         last = array.nbytes - array.dtype.itemsize
-        self._event = cl.enqueue_copy(array.queue, self._value, array.base_data, src_offset=last, is_blocking=False)
+        queue, memory = cast(cl.CommandQueue, array.queue), cast(cl.Buffer, array.base_data)
+        self._event = cl.enqueue_copy(queue, self._value, memory, src_offset=last, is_blocking=False)
 
     def __int__(self) -> int:
         self._event.wait()

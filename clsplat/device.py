@@ -94,7 +94,7 @@ def select_device(name: str | None = None) -> cl.Device:
 
 
 def _converted(argument: Any) -> Any:
-    """A kernel's argument as pyopencl takes it. An int becomes its lower 32 bits, which are those of its int32 too."""
+    """A kernel's argument as pyopencl takes it. An int becomes its lower 32 bits, unsigned or not the same."""
     if isinstance(argument, cl.array.Array):
         return argument.data
     return argument & 0xFFFFFFFF if isinstance(argument, int) else argument
