@@ -21,7 +21,7 @@ def model_text(results: Results) -> str:
         Of `clsplat.bench.kernels.bench_kernels`, with at least seven workloads.
     """
     model, errors = model_of(results), checked(results)
-    rows = [("stage", *COLUMNS, "median error", "largest error")]
+    rows: list[tuple[str, ...]] = [("stage", *COLUMNS, "median error", "largest error")]
     for stage, found in errors.items():
         named = dict(zip(TERMS.get(stage, OTHERS), model.get(stage, ()), strict=False))
         cells = [f"{named[name]:.3g}" if name in named else "" for name in COLUMNS]
