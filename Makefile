@@ -28,11 +28,11 @@ CASES = 4000
 fuzz-cases:
 	CLSPLAT_FUZZ=$(CASES) $(PYTHON) -m pytest --hypothesis-profile=fuzz $(shell ls tests/stability/test_fuzz_*.py)
 
-# Fail each call of the system and of the device in turn, in every command of tests/training/measure_faults.py:
+# Fail each call of the system and of the device in turn, in every command of tests/training/fault_commands.py:
 # build/faults/faults.json. EVERY=10 takes each tenth call.
 EVERY = 1
 faults:
-	PYTHONPATH=tests/training:tests/commands:$(PYTHONPATH) $(PYTHON) tests/training/measure_faults.py --every $(EVERY) \
+	PYTHONPATH=tests/training:tests/commands:tests/dataset:$(PYTHONPATH) $(PYTHON) tests/training/measure_faults.py --every $(EVERY) \
 	  -o build/faults
 
 # Change the mathematics in COUNT places, one at a time, and list which changes the tests see: build/mutants.jsonl. It
