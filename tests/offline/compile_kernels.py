@@ -39,7 +39,7 @@ EXTENSIONS = ["-Xclang", "-cl-ext=+cl_khr_subgroups,+__opencl_c_subgroups"]
 # -cl-single-precision-constant makes single.
 STRICT = ["-pedantic", "-Werror", "-Wall", "-Wno-unused-function", "-Wno-unknown-pragmas"]
 
-PRIVATE_MAX = 1024
+PRIVATE_MAX = 512
 """Largest private memory of a work-item, bytes. NVIDIA's driver reserves it for each work-item that can be resident,
 270 000 on an H200, and accesses to it are those of global memory."""
 
