@@ -135,6 +135,25 @@ def test_count(b: Bench) -> Found:
     yield from pairs(b.stages.count_pairs(b.up(b.splats), b.lists()), reference.count_pairs(b.splats, b.bins))
 
 
+def test_disparity(b: Bench) -> Found:
+    expected = Splats(*map(b.rounded, reference.project_fwd(b.gaussians, b.camera, 3, channels=4)))
+    found = b.up(expected)
+    b.stages.disparity_fwd(found)
+    reference.disparity_fwd(expected)
+    yield from pairs(found, expected)
+    v_expected = SplatGrads(*(b.random(*getattr(expected, k).shape) for k in SplatGrads._fields))
+    v_found = b.up(v_expected)
+    b.stages.disparity_bwd(found, v_found)
+    reference.disparity_bwd(expected, v_expected)
+    yield from pairs(v_found, v_expected)
+    image, target = b.random(HEIGHT, WIDTH, 4), b.random(HEIGHT, WIDTH)
+    loss, rgb = b.stages.disparity_loss(b.up(image), b.up(target), 0.5)
+    loss_expected, rgb_expected = reference.disparity_loss(image, target, 0.5)
+    yield from pairs((np.array(loss), rgb), (np.array(loss_expected), rgb_expected))
+    joined = b.stages.disparity_grad(b.up(image), b.up(target), 0.5, rgb)
+    yield joined, reference.disparity_grad(image, target, 0.5, rgb_expected)
+
+
 def test_dropout(b: Bench) -> Found:
     dropout, found = Dropout(0.4, 3, 5), b.up(b.splats)
     expected = Splats(*(a.copy() for a in b.splats))

@@ -29,7 +29,7 @@ class Splats(NamedTuple):
 
     means2d (N, 2) px; conics (N, 3) px^-2, the entries xx, xy, yy of the inverse 2D covariance; depths (N,) world
     units; extents (N, 2) px, half widths of the box outside which alpha < ALPHA_MIN; opacities (N,) in [0, 1],
-    compensation included; colors (N, C), RGB and, for C = 4, the depth.
+    compensation included; colors (N, C), RGB and, for C = 4, the depth, or after `disparity_fwd` its inverse.
     """
 
     means2d: Any
@@ -137,8 +137,8 @@ class Bins(NamedTuple):
 
 
 class Image(NamedTuple):
-    """Result of compositing: rgb (H, W, C), background included, with the depth as a fourth channel where it was
-    asked for; and alpha (H, W)."""
+    """Result of compositing: rgb (H, W, C), background included, with the depth, or its inverse, as a fourth channel
+    where it was asked for; and alpha (H, W)."""
 
     rgb: Any
     alpha: Any
@@ -219,6 +219,8 @@ class Stages(FieldStages, Protocol):
         antialiased: bool = False,
         camera_grad: bool = False,
     ) -> CameraGrads | None: ...
+    def disparity_fwd(self, splats: AnySplats) -> None: ...
+    def disparity_bwd(self, splats: AnySplats, v_splats: AnyGrads) -> None: ...
     def dropout_fwd(self, splats: AnySplats, dropout: Dropout) -> None: ...
     def dropout_bwd(self, v_splats: AnyGrads, dropout: Dropout) -> None: ...
     def bin_splats(
@@ -255,6 +257,8 @@ class Stages(FieldStages, Protocol):
     def removal(
         self, splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
     ) -> Removal: ...
+    def disparity_loss(self, image: Array, target: Array, weight: float) -> tuple[float, Array]: ...
+    def disparity_grad(self, image: Array, target: Array, weight: float, v_rgb: Array) -> Array: ...
     def exposure_fwd(self, image: Array, affine: Any, photo: Array) -> Array: ...
     def exposure_bwd(self, image: Array, affine: Any, photo: Array, v_image: Array) -> Any: ...
     def l1_ssim(self, image: Array, photo: Array, ssim_weight: float, mask: Array = None) -> tuple[float, Array]: ...
