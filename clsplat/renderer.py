@@ -43,8 +43,8 @@ class Pass:
     """Results of a forward pass that its gradients need. Arrays are where the stages ran.
 
     splats: those of the Gaussians. drawn: all that were composited, those of the Gaussians before those of the
-    backdrop, if there is one. disparities: those of all, where each pixel sorts them; otherwise None. inverse: whether
-    the fourth channel is the inverse depth.
+    backdrop, if there is one. disparities: those of all, where each pixel sorts them; otherwise None. inverse:
+    whether the fourth channel is the inverse depth.
     """
 
     gaussians: Gaussians

@@ -67,7 +67,9 @@ def test_inverse_depths_match_twin(any_device: Device, n: int) -> None:
     gaussians, camera = synthetic_scene(n, 0, width=160, height=120)
     gaussians.means[: n // 2 : 3] = camera.position  # invisible
     expected = reference.project_fwd(gaussians, camera, 3, channels=4)
-    v_expected = SplatGrads(*(np.random.default_rng(1).normal(size=getattr(expected, k).shape) for k in SplatGrads._fields))
+    v_expected = SplatGrads(
+        *(np.random.default_rng(1).normal(size=getattr(expected, k).shape) for k in SplatGrads._fields)
+    )
     found = Splats(*(any_device.upload("splats", a) for a in expected))
     v_found = SplatGrads(*(any_device.upload("v_splats", a) for a in v_expected))
     ops.disparity_fwd(any_device, found)

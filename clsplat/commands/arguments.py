@@ -28,6 +28,7 @@ HELP, HELP_ALL = ("-h", "--help"), "--help-all"
 
 COMMON = {
     "background",
+    "depth",
     "device",
     "downscale",
     "exposure",
