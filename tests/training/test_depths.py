@@ -25,6 +25,7 @@ from clsplat.demo.still_life import still_life
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.formats import save_gaussians
+from clsplat.gaussians import Gaussians
 from clsplat.render import render
 from clsplat.scene import DepthMap, Scene, View
 from clsplat.training.corrections import depth_weight
@@ -144,23 +145,26 @@ def estimated(view: View, solids: list[Solid], rng: np.random.Generator) -> View
     return replace(view, depth=DepthMap(values.astype(np.float32)))
 
 
+def depth_error(gaussians: Gaussians, scene: Scene, solids: list[Solid], device: Device) -> float:
+    """Mean over held-out photos of the median error of the depths, as a fraction, where a surface is drawn."""
+    errors = []
+    for view in scene.test:
+        found, truth = render(gaussians, view.camera, device=device, depth=True), true_depths(view.camera, solids)
+        surface = np.isfinite(truth) & (found.alpha > 0.5)
+        errors.append(np.median(np.abs(found.depth / truth - 1)[surface]))
+    return float(np.mean(errors))
+
+
 def test_few_photos_gain_by_depth_maps(device: Device, tmp_path: Path) -> None:
     """Six photos around the still life, in which many arrangements of Gaussians look right."""
     solids, rng = still_life(), np.random.default_rng(0)
     scene = known_scene(24, 80, 60, points=400)
     scene = replace(scene, train=scene.train[::4])
     deep = aligned(replace(scene, train=[estimated(view, solids, rng) for view in scene.train]))
-    errors: list[float] = []
-    for some in (scene, deep):
-        some = with_near_planes(some)
+    errors = []
+    for some in map(with_near_planes, (scene, deep)):
         config = adapted(TrainConfig(iterations=600, eval_every=0), some)
-        gaussians = train(some, config, tmp_path, device)
-        off = []
-        for view in some.test:
-            found, truth = render(gaussians, view.camera, device=device, depth=True), true_depths(view.camera, solids)
-            surface = np.isfinite(truth) & (found.alpha > 0.5)
-            off.append(np.median(np.abs(found.depth / truth - 1)[surface]))
-        errors.append(float(np.mean(off)))
+        errors.append(depth_error(train(some, config, tmp_path, device), some, solids, device))
     # Measured: 0.108 and 0.047.
     assert errors[1] < 0.7 * errors[0]
 
