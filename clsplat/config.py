@@ -97,8 +97,8 @@ class DataConfig:
     invert_masks: bool = False
     """Invert the masks: black pixels train, white ones do not."""
     depth: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Folder of depth maps, named as the photos are (NAME.png with 16 bits, NAME.npy, or NAME.tiff with floats):
-    depths or inverse depths in any unit, which are scaled to the scene's points; 0 is unknown."""
+    """Folder of depth maps, named as the photos are (NAME.png of 16 bits, NAME.npy or NAME.tiff). They hold depths or
+    inverse depths in any unit, which are scaled to the scene's points; 0 is unknown. For few photos."""
     sfm: SfmConfig = field(default_factory=SfmConfig)
     """Settings of structure from motion, which runs where there are photos without poses."""
 

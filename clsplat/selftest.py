@@ -109,6 +109,11 @@ def pairs(found: Any, expected: Any) -> Found:
     yield from zip(*both, strict=True)
 
 
+def test_absgrad(b: Bench) -> Found:
+    found = b.stages.absgrad(b.up(b.splats), b.lists(), b.up(b.image), b.up(b.v_image))
+    yield found, reference.absgrad(b.splats, b.bins, b.image, b.v_image)
+
+
 def test_adam(b: Bench) -> Found:
     (parameters, gradients, first, second), step = b.adam(2)
     found = b.up(parameters), b.up(gradients), b.up(first), b.up(second)

@@ -28,7 +28,6 @@ HELP, HELP_ALL = ("-h", "--help"), "--help-all"
 
 COMMON = {
     "background",
-    "depth",
     "device",
     "downscale",
     "exposure",

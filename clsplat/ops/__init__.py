@@ -7,6 +7,7 @@ mathematics, which is in cl/ and, as NumPy, in `clsplat.reference`.
 from functools import partial
 
 from clsplat.device import Device
+from clsplat.ops.absgrad import absgrad
 from clsplat.ops.adam import adam_array, adam_step
 from clsplat.ops.bin import bin_splats
 from clsplat.ops.composite import composite_bwd, composite_fwd
@@ -48,6 +49,7 @@ class Launches:
         self.bin_splats = partial(bin_splats, device)
         self.composite_fwd = partial(composite_fwd, device)
         self.composite_bwd = partial(composite_bwd, device)
+        self.absgrad = partial(absgrad, device)
         self.count_pairs = partial(count_pairs, device)
         self.median_splats = partial(median_splats, device)
         self.removal = partial(removal, device)

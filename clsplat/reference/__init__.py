@@ -4,6 +4,7 @@ This module implements `clsplat.stages.Stages`. Belongs here: one module per sta
 several stages share (lenses, spherical harmonics). Does not belong here: the algorithms that make a stage fast.
 """
 
+from clsplat.reference.absgrad import absgrad
 from clsplat.reference.adam import adam_array, adam_step
 from clsplat.reference.bin import bin_splats
 from clsplat.reference.composite import composite_bwd, composite_fwd
