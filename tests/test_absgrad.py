@@ -20,6 +20,7 @@ def inputs(n: int, tile: int, real: Any, opaque: float = 0.0) -> tuple[Splats, I
     """Splats, their image and its gradients, as the device has them, for a camera of 37 x 29 pixels."""
     gaussians, camera = synthetic_scene(n, 1, width=37, height=29, margin=1e-3)
     gaussians.logit_opacities[:] += opaque
+    gaussians.log_scales[:] += opaque / 3
     splats = Splats(*(np.asarray(a, real).astype(float) for a in reference.project_fwd(gaussians, camera, 3)))
     image = reference.composite_fwd(splats, reference.bin_splats(splats, 37, 29, tile), BACKGROUND)
     rng = np.random.default_rng(0)
@@ -43,6 +44,9 @@ def test_matches_twin(any_device: Device, n: int, opaque: float, tile: int) -> N
     found = by_kernel(any_device, splats, tile, image, v_image)
     assert_matches("v_means2d", found, expected, DOUBLE if any_device.real == np.float64 else FLOAT)
     assert (expected > 0).any()
+    if opaque:
+        hidden = (expected == 0).all(axis=1) & (splats.extents[:, 0] > 0)
+        assert hidden.any(), "some splats lie behind where all pixels stop"
 
 
 def test_it_is_the_sum_of_the_gradients_of_single_pixels() -> None:
