@@ -1,6 +1,6 @@
 """Corrections per photo around a step: camera, mask and background before it, exposure within it, pose after it."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
 
@@ -46,7 +46,7 @@ def example(
 
 def compare(
     image: Image, seen: Example, progress: float, state: State, config: TrainConfig, renderer: Renderer
-) -> tuple[float, Image]:
+) -> tuple[SupportsFloat, Image]:
     """Loss of a render against its photo, and its gradients; takes a step on the photo's exposure, if it is learned.
 
     Parameters
@@ -60,7 +60,8 @@ def compare(
 
     Returns
     -------
-    loss : float
+    loss : convertible to float
+        That of a device is waited for when it is converted.
     v_image : Image
         Gradients with respect to the render.
     """
@@ -78,7 +79,8 @@ def compare(
         photo_exposures.update(state.exposures, seen.name, v_affine, progress, config.optim)
     if seen.disparities is not None:
         v_rgb = stages.disparity_grad(image.rgb, seen.disparities, weight, v_rgb)
-    return loss + by_depth, Image(v_rgb, renderer.no_alpha_gradient(seen.camera))
+        loss = float(loss) + by_depth
+    return loss, Image(v_rgb, renderer.no_alpha_gradient(seen.camera))
 
 
 def depth_weight(progress: float, config: OptimConfig) -> float:
