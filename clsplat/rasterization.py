@@ -111,13 +111,8 @@ def rasterization(
         If shapes do not fit each other, a number is out of range, or an array of another library is not in the memory
         of the host, naming the argument.
     """
-    means, quats, scales, opacities = (
-        np.asarray(on_host(name, array), np.float64)
-        for name, array in (("means", means), ("quats", quats), ("scales", scales), ("opacities", opacities))
-    )
-    colors, viewmats, Ks = (
-        np.asarray(on_host(name, array), np.float64)
-        for name, array in (("colors", colors), ("viewmats", viewmats), ("Ks", Ks))
+    means, quats, scales, opacities, colors, viewmats, Ks = _arrays(
+        means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks
     )
     n, count = len(means), len(viewmats)
     if n == 0 or count == 0:
@@ -133,12 +128,7 @@ def rasterization(
         raise InputError(f"render_mode: expected {', '.join(get_args(RenderMode))}, found {render_mode!r}")
     cameras = _cameras(viewmats, Ks, (width, height), camera_model, radial_coeffs, near_plane)
     channels = colors.shape[2] if sh_degree is None else 3
-    behind = np.zeros((count, channels))
-    if backgrounds is not None:
-        behind = np.asarray(on_host("backgrounds", backgrounds), np.float64)
-    _check_shape("backgrounds", behind, (count, channels))
-    if not np.isfinite(behind).all():
-        raise InputError("backgrounds: expected finite numbers, found NaN or infinity")
+    behind = _behind(backgrounds, (count, channels))
 
     renderer = Renderer(device if eps2d == BLUR else _blurred(device, eps2d))
     placed, antialiased = renderer.place(gaussians), rasterize_mode == "antialiased"
@@ -159,6 +149,22 @@ def rasterization(
     if gradients:
         result.remember(renderer, placed, gaussians, passes, sh_degree, antialiased)
     return result
+
+
+def _arrays(**given: ArrayLike) -> list[NDArray[np.float64]]:
+    """Arguments by name as arrays of NumPy."""
+    return [np.asarray(on_host(name, array), np.float64) for name, array in given.items()]
+
+
+def _behind(backgrounds: ArrayLike | None, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """The backgrounds of the cameras, of the shape (C, D)."""
+    if backgrounds is None:
+        return np.zeros(shape)
+    (behind,) = _arrays(backgrounds=backgrounds)
+    _check_shape("backgrounds", behind, shape)
+    if not np.isfinite(behind).all():
+        raise InputError("backgrounds: expected finite numbers, found NaN or infinity")
+    return behind
 
 
 def _clipped(renderer: Renderer, splats: AnySplats, radius_clip: float) -> AnySplats:
@@ -211,7 +217,7 @@ def _cameras(
         raise InputError(f"camera_model: expected {', '.join(CAMERA_MODELS)}, found {model!r}")
     distortions = np.zeros((count, 4))
     if radial_coeffs is not None:
-        distortions = np.asarray(on_host("radial_coeffs", radial_coeffs), np.float64)
+        (distortions,) = _arrays(radial_coeffs=radial_coeffs)
     _check_shape("radial_coeffs", distortions, (count, 4))
     if near_plane is not None and not 0 < near_plane < float("inf"):
         raise InputError(f"near_plane: expected a depth above 0, found {near_plane}")
