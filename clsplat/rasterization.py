@@ -111,9 +111,8 @@ def rasterization(
         If shapes do not fit each other, a number is out of range, or an array of another library is not in the memory
         of the host, naming the argument.
     """
-    means, quats, scales, opacities, colors, viewmats, Ks = _arrays(
-        means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks
-    )
+    means, quats, scales, opacities = _arrays(means=means, quats=quats, scales=scales, opacities=opacities)
+    colors, viewmats, Ks = _arrays(colors=colors, viewmats=viewmats, Ks=Ks)
     n, count = len(means), len(viewmats)
     if n == 0 or count == 0:
         raise InputError(f"means, viewmats: expected at least one Gaussian and one camera, found {n} and {count}")
@@ -138,10 +137,7 @@ def rasterization(
         splats = _clipped(renderer, splats, radius_clip)
         values = colors[i] if sh_degree is None else download(splats.colors)[:, :3]
         run, meta = _composited(renderer, splats, camera, values, behind[i], (render_mode, tile_size, gradients))
-        if normals:
-            surface = surface_of(gaussians, camera, download(renderer.stages.median_splats(run.colored, run.bins)))
-            meta |= {"normals": surface.normals, "median_depths": surface.depth}
-        parts.append((run, meta))
+        parts.append((run, meta | _surface(renderer, gaussians, run) if normals else meta))
     passes = [run for run, _ in parts]
     stacked: dict[str, Any] = {name: np.stack([meta[name] for _, meta in parts]) for name in parts[0][1]}
     stacked |= {"width": width, "height": height, "tile_size": tile_size, "n_cameras": count}
@@ -165,6 +161,13 @@ def _behind(backgrounds: ArrayLike | None, shape: tuple[int, int]) -> NDArray[np
     if not np.isfinite(behind).all():
         raise InputError("backgrounds: expected finite numbers, found NaN or infinity")
     return behind
+
+
+def _surface(renderer: Renderer, gaussians: Gaussians, run: RasterPass) -> dict[str, Any]:
+    """Normals and median depths of a camera, as a part of meta."""
+    ids = download(renderer.stages.median_splats(run.colored, run.bins))
+    surface = surface_of(gaussians, run.camera, ids)
+    return {"normals": surface.normals, "median_depths": surface.depth}
 
 
 def _clipped(renderer: Renderer, splats: AnySplats, radius_clip: float) -> AnySplats:
