@@ -56,9 +56,19 @@
 #error "-DCAMERA_GRAD=1 needs -DGROUP, the work-group size of the backward kernels"
 #endif
 
-// Number of spherical harmonics' coefficients that are rearranged together, and of their chunks.
-#define COEFFICIENTS 8
-#define CHUNKS       (3 * COEFFICIENTS / LANES)
+// Number of spherical harmonics' coefficients that are rearranged together, and of their chunks. FOR_COEFFICIENTS takes
+// the first of each such group, below `end`. Where a work-item takes one Gaussian, its bounds are constants: the loop is
+// unrolled, and the basis stays in registers.
+#if LANES == 1
+#define COEFFICIENTS 1
+#define FOR_COEFFICIENTS(first, end)                                                                                 \
+    for (int first = 0; first < 16; ++first)                                                                         \
+        if (first < (end))
+#else
+#define COEFFICIENTS                 8
+#define FOR_COEFFICIENTS(first, end) for (int first = 0; first < (end); first += COEFFICIENTS)
+#endif
+#define CHUNKS (3 * COEFFICIENTS / LANES)
 
 // For compilers that put several work-items into one vector: these kernels use vectors already. Vectors of 64 Gaussians
 // would take Intel's compiler half a minute.
@@ -263,7 +273,10 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
     sh_basis(normalized3(lens_offset(&camera, mean)), sh_degree, basis);
     reals3 color = {(real)0.5, (real)0.5, (real)0.5};
     const int active = coefficients_of(sh_degree);
-    for (int first = 0; first < active; first += COEFFICIENTS) {
+#if LANES == 1
+#pragma unroll
+#endif
+    FOR_COEFFICIENTS(first, active) {
         reals values[3 * COEFFICIENTS];
         const int last = min(first + COEFFICIENTS, active);
         load_coefficients(sh, i, n, sh_stride, first, last, values);
@@ -403,7 +416,10 @@ static inline GaussianGrad gaussian_vjp(size_t i, size_t n, const Camera *camera
     reals v_basis[16];
     sh_basis(direction, sh_degree, basis);
     const int active = coefficients_of(sh_degree);
-    for (int first = 0; first < active; first += COEFFICIENTS) {
+#if LANES == 1
+#pragma unroll
+#endif
+    FOR_COEFFICIENTS(first, active) {
         reals values[3 * COEFFICIENTS];
         const int last = min(first + COEFFICIENTS, active);
         load_coefficients(gaussians.sh, i, n, sh_stride, first, last, values);
@@ -509,7 +525,10 @@ project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh
     store_vectors3(v_log_scales, i, n, v.log_scales);
     store_vectors4(v_quats, i, n, v.quat);
     store_numbers(v_logit_opacities, i, n, v.logit_opacity);
-    for (int first = 0; first < sh_stride; first += COEFFICIENTS) {
+#if LANES == 1
+#pragma unroll
+#endif
+    FOR_COEFFICIENTS(first, sh_stride) {
         reals values[3 * COEFFICIENTS];
         coefficients_grad(basis, v.color, first, values);
         for (int lane = 0; lane < LANES && i + lane < n; ++lane) {
@@ -625,7 +644,10 @@ __kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const 
 
     const int active = coefficients_of(sh_degree);
     const reals sh0 = adam.sh0, sh_rest = adam.sh_rest;
-    for (int first = 0; first < active; first += COEFFICIENTS) {
+#if LANES == 1
+#pragma unroll
+#endif
+    FOR_COEFFICIENTS(first, active) {
         reals values[3 * COEFFICIENTS];
         coefficients_grad(basis, v.color, first, values);
         for (int lane = 0; lane < LANES && i + lane < n; ++lane) {

@@ -26,7 +26,7 @@ from clsplat.programs import kernel_folder
 
 RANDOM = (
     (re.compile(r"\.(.*)\.[0-9a-f]{16}\.part"), r"\1.part"),
-    (re.compile(r"(tmp|clsplat_triangulate_)[a-z0-9_]{8}"), r"\1"),
+    (re.compile(r"(tmp|clsplat_triangulate_|clsplat_sfm_)[a-z0-9_]{8}"), r"\1"),
     (re.compile(r"events\.out\.tfevents\..*"), "events"),
 )
 """Parts of names of files that differ from run to run, and what stands for them."""

@@ -7,6 +7,7 @@ import pyopencl as cl
 import pytest
 from test_memory import FIXED_N, make_scene
 
+from clsplat.bench.timing import STILL
 from clsplat.config import TrainConfig
 from clsplat.device import Device
 from clsplat.training.loop import train
@@ -70,6 +71,22 @@ def test_the_device_has_work_while_the_host_waits(
             read, until = step.index("copy"), step.index("wait")
             assert read < until - 1, step
             step = step[until + 1 :]
+
+
+@pytest.mark.parametrize("variants", ["cpu", "gpu"])
+def test_a_step_allocates_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variants: str) -> None:
+    """Once every photo was seen, and while no list grows, all buffers come from those of earlier steps."""
+    monkeypatch.setenv("CLSPLAT_VARIANTS", variants)
+    device, managed = Device(), []
+
+    def count(_: object) -> None:
+        pool = device.buffers.pool
+        managed.append((pool.active_blocks + pool.held_blocks, pool.managed_bytes))
+
+    config = TrainConfig(strategy="adc", size="fixed", iterations=2 * STEPS, adc=FIXED_N, eval_every=0, optim=STILL)
+    train(make_scene(2000, 288, 256), config, tmp_path, device, progress=count)
+    assert len(set(managed[STEPS : 2 * STEPS - 1])) == 1
+    assert managed[0] != managed[STEPS]  # the first steps did allocate
 
 
 def test_splats_are_packed_again_where_they_are_others(device: Device) -> None:
