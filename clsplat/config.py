@@ -96,6 +96,9 @@ class DataConfig:
     """Folder of masks, named as the photos are (NAME.png or NAME.jpg.png): white pixels train, black ones do not."""
     invert_masks: bool = False
     """Invert the masks: black pixels train, white ones do not."""
+    depth: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Folder of depth maps, named as the photos are (NAME.png of 16 bits, NAME.npy or NAME.tiff). They hold depths or
+    inverse depths in any unit, which are scaled to the scene's points; 0 is unknown. For few photos."""
     sfm: SfmConfig = field(default_factory=SfmConfig)
     """Settings of structure from motion, which runs where there are photos without poses."""
 
@@ -149,6 +152,10 @@ class OptimConfig:
     """Iterations after which the degree of the trained spherical harmonics rises by one; fewer in short runs."""
     erank_penalty: NonNegative = 0.0
     """Weight in the loss of the penalty of needles: the mean over Gaussians of max(-ln(effective rank - 1), 0)."""
+    depth_weight: Positive = 1.0
+    """Weight in the loss, at the start, of the relative difference from the depth maps; with --depth."""
+    depth_weight_final: Positive = 0.1
+    """This weight at the last iteration; it changes exponentially in between."""
     exposure_lr: Positive = 1e-2
     """Learning rate of the photos' exposures at the start (original code)."""
     exposure_lr_final: Positive = 1e-3

@@ -25,6 +25,9 @@ from clsplat.show.evaluation_page import write_page
 Result = TypeVar("Result")
 Metric = Callable[..., float | None]
 
+METRICS: tuple[Metric, ...] = (psnr, psnr_fitted, ssim, flip)
+"""The metrics of every evaluation."""
+
 
 def mean_metrics(
     gaussians: Gaussians,
@@ -67,6 +70,7 @@ def evaluate(
     views: Iterable[View],
     out: Path | str,
     renderer: Renderer | None = None,
+    metrics: Sequence[Metric] = METRICS,
 ) -> dict[str, Any]:
     """Render views and compare them with their photos.
 
@@ -80,14 +84,16 @@ def evaluate(
         Folder for metrics.json, index.html, and the pictures in truth/, render/ and difference/; created if missing.
     renderer : Renderer, optional
         Its background is that of the photos where they were transparent. Default: ``Renderer()``.
+    metrics : functions of `clsplat.metrics`
+        What is computed; `METRICS` and maybe `lpips`.
 
     Returns
     -------
     dict
         The content of metrics.json. ``mean`` holds the means over the views of psnr (dB), psnr_fitted (dB, after an
-        affine fit of the colours), ssim and flip; ``views`` holds the same of each view, its size and the paths of
-        its pictures. None (null) stands for an infinite PSNR, as between equal images, and for FLIP where
-        flip-evaluator is not installed.
+        affine fit of the colours), ssim and flip, and of lpips if it is asked for; ``views`` holds the same of each
+        view, its size and the paths of its pictures. None (null) stands for an infinite PSNR, as between equal
+        images, and for FLIP where flip-evaluator is not installed.
 
     Raises
     ------
@@ -100,18 +106,23 @@ def evaluate(
         "sh_degree": gaussians.sh_degree,
         "mode": renderer.config.mode,
     }
-    return evaluate_images(rendered(gaussians, views, renderer), views, out, about, renderer.label)
+    return evaluate_images(rendered(gaussians, views, renderer), views, out, about, renderer.label, metrics)
 
 
 def evaluate_images(
-    images: Iterable[NDArray[np.uint8]], views: list[View], out: Path | str, about: dict[str, Any], device: str
+    images: Iterable[NDArray[np.uint8]],
+    views: list[View],
+    out: Path | str,
+    about: dict[str, Any],
+    device: str,
+    metrics: Sequence[Metric] = METRICS,
 ) -> dict[str, Any]:
     """Compare images, one per view, with the photos, as `evaluate` does.
 
     Parameters
     ----------
     images : iterable of (H, W, 3) uint8
-    views, out
+    views, out, metrics
         As given to `evaluate`.
     about : dict
         What made the images, for the result; for a field: method and model_bytes.
@@ -133,17 +144,15 @@ def evaluate_images(
         save_png(out / files["truth"], view.image)
         save_png(out / files["render"], image)
         save_difference(out / files["difference"], image, view.image, view.mask)
-        metrics = {
-            metric.__name__: metric(image, view.image, view.mask) for metric in (psnr, psnr_fitted, ssim, flip)
-        }
-        metrics = {name: None if value == math.inf else value for name, value in metrics.items()}
+        found = {metric.__name__: metric(image, view.image, view.mask) for metric in metrics}
+        found = {name: None if value == math.inf else value for name, value in found.items()}
         size = {"width": view.camera.width, "height": view.camera.height}
-        return {"name": view.name, **metrics, **size, **files}
+        return {"name": view.name, **found, **size, **files}
 
     records = compared(compare, views, images)
 
     result = {
-        "mean": {metric: _mean([r[metric] for r in records]) for metric in ("psnr", "psnr_fitted", "ssim", "flip")},
+        "mean": {metric.__name__: _mean([r[metric.__name__] for r in records]) for metric in metrics},
         **about,
         "resolution": ", ".join(sorted({f"{r['width']}x{r['height']}" for r in records})),
         "device": device,

@@ -1,10 +1,12 @@
-"""Image metrics as the field reports them: PSNR, SSIM and, if installed, FLIP.
+"""Image metrics as the field reports them: PSNR, SSIM and, if installed, FLIP and LPIPS.
 
 Images are (H, W, 3), uint8 or floats in [0, 1]. Floats are first rounded to 8 bits, the precision of photos and of
 saved renders. The metric of a scene is the mean over its images, not the metric of the mean error.
 """
 
 import math
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -150,6 +152,59 @@ def flip(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> f
         b.astype(np.float32), a.astype(np.float32), "LDR", applyMagma=False, computeMeanError=False
     )
     return float(np.mean(errors[..., 0][mask], dtype=np.float64))
+
+
+def lpips(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> float:
+    """LPIPS distance by the features of AlexNet (Zhang et al. 2018, version 0.1), as the package lpips computes it.
+
+    The package imports torch. Nothing is downloaded: the weights of AlexNet must be in torch's cache.
+
+    Parameters
+    ----------
+    image, truth : (H, W, 3) uint8 or float in [0, 1]
+    mask : (H, W) bool, optional
+        True where pixels count.
+
+    Returns
+    -------
+    float
+        0 for equal images.
+
+    Raises
+    ------
+    InputError
+        As `psnr`; if the package lpips is not installed, or the weights are missing.
+    """
+    a, b, mask = _prepare(image, truth, mask)
+    network, tensor = lpips_network(not mask.all())
+    first, second = (tensor(np.float32(2 * x - 1).transpose(2, 0, 1)[None].copy()) for x in (a, b))
+    found = np.asarray(network(first, second).detach().numpy(), np.float64)
+    return float(found.ravel()[0]) if mask.all() else float(found[0, 0][mask].mean())
+
+
+@cache
+def lpips_network(spatial: bool) -> tuple[Any, Any]:
+    """The network of `lpips`, with a distance per pixel if `spatial`, and the function that makes tensors of arrays.
+
+    Raises
+    ------
+    InputError
+        If the package or the weights are missing.
+    """
+    try:
+        import lpips as package
+        import torch
+    except ImportError as error:
+        raise InputError(
+            f"lpips: expected the package lpips, found none ({error}); pip install 'clsplat[lpips]'"
+        ) from error
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
+    if not any(folder.glob("alexnet-owt-*.pth")):
+        raise InputError(
+            f"lpips: expected the weights of AlexNet, alexnet-owt-*.pth, in {folder}, found none; "
+            "torchvision.models.alexnet(weights='DEFAULT') downloads them"
+        )
+    return package.LPIPS(net="alex", spatial=spatial, verbose=False).eval(), torch.from_numpy
 
 
 def _prepare(image: Array, truth: Array, mask: NDArray[np.bool_] | None) -> tuple[Array, Array, NDArray[np.bool_]]:

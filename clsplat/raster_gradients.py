@@ -39,7 +39,9 @@ class RasterGradients(NamedTuple):
 
     colors is that of the values or of the coefficients of spherical harmonics, summed over the cameras if they share
     them. viewmats (C, 4, 4) has each entry as an independent variable, Ks (C, 3, 3) those of fx, fy, cx and cy.
-    means2d (C, N, 2) is the gradient with respect to the splats' centres, px, which densification uses.
+    means2d (C, N, 2) is the gradient with respect to the splats' centres, px, which densification uses; absgrad
+    (C, N, 2) are the sums over pixels of its absolute values (Ye et al. 2024, "AbsGS"), None unless they were asked
+    for.
     """
 
     means: Array
@@ -51,6 +53,7 @@ class RasterGradients(NamedTuple):
     Ks: Array
     backgrounds: Array
     means2d: Array
+    absgrad: Array | None = None
 
 
 class _Outputs(NamedTuple):
@@ -76,7 +79,9 @@ class Rasterization(_Outputs):
         """Keep what `backward` needs; `rasterization` calls it."""
         self._kept = (renderer, placed, gaussians, passes, sh_degree, antialiased)
 
-    def backward(self, v_render: Any, v_alpha: Any = None, *, shared_colors: bool = True) -> RasterGradients:
+    def backward(
+        self, v_render: Any, v_alpha: Any = None, *, shared_colors: bool = True, absgrad: bool = False
+    ) -> RasterGradients:
         """Gradients of a scalar with respect to the Gaussians and the cameras.
 
         Parameters
@@ -87,6 +92,8 @@ class Rasterization(_Outputs):
             The same for alpha; default 0.
         shared_colors : bool
             Whether all cameras have the same values (N, D), whose gradients are summed. False keeps (C, N, D).
+        absgrad : bool
+            Whether absolute gradients with respect to the centres are computed, too.
 
         Returns
         -------
@@ -105,9 +112,12 @@ class Rasterization(_Outputs):
         v_render = _checked("v_render", v_render, self.render.shape)
         v_alpha = np.zeros(self.alpha.shape) if v_alpha is None else _checked("v_alpha", v_alpha, self.alpha.shape)
         total = {name: np.zeros(array.shape) for name, array in gaussians.arrays().items()}
-        values, viewmats, intrinsics, backgrounds, means2d = [], [], [], [], []
+        values, viewmats, intrinsics, backgrounds, means2d, sums = [], [], [], [], [], []
         for run, v_image, v_cover in zip(passes, v_render, v_alpha, strict=True):
-            v_splats, v_values = _to_splats(renderer, run, v_image, v_cover, sh_degree is not None)
+            placed_v = _placed(renderer, run, v_image, v_cover)
+            v_splats, v_values = _to_splats(renderer, run, placed_v, sh_degree is not None)
+            if absgrad:
+                sums.append(download(renderer.stages.absgrad(run.colored, run.bins, run.image, placed_v)))
             v, v_camera = renderer.stages.project_bwd(
                 placed,
                 run.camera,
@@ -138,20 +148,23 @@ class Rasterization(_Outputs):
             np.stack(intrinsics),
             np.stack(backgrounds),
             np.stack(means2d),
+            np.stack(sums) if absgrad else None,
         )
 
 
-def _to_splats(
-    renderer: Renderer, run: RasterPass, v_image: Array, v_alpha: Array, harmonics: bool
-) -> tuple[AnyGrads, Array]:
-    """Gradients with respect to the splats with RGB and depth, and to the values (N, D) that were composited."""
+def _placed(renderer: Renderer, run: RasterPass, v_image: Array, v_alpha: Array) -> Image:
+    """Gradients with respect to what was composited, where the stages run."""
     v_image, v_cover = v_image.copy(), v_alpha[:, :, 0].copy()
     if "ED" in run.render_mode:  # the accumulated depth over alpha
         alpha = run.alpha[:, :, 0].astype(np.float64)
         v_image[:, :, -1] = np.divide(v_image[:, :, -1], alpha, out=np.zeros_like(alpha), where=alpha > 0)
         v_cover -= v_image[:, :, -1] * run.render[:, :, -1]
-    image = Image(renderer.upload("v_image", v_image), renderer.upload("v_alpha", v_cover))
-    v = renderer.stages.composite_bwd(run.colored, run.bins, run.image, image)
+    return Image(renderer.upload("v_image", v_image), renderer.upload("v_alpha", v_cover))
+
+
+def _to_splats(renderer: Renderer, run: RasterPass, v_image: Image, harmonics: bool) -> tuple[AnyGrads, Array]:
+    """Gradients with respect to the splats with RGB and depth, and to the values (N, D) that were composited."""
+    v = renderer.stages.composite_bwd(run.colored, run.bins, run.image, v_image)
     v_colors = download(v.colors).astype(np.float64)
     deep = "D" in run.render_mode
     v_values = v_colors[:, : run.channels] if "RGB" in run.render_mode else np.zeros((len(v_colors), run.channels))
@@ -173,8 +186,27 @@ def _quotient(x: Array, y: Array) -> Array:
     return np.divide(x, y, out=np.zeros_like(x), where=y > 0)
 
 
+def on_host(name: str, array: Any) -> Array:
+    """An argument as an array of NumPy, which shares the memory of what exports DLPack.
+
+    Raises
+    ------
+    InputError
+        If its memory is not the host's, or its library does not export it.
+    """
+    if isinstance(array, np.ndarray) or not hasattr(array, "__dlpack__"):
+        return np.asarray(array)
+    try:
+        return np.from_dlpack(array)
+    except (BufferError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{name}: expected an array in the memory of the host, which DLPack shares, found {type(array).__name__} "
+            f"({error}); copy it to the host, and detach it from its gradients"
+        ) from error
+
+
 def _checked(name: str, array: Any, expected: tuple[int, ...]) -> Array:
-    array = np.asarray(array, np.float64)
+    array = np.asarray(on_host(name, array), np.float64)
     if array.shape != expected:
         raise InputError(f"{name}: expected shape {expected}, found {array.shape}")
     return array

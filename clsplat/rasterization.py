@@ -10,9 +10,10 @@ from clsplat.camera import Camera, CameraModel
 from clsplat.constants import BLUR
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
-from clsplat.raster_gradients import Rasterization, RasterPass
+from clsplat.raster_gradients import Rasterization, RasterPass, on_host
 from clsplat.renderer import Renderer, default_device, download
 from clsplat.stages import AnySplats
+from clsplat.surface import surface_of
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -45,6 +46,7 @@ def rasterization(
     eps2d: float = BLUR,
     radius_clip: float = 0.0,
     gradients: bool = False,
+    normals: bool = False,
     device: "Device | Literal['reference'] | None" = None,
 ) -> Rasterization:
     """Render a batch of cameras from activated parameters, with gsplat's arguments.
@@ -89,6 +91,8 @@ def rasterization(
         Splats whose half width is at most this are left out, px.
     gradients : bool
         Whether `Rasterization.backward` follows. True keeps on the device what it needs.
+    normals : bool
+        Whether meta also holds the surface: normals and median_depths, which have no gradient.
     device : Device, "reference" or None
         None takes the default OpenCL device; "reference" the float64 twins, slowly.
 
@@ -98,15 +102,17 @@ def rasterization(
         The tuple (render, alpha, meta), with a method `backward`. render (C, H, W, X) has X channels: D, 1 or D + 1,
         the depth last. alpha is (C, H, W, 1). meta is a dict of means2d (C, N, 2), conics (C, N, 3), depths (C, N),
         opacities (C, N) with the compensation, radii (C, N, 2) px as integers, 0 for what is not visible,
-        tiles_per_gauss (C, N), and width, height, tile_size, n_cameras.
+        tiles_per_gauss (C, N), and width, height, tile_size, n_cameras; with `normals`, normals (C, H, W, 3), in the
+        world, and median_depths (C, H, W), as `clsplat.surface.Surface` has them.
 
     Raises
     ------
     InputError
-        If shapes do not fit each other or a number is out of range, naming the argument.
+        If shapes do not fit each other, a number is out of range, or an array of another library is not in the memory
+        of the host, naming the argument.
     """
-    means, viewmats, Ks = (np.asarray(a, dtype=np.float64) for a in (means, viewmats, Ks))
-    colors = np.asarray(colors, dtype=np.float64)
+    means, quats, scales, opacities = _arrays(means=means, quats=quats, scales=scales, opacities=opacities)
+    colors, viewmats, Ks = _arrays(colors=colors, viewmats=viewmats, Ks=Ks)
     n, count = len(means), len(viewmats)
     if n == 0 or count == 0:
         raise InputError(f"means, viewmats: expected at least one Gaussian and one camera, found {n} and {count}")
@@ -121,10 +127,7 @@ def rasterization(
         raise InputError(f"render_mode: expected {', '.join(get_args(RenderMode))}, found {render_mode!r}")
     cameras = _cameras(viewmats, Ks, (width, height), camera_model, radial_coeffs, near_plane)
     channels = colors.shape[2] if sh_degree is None else 3
-    behind = np.zeros((count, channels)) if backgrounds is None else np.asarray(backgrounds, dtype=np.float64)
-    _check_shape("backgrounds", behind, (count, channels))
-    if not np.isfinite(behind).all():
-        raise InputError("backgrounds: expected finite numbers, found NaN or infinity")
+    behind = _behind(backgrounds, (count, channels))
 
     renderer = Renderer(device if eps2d == BLUR else _blurred(device, eps2d))
     placed, antialiased = renderer.place(gaussians), rasterize_mode == "antialiased"
@@ -133,7 +136,8 @@ def rasterization(
         splats = renderer.stages.project_fwd(placed, camera, sh_degree or 0, antialiased=antialiased, channels=4)
         splats = _clipped(renderer, splats, radius_clip)
         values = colors[i] if sh_degree is None else download(splats.colors)[:, :3]
-        parts.append(_composited(renderer, splats, camera, values, behind[i], (render_mode, tile_size, gradients)))
+        run, meta = _composited(renderer, splats, camera, values, behind[i], (render_mode, tile_size, gradients))
+        parts.append((run, meta | _surface(renderer, gaussians, run) if normals else meta))
     passes = [run for run, _ in parts]
     stacked: dict[str, Any] = {name: np.stack([meta[name] for _, meta in parts]) for name in parts[0][1]}
     stacked |= {"width": width, "height": height, "tile_size": tile_size, "n_cameras": count}
@@ -141,6 +145,29 @@ def rasterization(
     if gradients:
         result.remember(renderer, placed, gaussians, passes, sh_degree, antialiased)
     return result
+
+
+def _arrays(**given: ArrayLike) -> list[NDArray[np.float64]]:
+    """Arguments by name as arrays of NumPy."""
+    return [np.asarray(on_host(name, array), np.float64) for name, array in given.items()]
+
+
+def _behind(backgrounds: ArrayLike | None, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """The backgrounds of the cameras, of the shape (C, D)."""
+    if backgrounds is None:
+        return np.zeros(shape)
+    (behind,) = _arrays(backgrounds=backgrounds)
+    _check_shape("backgrounds", behind, shape)
+    if not np.isfinite(behind).all():
+        raise InputError("backgrounds: expected finite numbers, found NaN or infinity")
+    return behind
+
+
+def _surface(renderer: Renderer, gaussians: Gaussians, run: RasterPass) -> dict[str, Any]:
+    """Normals and median depths of a camera, as a part of meta."""
+    ids = download(renderer.stages.median_splats(run.colored, run.bins))
+    surface = surface_of(gaussians, run.camera, ids)
+    return {"normals": surface.normals, "median_depths": surface.depth}
 
 
 def _clipped(renderer: Renderer, splats: AnySplats, radius_clip: float) -> AnySplats:
@@ -191,7 +218,9 @@ def _cameras(
     _check_shape("Ks", Ks, (count, 3, 3))
     if model not in CAMERA_MODELS:
         raise InputError(f"camera_model: expected {', '.join(CAMERA_MODELS)}, found {model!r}")
-    distortions = np.zeros((count, 4)) if radial_coeffs is None else np.asarray(radial_coeffs, dtype=np.float64)
+    distortions = np.zeros((count, 4))
+    if radial_coeffs is not None:
+        (distortions,) = _arrays(radial_coeffs=radial_coeffs)
     _check_shape("radial_coeffs", distortions, (count, 4))
     if near_plane is not None and not 0 < near_plane < float("inf"):
         raise InputError(f"near_plane: expected a depth above 0, found {near_plane}")

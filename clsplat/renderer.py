@@ -43,7 +43,8 @@ class Pass:
     """Results of a forward pass that its gradients need. Arrays are where the stages ran.
 
     splats: those of the Gaussians. drawn: all that were composited, those of the Gaussians before those of the
-    backdrop, if there is one. disparities: those of all, where each pixel sorts them; otherwise None.
+    backdrop, if there is one. disparities: those of all, where each pixel sorts them; otherwise None. inverse:
+    whether the fourth channel is the inverse depth.
     """
 
     gaussians: Gaussians
@@ -55,6 +56,7 @@ class Pass:
     image: Image
     disparities: Any = None
     dropout: Dropout | None = None
+    inverse: bool = False
 
 
 class Renderer:
@@ -156,7 +158,7 @@ class Renderer:
         sh_degree: int | None = None,
         *,
         background: Any = None,
-        depth: bool = False,
+        depth: bool | Literal["inverse"] = False,
         gradients: bool = True,
         dropout: Dropout | None = None,
     ) -> Pass:
@@ -172,8 +174,8 @@ class Renderer:
             Highest degree of the spherical harmonics evaluated; default: all that are stored.
         background : (3,) floats, optional
             Another than the renderer's.
-        depth : bool
-            Composite the depth as a fourth channel.
+        depth : bool or "inverse"
+            Composite the depth, or the inverse depth, as a fourth channel.
         gradients : bool
             Whether `backward` follows; otherwise its lists of intersections are left out.
         dropout : Dropout, optional
@@ -187,13 +189,14 @@ class Renderer:
         degree = gaussians.sh_degree if sh_degree is None else sh_degree
         if config.near is not None:
             camera = replace(camera, near=config.near)
-        behind = np.array([*(self.background if background is None else background), *[0.0] * depth])
-        splats = self._project(gaussians, camera, degree, len(behind))
+        behind = np.array([*(self.background if background is None else background), *[0.0] * bool(depth)])
+        inverse = depth == "inverse"
+        splats = self._project(gaussians, camera, degree, len(behind), inverse)
         if dropout:
             self.stages.dropout_fwd(splats, dropout)
         drawn = splats
         if self.backdrop is not None:
-            others = self._project(self.backdrop, camera, self.backdrop.sh_degree, len(behind))
+            others = self._project(self.backdrop, camera, self.backdrop.sh_degree, len(behind), inverse)
             drawn = self._joined(splats, others)
         # The reference works splat by splat and gains nothing from tiles.
         tile_size = max(camera.width, camera.height) if self.device is None else config.tile_size
@@ -207,11 +210,16 @@ class Renderer:
             more = self.stages.project_disparities(self.backdrop, camera, others)
             disparities = self.stages.join_rows(disparities, more)
         image = self.stages.composite_fwd(drawn, bins, behind, compositor=config.compositor, disparities=disparities)
-        return Pass(gaussians, camera, degree, splats, drawn, bins, image, disparities, dropout)
+        return Pass(gaussians, camera, degree, splats, drawn, bins, image, disparities, dropout, inverse)
 
-    def _project(self, gaussians: Gaussians, camera: Camera, sh_degree: int, channels: int) -> AnySplats:
+    def _project(
+        self, gaussians: Gaussians, camera: Camera, sh_degree: int, channels: int, inverse: bool
+    ) -> AnySplats:
         options = {"antialiased": self.config.mode == "antialiased", "rays": along_rays(self.config, camera)}
-        return self.stages.project_fwd(gaussians, camera, sh_degree, channels=channels, **options)
+        splats = self.stages.project_fwd(gaussians, camera, sh_degree, channels=channels, **options)
+        if inverse:
+            self.stages.disparity_fwd(splats)
+        return splats
 
     def _joined(self, splats: AnySplats, others: AnySplats) -> AnySplats:
         """Splats of two scenes. The directions of rays belong to the camera, not to a splat."""
@@ -226,6 +234,8 @@ class Renderer:
         )
         if run.drawn is not run.splats:
             v_splats = type(v_splats)(*(v[: len(run.gaussians)] for v in v_splats))
+        if run.inverse:
+            self.stages.disparity_bwd(run.splats, v_splats)
         if run.dropout:
             self.stages.dropout_bwd(v_splats, run.dropout)
         return v_splats

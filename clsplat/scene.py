@@ -1,6 +1,7 @@
 """Scenes: posed photos and sparse points, as `clsplat.dataset` loads them."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,52 @@ from clsplat.camera import Camera
 
 Color = tuple[float, float, float]
 
+DISPARITY_MIN = 1e-6
+"""Least inverse depth of a map, as a fraction of its largest: far beyond what photos of a scene resolve."""
+
 THUMBNAILS = 8
 """Approximate number of photos that a notebook shows of a scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """Depths that were measured or estimated for a photo, up to a scale and a shift.
+
+    The inverse depth of a pixel, 1/world units, is ``scale * value + shift``, or if the values grow with the depth,
+    ``1 / (scale * value + shift)``. Depth is as rendered: z, and for fisheyes and whole panoramas the distance.
+
+    Parameters
+    ----------
+    values : (H, W) float32
+        As they are in the file; NaN where the map knows none.
+    inverse : bool
+        Whether the values fall with the depth.
+    scale, shift : float
+        Found by `clsplat.dataset.depth_maps.aligned`. As they are by default, the values are in world units.
+    """
+
+    values: NDArray[np.float32]
+    inverse: bool = False
+    scale: float = 1.0
+    shift: float = 0.0
+
+    @cached_property
+    def disparities(self) -> NDArray[np.float32]:
+        """Inverse depths (H, W), 1/world units; 0 where the map knows none."""
+        values = self.scale * self.values.astype(np.float64) + self.shift
+        if self.inverse:
+            # Beyond infinity, by an error of the fit: as far away as a number tells, but not unknown.
+            least = DISPARITY_MIN * np.nanmax(values, initial=0)
+            known = np.where(np.isnan(values), 0, np.maximum(values, least))
+        else:
+            known = np.divide(1, values, out=np.zeros_like(values), where=values > 0)
+        return known.astype(np.float32)
+
+    @cached_property
+    def unit(self) -> float:
+        """Median of the inverse depths, 1/world units; 0 if the map knows none."""
+        known = self.disparities[self.disparities > 0]
+        return float(np.median(known)) if known.size else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +76,8 @@ class View:
         True where pixels are used.
     clear : (H, W) uint8, optional
         Visible share of the background, 0 to 255, if the photo is transparent and training uses random backgrounds.
+    depth : DepthMap, optional
+        Depths of its pixels, which training compares with those of the scene.
     """
 
     name: str
@@ -38,6 +85,7 @@ class View:
     image: NDArray[np.uint8]
     mask: NDArray[np.bool_] | None = None
     clear: NDArray[np.uint8] | None = None
+    depth: DepthMap | None = None
 
     def on(self, background: Color, loaded_on: Color) -> NDArray[np.uint8]:
         """Composite the photo (H, W, 3) on another background than that of loading; both are RGB in [0, 1]."""
@@ -89,6 +137,8 @@ class Scene:
             "masks": str(sum(v.mask is not None for v in views)),
             "points": f"{len(self.points):,}",
         }
+        if any(v.depth is not None for v in views):
+            rows["depth maps"] = str(sum(v.depth is not None for v in views))
         if self.offset.any():
             rows["offset"] = display.numbers(self.offset)
         if not views:

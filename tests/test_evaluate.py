@@ -13,7 +13,7 @@ from clsplat import metrics
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.errors import InputError
-from clsplat.evaluate import evaluate, mean_metrics
+from clsplat.evaluate import METRICS, evaluate, mean_metrics
 from clsplat.gaussians import Gaussians
 from clsplat.render import render
 from clsplat.renderer import Renderer
@@ -178,3 +178,18 @@ def test_what_is_refused(gaussians, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"cannot create .*file: Not a directory"):
         evaluate(gaussians, [view], tmp_path / "file", REFERENCE)
+
+
+def test_more_metrics_where_they_are_asked_for(gaussians, tmp_path):
+    """As LPIPS: in the figures and on the page."""
+
+    def lpips(image, truth, mask):
+        return 0.25
+
+    views = make_views(gaussians, [0, 5], device="reference")
+    plain = evaluate(gaussians, views, tmp_path / "plain", REFERENCE)
+    more = evaluate(gaussians, views, tmp_path / "more", REFERENCE, (*METRICS, lpips))
+    assert "lpips" not in plain["mean"] and more["mean"] == {**plain["mean"], "lpips": 0.25}
+    assert [view["lpips"] for view in more["views"]] == [0.25, 0.25]
+    pages = [(tmp_path / name / "index.html").read_text(encoding="utf-8") for name in ("plain", "more")]
+    assert "LPIPS" not in pages[0] and "Mean LPIPS" in pages[1]

@@ -1,13 +1,15 @@
 """Metrics against scikit-image, against their definitions written out, and on what must be refused."""
 
 import math
+import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
 
 from clsplat.errors import InputError
-from clsplat.metrics import flip, psnr, psnr_fitted, ssim, to_uint8
+from clsplat.metrics import flip, lpips, lpips_network, psnr, psnr_fitted, ssim, to_uint8
 
 METRICS = [psnr, psnr_fitted, ssim, flip]
 
@@ -165,3 +167,71 @@ def test_the_mean_is_over_the_mask(pair, metric, best):
     # All differences lie in the mask, the windows of both metrics included: only the number of pixels changes.
     whole, masked = (metric(image, pair[1], m) - best for m in (None, mask))
     assert masked * mask.sum() == pytest.approx(whole * mask.size, rel=1e-6)
+
+
+class Tensor:
+    """What `lpips` uses of a tensor."""
+
+    def __init__(self, array):
+        self.array = array
+
+    def detach(self):
+        return self
+
+    def numpy(self):
+        return self.array
+
+
+@pytest.fixture
+def lpips_installed(tmp_path, monkeypatch):
+    """Modules in the place of lpips and torch: the distance is the mean absolute difference, of inputs in [-1, 1]."""
+
+    class LPIPS:
+        def __init__(self, net, spatial, verbose):
+            assert (net, verbose) == ("alex", False)
+            self.spatial = spatial
+
+        def eval(self):
+            return self
+
+        def __call__(self, a, b):
+            assert a.array.dtype == np.float32 and a.array.shape == (1, 3, 40, 50) and np.abs(a.array).max() <= 1
+            off = np.abs(a.array - b.array).mean(axis=1, keepdims=True)
+            return Tensor(off if self.spatial else off.mean(axis=(2, 3), keepdims=True))
+
+    hub = types.SimpleNamespace(get_dir=lambda: str(tmp_path))
+    monkeypatch.setitem(sys.modules, "torch", types.SimpleNamespace(hub=hub, from_numpy=Tensor))
+    monkeypatch.setitem(sys.modules, "lpips", types.SimpleNamespace(LPIPS=LPIPS))
+    lpips_network.cache_clear()
+    yield tmp_path
+    lpips_network.cache_clear()
+
+
+def test_lpips_is_that_of_its_package(pair, lpips_installed):
+    (lpips_installed / "checkpoints").mkdir()
+    (lpips_installed / "checkpoints" / "alexnet-owt-7be5be79.pth").touch()
+    off = 2 * np.abs(pair[0].astype(float) - pair[1]) / 255
+    assert lpips(*pair) == pytest.approx(off.mean(), rel=1e-5)
+    mask = np.zeros(off.shape[:2], bool)
+    mask[5:9, 7:30] = True
+    assert lpips(*pair, mask) == pytest.approx(off[mask].mean(), rel=1e-5)
+    assert lpips(pair[1], pair[1]) == 0
+
+
+def test_lpips_downloads_no_weights(pair, lpips_installed):
+    with pytest.raises(InputError, match=r"expected the weights of AlexNet, alexnet-owt-\*\.pth, in .*, found none"):
+        lpips(*pair)
+
+
+def test_lpips_names_the_package_that_is_missing(pair, monkeypatch):
+    lpips_network.cache_clear()
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    with pytest.raises(InputError, match=r"lpips: expected the package lpips, found none .* pip install"):
+        lpips(*pair)
+
+
+def test_torch_is_imported_by_lpips_alone():
+    code = "import sys, clsplat, clsplat.evaluate, clsplat.metrics, clsplat.cli; print('torch' in sys.modules)"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+    )

@@ -94,9 +94,20 @@ def test_reference_and_device_agree(given: dict[str, Any], device64: Device) -> 
     v = []
     for device in (device64, "reference"):
         result = rasterization(**inputs, device=device, gradients=True)  # type: ignore[arg-type]
-        v.append(result.backward(np.cos(np.arange(result.render.size)).reshape(result.render.shape)))
+        v_render = np.cos(np.arange(result.render.size)).reshape(result.render.shape)
+        v.append(result.backward(v_render, absgrad=True))
     for one, other in zip(*v, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-8 * max(1, np.abs(other).max()))
+
+
+def test_absolute_gradients_are_those_of_what_was_composited(given: dict[str, Any], device64: Device) -> None:
+    """At least the absolute values of the gradients, in each camera; only if they are asked for."""
+    result = rasterization(**with_colors(given, 5) | {"render_mode": "RGB+ED"}, device=device64, gradients=True)
+    v_render = np.random.default_rng(3).normal(size=result.render.shape)
+    v = result.backward(v_render, absgrad=True)
+    assert v.absgrad is not None and v.absgrad.shape == v.means2d.shape == (2, 12, 2)
+    assert (v.absgrad >= np.abs(v.means2d) * (1 - 1e-9)).all() and (v.absgrad > 1.5 * np.abs(v.means2d)).any()
+    assert result.backward(v_render).absgrad is None
 
 
 def test_opacities_and_scales_at_their_bounds_have_finite_gradients(given: dict[str, Any], device: Device) -> None:
@@ -105,7 +116,7 @@ def test_opacities_and_scales_at_their_bounds_have_finite_gradients(given: dict[
     inputs["scales"] = np.array(given["scales"])
     inputs["scales"][1] = 0
     result = rasterization(**inputs, device=device, gradients=True)
-    v = result.backward(np.ones(result.render.shape))
+    v = result.backward(np.ones(result.render.shape), absgrad=True)
     assert all(np.isfinite(array).all() for array in v)
     assert not v.opacities.any() and not v.scales[1].any()
 

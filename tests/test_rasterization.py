@@ -19,6 +19,21 @@ from clsplat.testing import synthetic_scene
 BACKGROUND = (0.2, 0.5, 0.9)
 
 
+class Exported:
+    """An array of another library: it has DLPack, and nothing else that NumPy reads."""
+
+    def __init__(self, array: Any, device: tuple[int, int] = (1, 0)):
+        self._array, self._device = array, device
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        return self._device
+
+    def __dlpack__(self, **options: Any) -> Any:
+        if self._device[0] != 1:
+            raise BufferError("not in the memory of the host")
+        return self._array.__dlpack__()
+
+
 @pytest.fixture(scope="module")
 def scene() -> tuple[Gaussians, list[Camera]]:
     gaussians, camera = synthetic_scene(60, seed=7)
@@ -179,3 +194,44 @@ def test_errors_name_the_argument(
     given = arguments(*scene) | {"colors": np.ones((60, 3))} | change
     with pytest.raises(InputError, match=message):
         rasterization(**given)
+
+
+def test_arrays_of_other_libraries_by_dlpack(scene: tuple[Gaussians, list[Camera]], device: Device) -> None:
+    """Arguments that only have DLPack give the same bits, and results are shared by it."""
+    given = arguments(*scene)
+    given |= {"sh_degree": 3, "backgrounds": np.array([BACKGROUND] * 2), "device": device, "gradients": True}
+    plain = rasterization(**given)
+    exported = {name: Exported(a) if isinstance(a, np.ndarray) else a for name, a in given.items()}
+    shared = rasterization(**exported)
+    for one, other in zip(plain[:2], shared[:2], strict=True):
+        np.testing.assert_array_equal(one, other)
+        assert np.shares_memory(np.from_dlpack(other), other)
+    v_render = np.ones(plain.render.shape)
+    for one, other in zip(plain.backward(v_render), shared.backward(Exported(v_render)), strict=True):
+        if one is not None:
+            np.testing.assert_array_equal(one, other)
+            assert np.shares_memory(np.from_dlpack(other), other)
+    for name in ("means", "colors", "viewmats", "backgrounds"):
+        with pytest.raises(
+            InputError, match=f"{name}: expected an array in the memory of the host, .* found Exported"
+        ):
+            rasterization(**given | {name: Exported(given[name], device=(2, 0))})
+    with pytest.raises(InputError, match="v_render: expected an array in the memory of the host"):
+        plain.backward(Exported(v_render, device=(2, 0)))
+
+
+@pytest.mark.parametrize("model", ["pinhole", "ortho"])
+def test_normals_are_those_of_the_surface(
+    scene: tuple[Gaussians, list[Camera]], device64: Device, model: Any
+) -> None:
+    gaussians, cameras = scene
+    meta = rasterization(
+        **arguments(gaussians, cameras), sh_degree=0, camera_model=model, normals=True, device=device64
+    ).meta
+    for i, camera in enumerate(cameras):
+        kind: Any = "orthographic" if model == "ortho" else model
+        surface = render(gaussians, replace(camera, model=kind), device=device64).surface()
+        assert (surface.ids >= 0).any()
+        np.testing.assert_allclose(meta["normals"][i], surface.normals, atol=1e-9)
+        np.testing.assert_allclose(meta["median_depths"][i], surface.depth, atol=1e-9)
+    assert "normals" not in rasterization(**arguments(gaussians, cameras), sh_degree=0, device=device64).meta

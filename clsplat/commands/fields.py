@@ -27,7 +27,7 @@ def check_settings(method: str, config: TrainConfig) -> None:
     """Raise an InputError if a setting is given that only Gaussians have."""
     default = TrainConfig()
     names = [f.name for f in fields(config) if getattr(config, f.name) != getattr(default, f.name)]
-    others = [name for name in names if name not in COUNTED]
+    others = [name for name in names if name not in COUNTED] + ["depth"] * (config.data.depth is not None)
     if others:
         raise InputError(
             f"--method {method}: expected no settings of Gaussians, found {', '.join(others)}; leave them out"

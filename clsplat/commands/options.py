@@ -14,6 +14,7 @@ class PhotoOptions(DataConfig):
     """Settings of the photos that a scene is compared with. Their cameras are those that the scene was trained on."""
 
     random_background: tyro.conf.Fixed[bool] = False
+    depth: tyro.conf.Fixed[str | None] = None
     sfm: tyro.conf.Fixed[SfmConfig] = field(default_factory=SfmConfig)
 
 

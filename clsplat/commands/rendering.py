@@ -45,6 +45,8 @@ class Eval:
     """Dataset, as for `train`. Default: the dataset of the run."""
     out: OptionalOut = None
     """Folder for metrics.json, index.html and the renders. Default: the folder `eval` of the run."""
+    lpips: bool = False
+    """Also compute LPIPS; needs the extra `lpips`, which imports torch, and AlexNet's weights in torch's cache."""
     device: DeviceName = None
     """Part of the name of the platform or device."""
     data_config: Annotated[PhotoOptions, tyro.conf.arg(name="")] = field(default_factory=PhotoOptions)
@@ -57,11 +59,14 @@ class Eval:
     def run(self) -> None:
         """Run the command."""
         from clsplat.dataset import load_scene
-        from clsplat.evaluate import evaluate
+        from clsplat.evaluate import METRICS, evaluate
         from clsplat.formats import load_gaussians
+        from clsplat.metrics import lpips, lpips_network
         from clsplat.renderer import Renderer
 
         data, out = dataset_of("eval", self.data), place_of(self.out, self.scene, "eval")
+        if self.lpips:
+            lpips_network(False)  # refuses before any work
         try_folder(out)
         gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
@@ -72,7 +77,8 @@ class Eval:
         new_folder(out)
         background = BACKGROUNDS[self.data_config.background]
         renderer = Renderer(device, replace(self.render, mode=mode), background)
-        say_scores(evaluate(gaussians, scene.test, out, renderer), out)
+        metrics = (*METRICS, lpips) if self.lpips else METRICS
+        say_scores(evaluate(gaussians, scene.test, out, renderer, metrics), out)
 
 
 @dataclass(frozen=True)

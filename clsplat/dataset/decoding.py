@@ -103,7 +103,7 @@ class Dataset:
 
 
 @dataclass(frozen=True, eq=False)
-class _Plan:
+class Plan:
     """Everything needed to decode a photo to a view, determined from the files' headers."""
 
     photo: PosedPhoto
@@ -138,13 +138,13 @@ def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
     from tqdm import tqdm
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        plans = list(pool.map(lambda photo: _plan(photo, dataset, config.invert_masks), dataset.photos))
+        plans = list(pool.map(lambda photo: plan_view(photo, dataset, config.invert_masks), dataset.photos))
         _check_memory(plans, config)
         views = pool.map(lambda plan: _view(plan, dataset.reduce, config), plans)
         return list(tqdm(views, "photos", len(plans), unit="photo", dynamic_ncols=True, leave=False))
 
 
-def _check_memory(plans: list[_Plan], config: DataConfig) -> None:
+def _check_memory(plans: list[Plan], config: DataConfig) -> None:
     """Raise an InputError if the photos, all of which stay in memory, and the largest file do not fit the machine."""
     need = sum(CHANNELS * plan.camera.width * plan.camera.height for plan in plans)
     largest = max(CHANNELS * plan.size[0] * plan.size[1] for plan in plans)
@@ -169,20 +169,21 @@ def physical_memory() -> int | None:
 
 def load_view(photo: PosedPhoto, dataset: Dataset, config: DataConfig) -> View:
     """Decode one photo of a dataset; like `load_views`, with the same errors."""
-    return _view(_plan(photo, dataset, config.invert_masks), dataset.reduce, config)
+    return _view(plan_view(photo, dataset, config.invert_masks), dataset.reduce, config)
 
 
-def _plan(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> _Plan:
+def plan_view(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> Plan:
+    """Determine the camera of a photo's view from the headers of its file; errors as of `load_views`."""
     declared = photo.intrinsics
     width, height = photo_size(photo.path)
     turned = orientation(photo.path) >= 5 if dataset.upright else False
     upright = dataset.upright
-    if not upright and not _fits((width, height), declared) and _fits((height, width), declared):
+    if not upright and not fits((width, height), declared) and fits((height, width), declared):
         # Width and height are swapped: the cameras were computed from photos that had been turned upright.
         upright = turned = orientation(photo.path) >= 5
     if turned:
         width, height = height, width
-    if not _fits((width, height), declared):
+    if not fits((width, height), declared):
         raise InputError(
             f"{photo.path}: expected {declared.width}x{declared.height} pixels, the size of its camera, or a smaller "
             f"copy, found {width}x{height}"
@@ -213,16 +214,17 @@ def _plan(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> _Plan:
             camera = replace(camera, model="equirectangular")
     except InputError as error:
         raise InputError(f"photo {photo.name}: {error}") from error
-    return _Plan(photo, camera, (width, height), upright, invert_mask)
+    return Plan(photo, camera, (width, height), upright, invert_mask)
 
 
-def _fits(size: tuple[int, int], declared: Intrinsics) -> bool:
+def fits(size: tuple[int, int], declared: Intrinsics) -> bool:
+    """Whether width and height are those of a camera, or of a smaller or larger copy."""
     sx, sy = size[0] / declared.width, size[1] / declared.height
     # Rounding a smaller copy's size moves one edge by less than a pixel.
     return abs(sx - sy) <= max(ASPECT_TOLERANCE * max(sx, sy), 1 / min(declared.width, declared.height))
 
 
-def _view(plan: _Plan, reduce: int, config: DataConfig) -> View:
+def _view(plan: Plan, reduce: int, config: DataConfig) -> View:
     photo, camera = plan.photo, plan.camera
     image, mask = _pixels(plan, reduce, BACKGROUNDS[config.background])
     clear = None
@@ -234,7 +236,7 @@ def _view(plan: _Plan, reduce: int, config: DataConfig) -> View:
 
 
 def _pixels(
-    plan: _Plan, reduce: int, background: tuple[float, float, float]
+    plan: Plan, reduce: int, background: tuple[float, float, float]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """Decode, undistort and reduce a photo and its mask."""
     photo, camera = plan.photo, plan.camera
@@ -247,10 +249,10 @@ def _pixels(
         image, mask = bordered(image), None if mask is None else bordered(mask)
     elif camera.model == "pinhole" and not is_pinhole(photo.intrinsics):
         rows, columns = camera.height * reduce, camera.width * reduce
-        positions = _positions(photo.intrinsics, plan.size, (rows, columns))
+        positions = undistorted_positions(photo.intrinsics, plan.size, (rows, columns))
     if positions is not None:
-        image = np.stack([_resample(image[..., channel], positions, 1) for channel in range(3)], axis=-1)
-        mask = None if mask is None else _resample(mask, positions, 0)
+        image = np.stack([resample(image[..., channel], positions, 1) for channel in range(3)], axis=-1)
+        mask = None if mask is None else resample(mask, positions, 0)
     if reduce > 1:
         # Explicit sums: NumPy's mean over two axes of uint8 is several times slower.
         squares = _squares(image, camera, reduce)
@@ -279,19 +281,26 @@ def _squares(pixels: NDArray[Any], camera: Camera, edge: int) -> NDArray[Any]:
 def _fitted_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     """Read a mask and resize it to the photo's size, by nearest neighbour."""
     mask = read_mask(path)
-    if not _fits((mask.shape[1], mask.shape[0]), Intrinsics("PINHOLE", (), width, height)):
+    if not fits((mask.shape[1], mask.shape[0]), Intrinsics("PINHOLE", (), width, height)):
         raise InputError(
             f"{path}: expected a mask with the aspect ratio of the photo, {width}x{height} pixels, found "
             f"{mask.shape[1]}x{mask.shape[0]}"
         )
-    rows = ((np.arange(height) + 0.5) * mask.shape[0] / height).astype(int)
-    columns = ((np.arange(width) + 0.5) * mask.shape[1] / width).astype(int)
-    return mask[np.ix_(rows, columns)]
+    return nearest(mask, height, width)
+
+
+def nearest(pixels: NDArray[Any], height: int, width: int) -> NDArray[Any]:
+    """Resize pixels (H, W) by nearest neighbour."""
+    rows = ((np.arange(height) + 0.5) * pixels.shape[0] / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * pixels.shape[1] / width).astype(int)
+    return pixels[np.ix_(rows, columns)]
 
 
 # Photos of one camera share an entry. The small size bounds the memory if every photo has its own camera.
 @lru_cache(maxsize=2)
-def _positions(intrinsics: Intrinsics, size: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float32]:
+def undistorted_positions(
+    intrinsics: Intrinsics, size: tuple[int, int], shape: tuple[int, int]
+) -> NDArray[np.float32]:
     """Compute where the pixels of an undistorted image lie in the distorted photo.
 
     Parameters
@@ -333,7 +342,8 @@ def _positions(intrinsics: Intrinsics, size: tuple[int, int], shape: tuple[int, 
     return positions - np.float32(0.5)
 
 
-def _resample(channel: NDArray[Any], positions: NDArray[np.float32], order: int) -> NDArray[Any]:
+def resample(channel: NDArray[Any], positions: NDArray[np.float32], order: int) -> NDArray[Any]:
+    """Interpolate pixels (H, W) at row and column indices (2, ...) by splines of an order; 0 takes the nearest."""
     from scipy.ndimage import map_coordinates
 
     resampled: NDArray[Any] = map_coordinates(channel, positions, order=order, mode="nearest")

@@ -1,6 +1,9 @@
 """Load a folder as a `Scene`: detect the kind of dataset, hold out photos and choose the origin."""
 
+import os
 import warnings
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -10,7 +13,8 @@ import numpy as np
 from clsplat.config import DataConfig, SfmConfig
 from clsplat.dataset import colmap, transforms
 from clsplat.dataset.decoding import Dataset, by_faces, load_view, load_views
-from clsplat.dataset.finding import PhotosMissing
+from clsplat.dataset.depth_maps import aligned, find_depth_map, load_depth_map
+from clsplat.dataset.finding import PhotosMissing, mask_folder
 from clsplat.dataset.near_planes import with_near_planes
 from clsplat.dataset.photos import list_photos
 from clsplat.dataset.sfm import reconstruction as sfm
@@ -141,6 +145,44 @@ def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: boo
     if len(points):
         points, colors = filled(points, colors)
     return replace(scene, points=points, colors=colors)
+
+
+def with_depth_maps(scene: Scene, path: str | Path, config: DataConfig, tell: Callable[[str], None]) -> Scene:
+    """Read the depth maps of the training photos, and scale them to the scene's points.
+
+    Parameters
+    ----------
+    scene : Scene
+        As returned by `load_scene`, with points.
+    path : str or Path
+        The dataset from which it was loaded.
+    config : DataConfig
+        The options with which it was loaded; `config.depth` is the folder of the maps.
+    tell : callable
+        Called with a sentence about the result.
+
+    Raises
+    ------
+    InputError
+        If a photo has no depth map, or one of another shape or that cannot be read; if the photos are faces of
+        panoramas; if no map agrees with the points, or there are none.
+    """
+    assert config.depth is not None
+    path = Path(path)
+    folder = mask_folder(path, config.depth, "--depth")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # load_scene has warned of missing photos
+        dataset = _read_dataset(path, config, verbose=False)
+    if config.panoramas == "faces" and any(p.intrinsics.model == "EQUIRECTANGULAR" for p in dataset.photos):
+        raise InputError(
+            "--depth: expected photos that train whole, found panoramas, which train as faces; use --panoramas whole"
+        )
+    photos = {photo.name: photo for photo in dataset.photos}
+    files = {view.name: find_depth_map(folder, view.name) for view in scene.train}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        maps = pool.map(lambda name: load_depth_map(files[name], photos[name], dataset), files)
+        train = [replace(view, depth=depth) for view, depth in zip(scene.train, maps, strict=True)]
+    return aligned(replace(scene, train=train), tell)
 
 
 def _full_size(path: Path, config: DataConfig) -> Dataset:

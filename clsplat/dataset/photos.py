@@ -77,7 +77,8 @@ class _Bounded(io.BufferedReader):
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
+def opened(path: Path) -> Iterator[Image.Image]:
+    """Open a photo with Pillow; whatever goes wrong while it is open is an InputError that names it."""
     if path.suffix.lower() in HEIF and not heif_is_read():
         raise InputError(
             f"cannot read {path}: the package pillow-heif is not installed; pip install 'clsplat[heic]', or convert "
@@ -107,7 +108,7 @@ def photo_size(path: Path) -> tuple[int, int]:
     InputError
         If the file is not an image.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         return image.size
 
 
@@ -119,7 +120,7 @@ def orientation(path: Path) -> int:
     InputError
         If the file is not an image.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         tag = image.getexif().get(ExifTags.Base.Orientation, 1)
         return int(tag) if tag in range(1, 9) else 1
 
@@ -132,7 +133,7 @@ def is_plain(path: Path) -> bool:
     InputError
         If the file is not an image.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         # An MPO is a JPEG followed by further pictures, as some phones and 3D cameras write it.
         plain = image.format in ("JPEG", "MPO", "PNG") and image.mode in ("RGB", "L")
         transparent = "transparency" in image.info
@@ -147,7 +148,7 @@ def is_transparent(path: Path) -> bool:
     InputError
         If the file is not an image.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         return image.mode in TRANSPARENT or "transparency" in image.info
 
 
@@ -161,7 +162,7 @@ def write_upright_png(source: Path, target: Path) -> None:
     InputError
         If `source` cannot be decoded.
     """
-    with _opened(source) as image:
+    with opened(source) as image:
         upright = ImageOps.exif_transpose(image)
         try:
             exif = upright.getexif().tobytes()
@@ -194,7 +195,7 @@ def read_photo(path: Path, background: tuple[float, float, float], upright: bool
     InputError
         If the file is damaged, is not an image, or has floating-point or 32-bit pixels; the message names it.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         return _rgb(ImageOps.exif_transpose(image) if upright else image, background, path)
 
 
@@ -206,7 +207,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     InputError
         If the file cannot be decoded, or has grey pixels but no white ones: a mask of 0 and 1 would hide everything.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         values = _rgb(image, (0.0, 0.0, 0.0), path).max(axis=2)
     mask: NDArray[np.bool_] = values >= 128
     if values.any() and not mask.any():
@@ -248,7 +249,7 @@ def photo_sharpness(path: Path) -> float:
     InputError
         If the file cannot be decoded.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         image.draft("L", (SHARPNESS_EDGE, SHARPNESS_EDGE))  # decodes a JPEG at a smaller size, which is faster
         grey = Image.fromarray(_rgb(image, (0.0, 0.0, 0.0), path)).convert("L")
     grey.thumbnail((SHARPNESS_EDGE, SHARPNESS_EDGE))

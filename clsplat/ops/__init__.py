@@ -7,10 +7,12 @@ mathematics, which is in cl/ and, as NumPy, in `clsplat.reference`.
 from functools import partial
 
 from clsplat.device import Device
+from clsplat.ops.absgrad import absgrad
 from clsplat.ops.adam import adam_array, adam_step
 from clsplat.ops.bin import bin_splats
 from clsplat.ops.composite import composite_bwd, composite_fwd
 from clsplat.ops.count import count_pairs
+from clsplat.ops.disparity import disparity_bwd, disparity_fwd, disparity_grad, disparity_loss
 from clsplat.ops.dropout import dropout_bwd, dropout_fwd
 from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.filter import filter_bwd, filter_fwd, pixel_sizes
@@ -41,14 +43,19 @@ class Launches:
         self.project_disparities = partial(project_disparities, device)
         self.project_bwd = partial(project_bwd, device)
         self.project_bwd_adam = partial(project_bwd_adam, device)
+        self.disparity_fwd = partial(disparity_fwd, device)
+        self.disparity_bwd = partial(disparity_bwd, device)
         self.dropout_fwd = partial(dropout_fwd, device)
         self.dropout_bwd = partial(dropout_bwd, device)
         self.bin_splats = partial(bin_splats, device)
         self.composite_fwd = partial(composite_fwd, device)
         self.composite_bwd = partial(composite_bwd, device)
+        self.absgrad = partial(absgrad, device)
         self.count_pairs = partial(count_pairs, device)
         self.median_splats = partial(median_splats, device)
         self.removal = partial(removal, device)
+        self.disparity_loss = partial(disparity_loss, device)
+        self.disparity_grad = partial(disparity_grad, device)
         self.exposure_fwd = partial(exposure_fwd, device)
         self.exposure_bwd = partial(exposure_bwd, device)
         self.l1_ssim = partial(l1_ssim, device)

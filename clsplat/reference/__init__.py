@@ -4,10 +4,12 @@ This module implements `clsplat.stages.Stages`. Belongs here: one module per sta
 several stages share (lenses, spherical harmonics). Does not belong here: the algorithms that make a stage fast.
 """
 
+from clsplat.reference.absgrad import absgrad
 from clsplat.reference.adam import adam_array, adam_step
 from clsplat.reference.bin import bin_splats
 from clsplat.reference.composite import composite_bwd, composite_fwd
 from clsplat.reference.count import count_pairs
+from clsplat.reference.disparity import disparity_bwd, disparity_fwd, disparity_grad, disparity_loss
 from clsplat.reference.dropout import dropout_bwd, dropout_fwd
 from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.filter import filter_bwd, filter_fwd, pixel_sizes

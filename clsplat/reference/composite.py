@@ -145,7 +145,7 @@ def composite_bwd(
         for hit in hits(splats, bins, transmittance):
             g, dx, dy, v_pixels = hit.splat, hit.dx, hit.dy, v_image.rgb[hit.box]
             u = v_pixels @ splats.colors[g]
-            v_sigma, weight, behind[hit.box] = _v_sigma(hit.alpha, hit.before, u, behind[hit.box])
+            v_sigma, weight, behind[hit.box] = gradient_of_sigma(hit.alpha, hit.before, u, behind[hit.box])
             if isinstance(splats, RaySplats):
                 offsets, factors = hit.bend
                 parts = ray_exponents_bwd(splats.rays[g], offsets, factors, v_sigma)
@@ -161,7 +161,9 @@ def composite_bwd(
         for layer in layers(splats, bins, disparities, transmittance):
             many, dx, dy, v_pixels = layer.splats, layer.dx, layer.dy, v_image.rgb[layer.pixels]
             u = (v_pixels * splats.colors[many]).sum(axis=1)
-            v_sigma, weight, behind[layer.pixels] = _v_sigma(layer.alpha, layer.before, u, behind[layer.pixels])
+            v_sigma, weight, behind[layer.pixels] = gradient_of_sigma(
+                layer.alpha, layer.before, u, behind[layer.pixels]
+            )
             a, b, c = splats.conics[many].T
             np.subtract.at(v.means2d, many, (v_sigma * [a * dx + b * dy, b * dx + c * dy]).T)
             np.add.at(v.conics, many, (v_sigma * [0.5 * dx**2, dx * dy, 0.5 * dy**2]).T)
@@ -174,7 +176,7 @@ def composite_bwd(
     return v
 
 
-def _v_sigma(alpha: Array, before: Array, u: Array, behind: Array) -> tuple[Array, Array, Array]:
+def gradient_of_sigma(alpha: Array, before: Array, u: Array, behind: Array) -> tuple[Array, Array, Array]:
     """Gradient of sigma, the weight, and `behind` without the term of this splat.
 
     With u = colour . v_image, v_alpha = T u - behind/(1 - alpha). `behind` is the sum of u alpha T over the splats

@@ -14,6 +14,7 @@ METRICS = {
     "psnr_fitted": ("PSNR, colours fitted", "dB", 2, "higher"),
     "ssim": ("SSIM", "", 3, "higher"),
     "flip": ("FLIP", "", 3, "lower"),
+    "lpips": ("LPIPS", "", 3, "lower"),
 }
 """Name, unit, number of decimals and better direction of each metric."""
 
@@ -115,7 +116,9 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
     """
     views = result["views"]
     worst_first = sorted(range(len(views)), key=lambda k: _rank(views[k]))
-    tiles = "".join(_tile(metric, result["mean"], views) for metric in METRICS if result["mean"][metric] is not None)
+    tiles = "".join(
+        _tile(metric, result["mean"], views) for metric in METRICS if result["mean"].get(metric) is not None
+    )
     facts = " · ".join(map(html.escape, (*_model(result), result["resolution"], result["device"])))
     steps = ", ".join(f"rgb({r} {g} {b})" for r, g, b in palette(9))
     page = PAGE.format(
@@ -171,7 +174,7 @@ def _card(view: dict[str, Any], index: int) -> str:
     figures = "".join(
         f"<dt>{METRICS[metric][0]}</dt><dd>{_figure(metric, view[metric])}</dd>"
         for metric in METRICS
-        if metric.startswith("psnr") or view[metric] is not None
+        if metric.startswith("psnr") or view.get(metric) is not None
     )
     size = f"width={view['width']} height={view['height']} loading=lazy"
     files = {kind: quote(view[kind]) for kind in ("truth", "render", "difference")}

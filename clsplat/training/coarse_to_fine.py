@@ -6,6 +6,7 @@ import numpy as np
 from PIL import Image
 
 from clsplat.config import TrainConfig
+from clsplat.dataset.decoding import nearest
 from clsplat.scene import View
 
 
@@ -36,4 +37,6 @@ def shrunk(view: View, factor: int) -> View:
     mask = None if view.mask is None else boxes(np.where(view.mask, 255, 0).astype(np.uint8)) == 255
     clear = None if view.clear is None else boxes(view.clear)
     camera = view.camera.resized(width, height)
-    return replace(view, camera=camera, image=boxes(view.image), mask=mask, clear=clear)
+    # Means of depths on both sides of an edge would be depths of neither.
+    depth = view.depth and replace(view.depth, values=nearest(view.depth.values, height, width))
+    return replace(view, camera=camera, image=boxes(view.image), mask=mask, clear=clear, depth=depth)

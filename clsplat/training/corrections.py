@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, SupportsFloat
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.config import BACKGROUNDS, OptimConfig, TrainConfig
 from clsplat.randomness import stream
 from clsplat.renderer import Renderer
 from clsplat.scene import Color, View
@@ -16,14 +16,16 @@ from clsplat.training.state import State
 
 
 class Example(NamedTuple):
-    """A photo as an iteration trains on it: its pixels and mask on the device, the camera with its refined pose, and
-    the background that both photo and render have."""
+    """A photo as an iteration trains on it: its pixels and mask on the device, the camera with its refined pose, the
+    background that both photo and render have, and if it has a depth map, its inverse depths and their unit."""
 
     name: str
     camera: Camera
     photo: Any
     mask: Any
     background: Color
+    disparities: Any = None
+    unit: float = 0.0
 
 
 def example(
@@ -31,14 +33,15 @@ def example(
 ) -> Example:
     """Prepare a view for an iteration."""
     camera = photo_poses.refined(view.camera, state.poses.of(view.name)) if state.poses else view.camera
-    photo, mask = photos(view)
+    photo, mask, disparities = photos(view)
     background = BACKGROUNDS[config.data.background]
     if config.data.random_background:
         drawn = tuple(stream(config.seed, "backgrounds", iteration).random(3).tolist())
         if view.clear is not None:
             photo = renderer.upload("photo", view.on(drawn, background), np.uint8)
         background = drawn
-    return Example(view.name, camera, photo, mask, background)
+    unit = view.depth.unit if view.depth else 0.0
+    return Example(view.name, camera, photo, mask, background, disparities, unit)
 
 
 def compare(
@@ -62,15 +65,27 @@ def compare(
     v_image : Image
         Gradients with respect to the render.
     """
-    stages, rgb = renderer.stages, image.rgb
+    stages, rgb, by_depth = renderer.stages, image.rgb, 0.0
+    if seen.disparities is not None:
+        weight = depth_weight(progress, config.optim) / (seen.unit * seen.disparities.size)
+        by_depth, rgb = stages.disparity_loss(image.rgb, seen.disparities, weight)
+    plain = rgb
     if state.exposures:
         affine = state.exposures.of(seen.name)
-        rgb = stages.exposure_fwd(rgb, affine, seen.photo)
+        rgb = stages.exposure_fwd(plain, affine, seen.photo)
     loss, v_rgb = stages.l1_ssim(rgb, seen.photo, config.optim.ssim_weight, seen.mask)
     if state.exposures:
-        v_affine = stages.exposure_bwd(image.rgb, affine, seen.photo, v_rgb)
+        v_affine = stages.exposure_bwd(plain, affine, seen.photo, v_rgb)
         photo_exposures.update(state.exposures, seen.name, v_affine, progress, config.optim)
+    if seen.disparities is not None:
+        v_rgb = stages.disparity_grad(image.rgb, seen.disparities, weight, v_rgb)
+        loss = float(loss) + by_depth
     return loss, Image(v_rgb, renderer.no_alpha_gradient(seen.camera))
+
+
+def depth_weight(progress: float, config: OptimConfig) -> float:
+    """Weight of the relative difference from a depth map; it changes exponentially with progress, 0 to 1."""
+    return config.depth_weight * (config.depth_weight_final / config.depth_weight) ** progress
 
 
 def learn_pose(

@@ -32,11 +32,13 @@ NAMED = 3
 
 
 class Photo(NamedTuple):
-    """A photo of a run: digests of its pixels and of its mask (empty without one), and the numbers of its camera."""
+    """A photo of a run: digests of its pixels, of its mask and of its depth map (empty without one), and the numbers
+    of its camera."""
 
     pixels: str
     mask: str
     camera: list[float]
+    depth: str = ""
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,8 @@ class Inputs:
         """Inputs from their fields, as JSON gives them; any other value raises TypeError, ValueError or KeyError."""
         train, test = (
             {
-                name: Photo(str(pixels), str(mask), [float(x) for x in camera])
-                for name, (pixels, mask, camera) in saved.pop(part).items()
+                name: Photo(str(pixels), str(mask), [float(x) for x in camera], *map(str, depth))
+                for name, (pixels, mask, camera, *depth) in saved.pop(part).items()
             }
             for part in ("train", "test")
         )
@@ -114,6 +116,7 @@ class Inputs:
             "another choice of held-out photos": [name for name in both if (name in self.test) != (name in now.test)],
             "other pixels": [name for name in both if old[name].pixels != new[name].pixels],
             "other masks": [name for name in both if old[name].mask != new[name].mask],
+            "other depth maps": [name for name in both if old[name].depth != new[name].depth],
         }
         if self.train.keys() == now.train.keys():  # near planes follow the set of training photos
             differing["other cameras"] = [n for n in both if not _same_camera(old[n].camera, new[n].camera)]
@@ -142,7 +145,8 @@ def _photo(view: View, offset: NDArray[np.float64]) -> Photo:
     pixels = _digest(view.image) if view.clear is None else _digest(view.image, view.clear)
     mask = "" if view.mask is None else _digest(view.mask)
     pose = (*c.viewmat[:3, :3].flat, *c.viewmat[:3, 3], *offset)
-    return Photo(pixels, mask, [float(x) for x in (*numbers, *pose)])
+    depth = "" if view.depth is None else _digest(view.depth.values)
+    return Photo(pixels, mask, [float(x) for x in (*numbers, *pose)], depth)
 
 
 def _digest(*arrays: NDArray[Any]) -> str:

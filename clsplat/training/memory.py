@@ -44,6 +44,9 @@ PER_PIXEL = {
     "loss": 3 + 9 + 1,  # v_image, derivatives of SSIM, v_alpha
     "photo": 1,  # 3 bytes, and one of a mask
 }
+PER_DEPTH = 2  # per Gaussian: the fourth channel of colors and v_colors
+PER_INTERSECTION_DEPTH = 1
+PER_PIXEL_DEPTH = 1 + 3 + 4 + 1  # the image's fourth channel, its colours apart, v_image with depth, inverse depths
 PER_PIXEL_EXPOSURE = 3  # the image with the colours of its photo
 PER_PIXEL_CHARTS = 3  # directions of rays
 PER_ROW = 3 * 416  # derivatives of SSIM: rows have margins, and end with a work-item
@@ -77,6 +80,8 @@ class Footprint:
         Number of Gaussians of the renderer's backdrop, which are drawn and do not train.
     rays : int
         With ``--projection ray`` 1, or 2 if a photo is not of a pinhole; otherwise 0.
+    depth : bool
+        Whether photos have depth maps.
     """
 
     width: int
@@ -87,6 +92,7 @@ class Footprint:
     exposure: bool = False
     backdrop: int = 0
     rays: int = 0
+    depth: bool = False
 
     @classmethod
     def of(cls, scene: Scene, config: TrainConfig, device: "Device", backdrop: int = 0) -> "Footprint":
@@ -96,12 +102,14 @@ class Footprint:
         per_tile = config.render.sort == "per_tile"
         own_charts = any(camera.model != "pinhole" for camera in cameras)
         rays = (config.render.projection == "ray") * (1 + own_charts)
-        return cls(width, height, config.init.sh_degree, not device.is_cpu, per_tile, config.exposure, backdrop, rays)
+        depth = any(view.depth is not None for view in scene.train)
+        gpu, degree = not device.is_cpu, config.init.sh_degree
+        return cls(width, height, degree, gpu, per_tile, config.exposure, backdrop, rays, depth)
 
     def per_gaussian(self, intersections: float = INTERSECTIONS) -> float:
         """Bytes per Gaussian, if each meets `intersections` tiles."""
         values = COPIES * self._parameters + sum(PER_GAUSSIAN.values()) + intersections * self._per_intersection
-        values += (self.rays > 0) * PER_GAUSSIAN_RAYS + (self.rays > 1) * PER_GAUSSIAN_CHARTS
+        values += (self.rays > 0) * PER_GAUSSIAN_RAYS + (self.rays > 1) * PER_GAUSSIAN_CHARTS + self.depth * PER_DEPTH
         return REAL * ROUNDING * (values + (JOINED if self.backdrop else 0))
 
     @property
@@ -111,13 +119,14 @@ class Footprint:
     @property
     def _per_intersection(self) -> int:
         per_intersection = sum(PER_INTERSECTION.values()) + (self.rays > 0) * PER_INTERSECTION_RAYS
+        per_intersection += self.depth * PER_INTERSECTION_DEPTH
         return per_intersection + self.gpu * PER_INTERSECTION_GPU + self.per_tile * PER_INTERSECTION_PER_TILE
 
     @property
     def fixed(self) -> int:
         """Bytes that do not depend on the number of Gaussians."""
         per_pixel = sum(PER_PIXEL.values()) + self.exposure * PER_PIXEL_EXPOSURE
-        per_pixel += (self.rays > 1) * PER_PIXEL_CHARTS
+        per_pixel += (self.rays > 1) * PER_PIXEL_CHARTS + self.depth * PER_PIXEL_DEPTH
         return round(REAL * ROUNDING * self.height * (self.width * per_pixel + PER_ROW))
 
     def still(self, intersections: float = INTERSECTIONS) -> int:
@@ -161,11 +170,12 @@ class Footprint:
 
 
 class Photos:
-    """Photos and masks on the device, uploaded when they are first needed and kept within a budget of bytes."""
+    """Photos, masks and inverse depths on the device, uploaded when they are first needed and kept within a budget of
+    bytes."""
 
     def __init__(self, device: "Device"):
         self._device = device
-        self._kept: dict[str, tuple[Any, Any]] = {}
+        self._kept: dict[str, tuple[Any, Any, Any]] = {}
         self._bytes = 0
         self._budget = 0
 
@@ -176,13 +186,17 @@ class Photos:
             _, dropped = self._kept.popitem()
             self._bytes -= sum(array.nbytes for array in dropped if array is not None)
 
-    def __call__(self, view: View) -> tuple[Any, Any]:
+    def __call__(self, view: View) -> tuple[Any, Any, Any]:
         if view.name in self._kept:
             return self._kept[view.name]
         photo = self._device.upload("photo", view.image, np.uint8)
         mask = None if view.mask is None else self._device.upload("mask", view.mask, np.uint8)
-        size = photo.nbytes + (0 if mask is None else mask.nbytes)
+        depths = None
+        if view.depth and view.depth.unit:
+            depths = self._device.upload("inverse depths", view.depth.disparities)
+        found = photo, mask, depths
+        size = sum(array.nbytes for array in found if array is not None)
         if self._bytes + size <= self._budget:
-            self._kept[view.name] = photo, mask
+            self._kept[view.name] = found
             self._bytes += size
-        return photo, mask
+        return found

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clsplat.config import TrainConfig
-from clsplat.dataset import load_scene, with_points
+from clsplat.dataset import load_scene, with_depth_maps, with_points
 from clsplat.dataset.finding import mask_folder
 from clsplat.dataset.near_planes import with_near_planes
+from clsplat.errors import InputError
 from clsplat.ranges import check, parse_bytes
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
@@ -50,7 +51,7 @@ def prepare(
     scene : Scene, optional
         The dataset, if `load_scene` has read it already with `config.data`.
     resume : bool
-        The result continues a run: points, which only its start needed, are not triangulated again.
+        The result continues a run: points are not triangulated again, if only its start needed them.
     verbose : bool
         Show COLMAP's own messages.
     tell : callable
@@ -71,15 +72,23 @@ def prepare(
     if config.data.masks is not None:
         masks = str(mask_folder(Path(path), config.data.masks).resolve())
         config = replace(config, data=replace(config.data, masks=masks))
+    if config.data.depth is not None:
+        if config.blocks != 1:
+            raise InputError("--depth: expected not with --blocks, which train without depth maps; leave out one")
+        maps = str(mask_folder(Path(path), config.data.depth, "--depth").resolve())
+        config = replace(config, data=replace(config.data, depth=maps))
     if scene is None:
         scene = load_scene(path, config.data, verbose)
     scene = with_near_planes(scene)
     tell(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
-    few_photos = len(scene.train) < config.few.below  # their points limit the number of Gaussians
-    if config.init.triangulate and not len(scene.points) and (few_photos or not resume):
+    # The points of few photos limit the number of Gaussians, and depth maps are scaled to points.
+    always = len(scene.train) < config.few.below or config.data.depth is not None
+    if config.init.triangulate and not len(scene.points) and (always or not resume):
         scene = with_points(scene, path, config.data, verbose)
         found = f"{len(scene.points)} points, from photos and poses" if len(scene.points) else "random"
         tell(f"start: {found} (--init.no-triangulate: random)")
+    if config.data.depth is not None:
+        scene = with_depth_maps(scene, path, config.data, tell)
     config = with_iterations(config, scene)
     few = adapted(config, scene)
     if few != config:

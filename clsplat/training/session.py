@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable
 from copy import copy
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -160,7 +160,10 @@ def step(training: Training, view: View) -> float:
     seen = example(view, iteration, state, training.photos, config, renderer)
 
     gaussians = state.shown(renderer)
-    run = renderer.forward(gaussians, seen.camera, sh_degree, background=seen.background, dropout=dropout)
+    options: dict[str, Any] = {"background": seen.background, "dropout": dropout}
+    if seen.disparities is not None:
+        options["depth"] = "inverse"
+    run = renderer.forward(gaussians, seen.camera, sh_degree, **options)
     loss, v_image = compare(run.image, seen, progress, state, config, renderer)
     v_splats = renderer.backward_to_splats(run, v_image)
 

@@ -266,6 +266,15 @@ def settings():
     put("results", "three", "".join(json.dumps(row) + "\n" for row in rows).encode())
 
 
+def depths():
+    known = np.array([[0, 300, 65535], [1000, 2, 7]], np.uint16)
+    put("depth-png", "bit-16.png", picture(Image.fromarray(known)))
+    for kind in ("f2", "f4", "f8", "i4", "u2"):
+        file = io.BytesIO()
+        np.save(file, np.minimum(known, 9).astype(kind))
+        put("depth-npy", kind, file.getvalue())
+
+
 def main():
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -275,6 +284,7 @@ def main():
         recovered(folder)
         checkpoint(folder)
         settings()
+    depths()
 
 
 if __name__ == "__main__":

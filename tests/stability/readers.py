@@ -20,6 +20,7 @@ from clsplat.bench.results import read_records
 from clsplat.commands.info import dataset_lines, run_lines, scene_lines
 from clsplat.config import DataConfig, InitConfig, TrainConfig
 from clsplat.dataset import load_scene
+from clsplat.dataset.depth_maps import read_depth_map
 from clsplat.dataset.photos import (
     is_plain,
     is_transparent,
@@ -110,6 +111,16 @@ def read_a_mask(path):
     expect(mask.dtype == bool and mask.shape == size[::-1], f"a mask of {mask.dtype}, {mask.shape}")
 
 
+def read_a_depth_map(path):
+    if path.suffix == ".png":
+        size = photo_size(path)
+        if size[0] * size[1] > PIXELS_MAX:
+            return
+    depths = read_depth_map(path)
+    expect(depths.dtype == np.float32 and depths.ndim == 2, f"depths of {depths.dtype}, {depths.shape}")
+    expect(np.isfinite(depths).any() and not np.isinf(depths).any(), "no depth, or an infinite one")
+
+
 def read_dataset(path):
     # The two read different parts: a dataset that one of them refuses may reveal a flaw of the other.
     with suppress(InputError):
@@ -185,6 +196,8 @@ READERS = {
     "streamed-sog": ("scene", read_gaussians),
     "photo": ("photo.png", read_image),
     "mask": ("mask.png", read_a_mask),
+    "depth-png": ("depth.png", read_a_depth_map),
+    "depth-npy": ("depth.npy", read_a_depth_map),
     "colmap-bin": ("data", read_dataset),
     "colmap-txt": ("data", read_dataset),
     "transforms": ("data", read_dataset),
@@ -257,7 +270,7 @@ def attempt(folder, reader, content, measured=True):
                 expect(named, f"the message does not name the file: {error}")
                 result = "refused"
         _, peak = tracemalloc.get_traced_memory()  # 0 if it is not measured
-        most = PHOTO_MEMORY_MAX if reader in ("photo", "mask") else MEMORY_MAX
+        most = PHOTO_MEMORY_MAX if reader in ("photo", "mask", "depth-png") else MEMORY_MAX
         expect(peak < most, "memory out of proportion to the file")
         return result
     finally:

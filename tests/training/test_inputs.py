@@ -14,7 +14,7 @@ from small_run import CONFIG, SIZE, same
 
 from clsplat.device import Device
 from clsplat.errors import InputError
-from clsplat.scene import Scene, View
+from clsplat.scene import DepthMap, Scene, View
 from clsplat.training.checkpoint import load_state
 from clsplat.training.inputs import Inputs
 from clsplat.training.loop import train
@@ -60,6 +60,10 @@ DIFFERENCES: dict[str, tuple[Callable[[Scene], Scene], str]] = {
     ),
     "one bit": (lambda s: with_view(s, 2, one_pixel), r"other pixels \(\S+\)"),
     "transparency": (lambda s: with_view(s, 2, lambda v: replace(v, clear=CLEAR)), r"other pixels \(\S+\)"),
+    "depth map": (
+        lambda s: with_view(s, 2, lambda v: replace(v, depth=DepthMap(np.ones((SIZE[1], SIZE[0]), np.float32)))),
+        r"other depth maps \(\S+\)",
+    ),
     "mask": (lambda s: with_view(s, 2, lambda v: replace(v, mask=MASK)), r"other masks \(\S+\)"),
     "pose": (lambda s: with_view(s, 2, moved), r"other cameras \(\S+\)"),
     "lens": (

@@ -18,7 +18,7 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.ranges import parse_bytes
 from clsplat.render import render_views
-from clsplat.scene import Scene, View
+from clsplat.scene import DepthMap, Scene, View
 from clsplat.training.checkpoint import load_state
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.loop import complete, train
@@ -86,6 +86,19 @@ def test_what_is_predicted_is_allocated(
     photos = sum(view.image.nbytes for view in scene.train)
     predicted = Footprint.of(scene, config, device).total(n, met) + photos
     assert device.memory_peak <= predicted <= 1.2 * device.memory_peak
+
+
+def test_depth_maps_are_predicted(tmp_path: Path) -> None:
+    scene, device = make_scene(5000, 160, 120), Device()
+    depth = DepthMap(np.full((120, 160), 3, np.float32))
+    scene = replace(scene, train=[replace(view, depth=depth) for view in scene.train])
+    config = TrainConfig(strategy="adc", size="fixed", iterations=6, adc=FIXED_N, eval_every=0)
+    training = Training(scene, config, device, initial_state(scene, config))
+    complete(training, tmp_path)
+    photos = sum(view.image.nbytes + depth.disparities.nbytes for view in scene.train)
+    met = training.state.intersections
+    assert device.memory_peak <= training.need.total(5000, met) + photos <= 1.2 * device.memory_peak
+    assert replace(training.need, depth=False).total(5000, met) + photos < device.memory_peak
 
 
 def test_a_backdrop_is_predicted(tmp_path: Path) -> None:
