@@ -21,6 +21,18 @@ TV_EPS = 1e-9
 2022)."""
 
 
+DENSITY_SHIFT = 1.0
+"""Subtracted from a network's result before the softplus that makes a density of it (Barron et al. 2021, appendix)."""
+
+CHUNK_WIDTH = 16
+"""Widths of the layers of networks are multiples of it."""
+
+
+def encoded_width(levels: int) -> int:
+    """Width of an encoding with this number of frequencies: 3 + 6 levels + 1, up to a multiple of 16."""
+    return -(-(4 + 6 * levels) // CHUNK_WIDTH) * CHUNK_WIDTH
+
+
 class RayColors(NamedTuple):
     """Result of compositing samples along R rays.
 
@@ -41,6 +53,18 @@ class Marching(NamedTuple):
 
     step: float
     cone: float
+    near: float
+    far: float
+    contracted: bool
+
+
+class Span(NamedTuple):
+    """Where rays have intervals: lengths in the field's coordinates, as for `Marching`.
+
+    Without `contracted`, rays begin and end at the unit cube, and intervals are equal in their lengths; with it, from
+    `near` to `far`, and equal in their inverse distances.
+    """
+
     near: float
     far: float
     contracted: bool
@@ -121,6 +145,21 @@ class FieldStages(Protocol):
         v_sigmas: Array,
         v_colors: Array,
     ) -> Array: ...
+    def heads_soft_fwd(self, features: Array, outputs: Array, density_scale: float) -> tuple[Array, Array]: ...
+    def heads_soft_bwd(self, features: Array, density_scale: float, v_sigmas: Array, v_features: Array) -> None: ...
+    def encode_points(self, points: Array, levels: int) -> Array: ...
+    def encode_join(self, features: Array, rows: Array, rectify: bool) -> Array: ...
+    def encode_join_bwd(self, v_joined: Array, features: Array, rectify: bool) -> Array: ...
+    def intervals_along(
+        self, origins: Array, directions: Array, edges: Array, offsets: Array, span: Span
+    ) -> tuple[Array, Array]: ...
+    def intervals_resample(
+        self, edges: Array, weights: Array, draws: Array, padding: float, power: float, keep: bool
+    ) -> Array: ...
+    def weights_fwd(self, sigmas: Array, deltas: Array, count: int) -> Array: ...
+    def weights_bwd(
+        self, sigmas: Array, deltas: Array, count: int, weights: Array, v_weights: Array, v_sigmas: Array
+    ) -> None: ...
     def rays_fwd(self, sigmas: Array, colors: Array, deltas: Array, first: Array, background: Any) -> RayColors: ...
     def rays_bwd(
         self,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera, focus_point
-from clsplat.field_stages import Marching
+from clsplat.field_stages import Marching, Span
 from clsplat.scene import View
 
 BOX_SHARE = 0.375
@@ -23,6 +23,9 @@ with three times as many samples on a ray."""
 FAR = 100.0
 """Distance at which rays end where there is a background, in distances of the farthest camera from the centre. The
 contraction maps it to 1.99 of 2."""
+
+CUBE_FAR = 1e6
+"""Distance at which rays end without a background, in edges of the cube: where they leave it, if a camera is nearer."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,13 @@ class Space:
     def marching(self) -> Marching:
         """How rays are sampled."""
         if not self.contracted:
-            return Marching(STEP, 0.0, 0.0, 1e6, False)
+            return Marching(STEP, 0.0, 0.0, CUBE_FAR, False)
         return Marching(2 * STEP, CONE, self.near, FAR, True)  # the unit ball is two wide
+
+    @property
+    def span(self) -> Span:
+        """Where rays have intervals."""
+        return Span(self.near, FAR if self.contracted else CUBE_FAR, self.contracted)
 
     def rays(self, camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         """Origins and directions (R, 3) of the rays through points of an image, in px, in the field's coordinates.
