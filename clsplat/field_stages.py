@@ -22,7 +22,7 @@ TV_EPS = 1e-9
 
 
 DENSITY_SHIFT = 1.0
-"""Subtracted from a network's result before the softplus that makes a density of it (Barron et al. 2021, appendix)."""
+"""Subtracted from a network's result, of which the softplus is a density (Barron et al. 2021, appendix)."""
 
 CHUNK_WIDTH = 16
 """Widths of the layers of networks are multiples of it."""

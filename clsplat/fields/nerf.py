@@ -145,7 +145,7 @@ class NerfSmall(Nerf):
 
     name = "nerf-small"
     depth, width = 4, 64
-    rays = 1024
-    rate, rate_final = 4e-3, 4e-4
-    """Eight times those of the paper, for networks with a quarter of the width and few steps."""
-    iterations = 5000
+    rays = 256
+    rate, rate_final = 2e-3, 2e-4
+    """Four times those of the paper, for networks with a quarter of the width and few steps."""
+    iterations = 3000

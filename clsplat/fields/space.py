@@ -25,7 +25,7 @@ FAR = 100.0
 contraction maps it to 1.99 of 2."""
 
 CUBE_FAR = 1e6
-"""Distance at which rays end without a background, in edges of the cube: where they leave it, if a camera is nearer."""
+"""Distance at which rays end without a background, in edges of the cube, unless they leave it before."""
 
 
 @dataclass(frozen=True)
