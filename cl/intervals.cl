@@ -1,10 +1,9 @@
 // Stage intervals: samples in intervals of rays, and new intervals where samples had weight.
 //
-//   A ray is divided at edges s in [0, 1].
-//   CONTRACTED=0: t = t_near (1 - s) + t_far s, from where the ray enters the unit cube to where it leaves it;
-//                 points 2 x - 1 of x = o + t d
-//   CONTRACTED=1: 1/t = (1 - s)/near + s/far (Barron et al. 2022, section 3); points x/2 of x = o + t d, and of
-//                 (2 - 1/|x|) x/|x| where |x| > 1 (Barron et al. 2022, equation 10)
+//   A ray is divided at edges s, at the distances t (spans.h).
+//   CONTRACTED=0: points 2 x - 1 of x = o + t d
+//   CONTRACTED=1: points x/2 of x = o + t d, and of (2 - 1/|x|) x/|x| where |x| > 1
+//                                                                            (Barron et al. 2022, equation 10)
 //   intervals_along: one sample in each interval, at t_i + offset (t_{i+1} - t_i), which stands for t_{i+1} - t_i
 //   intervals_resample: the distribution of s is (w_i + padding)^power in interval i; the draws are
 //                 s = CDF^{-1}((j + draw_j) / M) (Mildenhall et al. 2020, section 5.2)
@@ -16,19 +15,7 @@
 //   offsets[R,N] in [0, 1); out points[R N,3], deltas[R N]. Resampling: in weights[R N], draws[R,M] in [0, 1); out
 //   result[R,M], or with `keep` the draws and the edges, result[R,N+1+M], ascending.
 // -DCONTRACTED=0|1   as above
-#include "common.h"
-
-#if !defined(CONTRACTED) || CONTRACTED & ~1
-#error "-DCONTRACTED must be 0 or 1"
-#endif
-
-static inline real distance_at(real s, real near, real far) {
-#if CONTRACTED
-    return 1 / ((1 - s) / near + s / far);
-#else
-    return near * (1 - s) + far * s;
-#endif
-}
+#include "spans.h"
 
 static inline real3 point_at(real3 origin, real3 direction, real t) {
     const real3 x = origin + t * direction;
@@ -40,28 +27,18 @@ static inline real3 point_at(real3 origin, real3 direction, real t) {
 #endif
 }
 
-__kernel void intervals_along(const uint rays, const uint count, real near, real far, const __global real *origins,
-                              const __global real *directions, const __global real *edges,
-                              const __global real *offsets, __global real *points, __global real *deltas) {
+__kernel void intervals_along(const uint rays, const uint count, const real near, const real far,
+                              const __global real *origins, const __global real *directions,
+                              const __global real *edges, const __global real *offsets, __global real *points,
+                              __global real *deltas) {
     const size_t r = get_global_id(0);
     if (r >= rays)
         return;
     const real3 origin = load3(origins, r), direction = load3(directions, r);
-#if !CONTRACTED
-    for (int axis = 0; axis < 3; ++axis) {
-        const real o = ((const real *)&origin)[axis], d = ((const real *)&direction)[axis];
-        if (d != 0) {
-            const real a = -o / d, b = (1 - o) / d;
-            near = GREATER(near, LESSER(a, b));
-            far = LESSER(far, GREATER(a, b));
-        } else if (o < 0 || o > 1)
-            far = near;
-    }
-    far = GREATER(far, near); // a ray beside the cube has intervals without length
-#endif
-    real begin = distance_at(edges[r * (count + 1)], near, far);
+    const real2 ends = ends_of(origin, direction, near, far);
+    real begin = distance_at(edges[r * (count + 1)], ends);
     for (uint i = 0; i < count; ++i) {
-        const real end = distance_at(edges[r * (count + 1) + i + 1], near, far);
+        const real end = distance_at(edges[r * (count + 1) + i + 1], ends);
         const size_t s = r * count + i;
         deltas[s] = end - begin;
         store3(points, s, point_at(origin, direction, begin + offsets[s] * (end - begin)));

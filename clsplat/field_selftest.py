@@ -162,3 +162,24 @@ def test_weights(b: Any) -> Found:
     b.stages.weights_bwd(*up(b, *given), count, *up(b, b.rounded(weights), v), found)
     reference.weights_bwd(*given, count, weights, v, expected)
     yield found, expected
+
+
+def test_frustums(b: Any) -> Found:
+    edges, along, radii = intervals(b)[0], directions(b), b.rounded(b.rng.uniform(0.01, 0.02, RAYS))
+    for rays, span in (
+        (b.rounded(0.5 - 2 * along), Span(0.0, 1e6, False)),
+        (b.rounded(0.2 * along), Span(0.1, 20.0, True)),
+    ):
+        # At four frequencies, rounding is far below the error that counts.
+        found = b.stages.frustums_encode(*up(b, rays, along, radii, edges), span, 4)
+        yield from zip(found, reference.frustums_encode(rays, along, radii, edges, span, 4), strict=True)
+
+
+def test_histograms(b: Any) -> Found:
+    edges, outer = intervals(b)[0], intervals(b)[0]
+    weights, bounds = (b.rounded(b.rng.uniform(size=RAYS * (edges.shape[1] - 1))) for _ in range(2))
+    given = edges, weights, outer, b.rounded(0.3 * bounds)
+    found = b.stages.histograms_interlevel(*up(b, *given), 0.5)
+    yield from zip(found, reference.histograms_interlevel(*given, 0.5), strict=True)
+    found = b.stages.histograms_distortion(*up(b, *given[:2]), 0.5)
+    yield from zip(found, reference.histograms_distortion(*given[:2], 0.5), strict=True)

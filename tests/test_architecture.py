@@ -226,6 +226,8 @@ DEFINES = {
     "voxels": {"FEATURES": 28, "TV_EPS": 1e-9},
     "heads": {"EXPONENT_MAX": 15.0, "DENSITY_SHIFT": 1.0},
     "intervals": {"CONTRACTED": 1},
+    "frustums": {"CONTRACTED": 1},
+    "histograms": {"INTERLEVEL_EPS": 1e-7},
     "march": {"CONTRACTED": 1},
     "loss": {
         **{"SSIM_C1": 1e-4, "SSIM_C2": 1e-3, "SSIM_TAPS": "0.25,0.5,0.25", "RADIUS": 1},
@@ -272,6 +274,7 @@ FORBIDDEN = [
     ("median", "CHANNELS", 0),
     ("median", "RAYS", 3),
     ("intervals", "CONTRACTED", 2),
+    ("frustums", "CONTRACTED", 2),
     ("march", "CONTRACTED", 2),
     ("voxels", "FEATURES", 0),
     ("mlp_cpu", "WIDEST", 2064),

@@ -61,6 +61,9 @@ DOUBLE = {
     "joined": _REORDERED,
     "variation": _CANCELS,
     "encoded": Tolerance(1e-10, 1e-11, "float64 on both sides: nine doublings of an angle double its error"),
+    "integrated encoding": Tolerance(1e-9, 1e-11, "float64: eleven doublings of an angle, exponents of up to 60"),
+    "losses of rays": _CANCELS,
+    "v_weights of rays": _CANCELS,
     "points": _REORDERED,
     "lengths": _CANCELS,
     "edges": _CANCELS,
@@ -114,6 +117,9 @@ FLOAT = {
     "encoded": Tolerance(
         1e-5, 1e-3, "float32: nine doublings of an angle double its error, which is some 1e-7 at first"
     ),
+    "integrated encoding": Tolerance(1e-5, 2e-3, "float32: eleven doublings of an angle, some 1e-7 at first"),
+    "losses of rays": Tolerance(1e-4, 1e-5, "float32: a weight less its bound cancels"),
+    "v_weights of rays": Tolerance(1e-4, 1e-5, "float32: as for losses of rays"),
     "points": Tolerance(1e-5, 1e-6, "float32: an inverse of a sum of inverses, and a contraction"),
     "lengths": Tolerance(1e-4, 1e-5, "float32: differences of distances of up to ten times the largest length"),
     "edges": Tolerance(1e-4, 1e-5, "float32: a share of the sum of all weights is divided by that of an interval"),

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from clsplat.field_stages import HashLevels, Samples
-from clsplat.fields.field import Array, Field
+from clsplat.fields.field import Array, Field, Rays
 from clsplat.fields.networks import Parameters, first_weights, moments, restore_parameters
 from clsplat.fields.occupancy import CELLS, EVERY, THRESHOLD, Occupancy
 from clsplat.fields.pixels import Batch
@@ -154,10 +154,11 @@ class IngpBase(Field):
             depths[part] = sigmas.get() * self.space.marching.step
         return depths
 
-    def colors(self, origins: Any, directions: Any, offsets: Any, background: Color) -> Any:
+    def colors(self, rays: Rays, background: Color) -> Any:
         """See `Field`."""
-        samples = self.stages.march(origins, directions, offsets, self._occupied, self.space.marching)
-        run = self._evaluate(samples, directions)
+        offsets = self.device.upload("offsets", np.full(len(rays.radii), 0.5))
+        samples = self.stages.march(*rays[:2], offsets, self._occupied, self.space.marching)
+        run = self._evaluate(samples, rays.directions)
         return self.stages.rays_fwd(run.sigmas, run.colors, samples.deltas, samples.first, background).rgb
 
     def model(self) -> dict[str, Array]:

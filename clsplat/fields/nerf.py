@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from clsplat.field_stages import RayColors, encoded_width
-from clsplat.fields.field import Array, Field
+from clsplat.fields.field import Array, Field, Rays
 from clsplat.fields.networks import (
     VIEW_LEVELS,
     Asked,
@@ -23,18 +23,11 @@ from clsplat.stages import AdamStep
 if TYPE_CHECKING:
     from clsplat.device import Device
 
-COARSE, FINE = 64, 128
-"""Samples of the coarse network, and draws of the fine one, which is asked at both (Mildenhall et al. 2020, section
-5.3)."""
-
 POINT_LEVELS = 10
 """Frequencies of points (Mildenhall et al. 2020, section 5.1)."""
 
 PADDING = 1e-5
 """Added to the weights of intervals before new samples are drawn (code of Mildenhall et al. 2020)."""
-
-DENSITY_SCALE = 3.0
-"""Factor on the densities: the unit cube has an edge of 3 in the units of the paper's synthetic scenes."""
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-7
 """Constants of Adam (Mildenhall et al. 2020, section 5.3; the epsilon is that of its library)."""
@@ -55,6 +48,9 @@ class Nerf(Field):
     name = "nerf"
     depth, width = 8, 256
     """Layers, and their width, of both networks."""
+    coarse, fine = 64, 128
+    """Samples of the coarse network, and draws of the fine one, which is asked at both (Mildenhall et al. 2020,
+    section 5.3)."""
     rays = 512
     """Of a step. The paper has 4096."""
     rate, rate_final = 5e-4, 5e-5
@@ -77,15 +73,15 @@ class Nerf(Field):
         self.iteration += 1
         rng = stream(self.seed, "offsets of samples", self.iteration)
         upload, stages = self.device.upload, self.stages
-        rays = upload("origins", batch.origins), upload("directions", batch.directions)
-        passes = self._look(*rays, lambda *shape: rng.uniform(size=shape), batch.background)
+        rays = Rays(*(upload("rays", array) for array in (batch.origins, batch.directions, batch.radii)))
+        passes = self._look(rays, lambda *shape: rng.uniform(size=shape), batch.background)
         gradients, errors = {}, np.zeros(0)
         for name, seen in passes.items():
             errors = seen.image.rgb.get() - batch.colors
             v_rgb = upload("v_rgb", errors * (2 / errors.size))
             composited = seen.asked.sigmas, seen.asked.colors, seen.deltas, seen.first, batch.background
             v = stages.rays_bwd(*composited, seen.image.transmittances, v_rgb)
-            found = self.network.gradients(stages, self._weights(name), seen.asked, DENSITY_SCALE, *v)
+            found = self.network.gradients(stages, self._weights(name), seen.asked, self.space.density_scale, *v)
             gradients |= {f"{name}.{part}": gradient for part, gradient in found.items()}
         rate = self.rate * (self.rate_final / self.rate) ** progress
         descend(stages, self.parameters, gradients, rate, AdamStep(self.iteration, {}, BETA1, BETA2, EPS, 0))
@@ -94,18 +90,19 @@ class Nerf(Field):
     def _weights(self, name: str) -> dict[str, Any]:
         return {part: self.parameters[f"{name}.{part}"].values for part in self.network.widths}
 
-    def _look(self, origins: Any, directions: Any, draw: Any, background: Color) -> dict[str, Seen]:
+    def _look(self, rays: Rays, draw: Any, background: Color) -> dict[str, Seen]:
         """Both passes along rays. `draw(*shape)` has places of samples in their intervals, in [0, 1)."""
-        upload, stages, count = self.device.upload, self.stages, len(origins)
-        edges = upload("edges", np.tile(np.linspace(0, 1, COARSE + 1), (count, 1)))
-        views = stages.encode_points(directions, VIEW_LEVELS)
-        coarse = self._pass("coarse", (origins, directions, views), edges, draw(count, COARSE), background)
-        weights = stages.weights_fwd(coarse.asked.sigmas, coarse.deltas, COARSE)
-        edges = stages.intervals_resample(edges, weights, upload("draws", draw(count, FINE)), PADDING, 1.0, True)
-        offsets = draw(count, COARSE + FINE)
+        upload, stages, count = self.device.upload, self.stages, len(rays.radii)
+        edges = upload("edges", np.tile(np.linspace(0, 1, self.coarse + 1), (count, 1)))
+        views = stages.encode_points(rays.directions, VIEW_LEVELS)
+        along = rays.origins, rays.directions, views
+        coarse = self._pass("coarse", along, edges, draw(count, self.coarse), background)
+        weights = stages.weights_fwd(coarse.asked.sigmas, coarse.deltas, self.coarse)
+        edges = stages.intervals_resample(edges, weights, upload("draws", draw(count, self.fine)), PADDING, 1.0, True)
+        offsets = draw(count, self.coarse + self.fine)
         return {
             "coarse": coarse,
-            "fine": self._pass("fine", (origins, directions, views), edges, offsets, background),
+            "fine": self._pass("fine", along, edges, offsets, background),
         }
 
     def _pass(self, name: str, rays: tuple[Any, Any, Any], edges: Any, offsets: Array, background: Color) -> Seen:
@@ -115,14 +112,14 @@ class Nerf(Field):
         places = self.device.upload("offsets", offsets)
         points, deltas = stages.intervals_along(origins, directions, edges, places, self.space.span)
         encoded = stages.encode_points(points, POINT_LEVELS)
-        asked = self.network.ask(stages, self._weights(name), encoded, views, DENSITY_SCALE)
+        asked = self.network.ask(stages, self._weights(name), encoded, views, self.space.density_scale)
         first = self.device.upload("first samples", np.arange(0, count * per + 1, per), np.uint32)
         image = stages.rays_fwd(asked.sigmas, asked.colors, deltas, first, background)
         return Seen(asked, deltas, first, image)
 
-    def colors(self, origins: Any, directions: Any, offsets: Any, background: Color) -> Any:
+    def colors(self, rays: Rays, background: Color) -> Any:
         """See `Field`."""
-        return self._look(origins, directions, lambda *shape: np.full(shape, 0.5), background)["fine"].image.rgb
+        return self._look(rays, lambda *shape: np.full(shape, 0.5), background)["fine"].image.rgb
 
     def model(self) -> dict[str, Array]:
         """See `Field`."""

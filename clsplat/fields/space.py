@@ -24,6 +24,9 @@ FAR = 100.0
 """Distance at which rays end where there is a background, in distances of the farthest camera from the centre. The
 contraction maps it to 1.99 of 2."""
 
+CUBE_EDGE = 3.0
+"""Edge of the cube in the units of NeRF's synthetic scenes (Mildenhall et al. 2020)."""
+
 CUBE_FAR = 1e6
 """Distance at which rays end without a background, in edges of the cube, unless they leave it before."""
 
@@ -66,6 +69,11 @@ class Space:
         return Marching(2 * STEP, CONE, self.near, FAR, True)  # the unit ball is two wide
 
     @property
+    def density_scale(self) -> float:
+        """Factor on the densities of networks: the length of a unit in the units of the papers."""
+        return 1.0 if self.contracted else CUBE_EDGE
+
+    @property
     def span(self) -> Span:
         """Where rays have intervals."""
         return Span(self.near, FAR if self.contracted else CUBE_FAR, self.contracted)
@@ -79,3 +87,13 @@ class Space:
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)  # poses may be printed with few digits
         origin = (camera.position - self.centre) / self.scale + (0.0 if self.contracted else 0.5)
         return np.broadcast_to(origin, directions.shape), directions
+
+    @staticmethod
+    def radii(camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Radii (R,) of the cones of pixels at a distance of 1, for points of an image as for `rays`.
+
+        A disc with this radius has the variance of a pixel (Barron et al. 2021, section 3.1). It is 0 where a fisheye
+        sees nothing.
+        """
+        widths = np.linalg.norm(camera.rays(u + 1, v) - camera.rays(u, v), axis=1)
+        return np.nan_to_num(widths) * 2 / 12**0.5

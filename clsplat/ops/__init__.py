@@ -16,6 +16,7 @@ from clsplat.ops.encode import encode_join, encode_join_bwd, encode_points
 from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.ops.finite import count_not_finite
+from clsplat.ops.frustums import frustums_encode
 from clsplat.ops.hashgrid import hashgrid_bwd, hashgrid_fwd
 from clsplat.ops.heads import (
     heads_bwd,
@@ -27,6 +28,7 @@ from clsplat.ops.heads import (
     heads_soft_bwd,
     heads_soft_fwd,
 )
+from clsplat.ops.histograms import histograms_distortion, histograms_interlevel
 from clsplat.ops.intervals import intervals_along, intervals_resample
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.march import march
@@ -99,3 +101,6 @@ class Launches:
         self.intervals_resample = partial(intervals_resample, device)
         self.weights_fwd = partial(weights_fwd, device)
         self.weights_bwd = partial(weights_bwd, device)
+        self.frustums_encode = partial(frustums_encode, device)
+        self.histograms_interlevel = partial(histograms_interlevel, device)
+        self.histograms_distortion = partial(histograms_distortion, device)

@@ -13,6 +13,7 @@ from clsplat.reference.encode import encode_join, encode_join_bwd, encode_points
 from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.reference.finite import count_not_finite
+from clsplat.reference.frustums import frustums_encode
 from clsplat.reference.hashgrid import hashgrid_bwd, hashgrid_fwd
 from clsplat.reference.heads import (
     heads_bwd,
@@ -24,6 +25,7 @@ from clsplat.reference.heads import (
     heads_soft_bwd,
     heads_soft_fwd,
 )
+from clsplat.reference.histograms import histograms_distortion, histograms_interlevel
 from clsplat.reference.intervals import intervals_along, intervals_resample
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.march import march
