@@ -36,9 +36,9 @@ ANNEAL_SLOPE = 10.0
 """Slope of the power of the weights at the start, which rises from 0 to 1 (Barron et al. 2022, equation 18)."""
 
 DISTORTION = 0.001
-"""Weight of the distortion loss. The paper has 0.01 (Barron et al. 2022, section 4), beside a loss of the colours that
-is linear in large errors. That loss lets a field of an object become empty, because most rays see the background, so
-the one of all other methods is taken here, the squared error, which has smaller gradients."""
+"""Weight of the distortion loss. The paper has 0.01 (Barron et al. 2022, section 4), beside a loss of the colours
+that is linear in large errors. With that one the field of an object became empty, because most rays see the
+background. Squared errors, as for all other methods, have smaller gradients."""
 
 WARM_UP = 100
 """Steps in which the learning rate rises to its value. The paper has 512 of 250 000."""

@@ -1,5 +1,7 @@
 """The network of NeRF: gradients of its weights by central differences, its widths, and its parts in float64."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ RAYS, PER, SCALE = 3, 4, 3.0
 def given(network):
     """Weights of the parts, encoded points and directions, and gradients of the densities and the colours."""
     rng = np.random.default_rng(0)
-    sizes = {name: sum(a * b for a, b in zip(w, w[1:], strict=False)) for name, w in network.widths.items()}
+    sizes = {name: sum(a * b for a, b in pairwise(w)) for name, w in network.widths.items()}
     weights = {name: rng.normal(size=size) / 4 for name, size in sizes.items()}
     points, directions = rng.uniform(-1, 1, (RAYS * PER, 3)), rng.normal(size=(RAYS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
