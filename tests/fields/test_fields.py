@@ -110,7 +110,7 @@ def test_damaged_files_are_refused(device, tmp_path):
     with pytest.raises(InputError, match="damaged"):
         load_field(path, METHODS, device)
     np.savez(path, about=json.dumps({"method": "nerd"}))
-    with pytest.raises(InputError, match="expected a field of plenoxels, ingp-base"):
+    with pytest.raises(InputError, match="expected a field of nerf, nerf-small, plenoxels"):
         load_field(path, METHODS, device)
 
 
