@@ -142,7 +142,10 @@ class NerfSmall(Nerf):
 
     name = "nerf-small"
     depth, width = 4, 64
+    coarse, fine = 32, 64
+    """Half of the paper's, for images of 100 x 100 pixels."""
     rays = 256
-    rate, rate_final = 2e-3, 2e-4
-    """Four times those of the paper, for networks with a quarter of the width and few steps."""
-    iterations = 3000
+    rate, rate_final = 8e-3, 4e-4
+    """Sixteen times the paper's at the start, for networks with a quarter of the width and few steps: after 120 steps
+    the squared error is two thirds of that with four times the paper's."""
+    iterations = 3500
