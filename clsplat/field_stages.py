@@ -37,7 +37,7 @@ def encoded_width(levels: int) -> int:
 def _icosahedron_axes() -> tuple[tuple[float, float, float], ...]:
     """Directions of the vertices of an icosahedron and of the middles of its edges, one of each opposite pair."""
     golden, found = (1 + 5**0.5) / 2, []
-    corners = [(0.0, a, b * golden) for a, b in product((-1, 1), repeat=2)]
+    corners: list[tuple[float, ...]] = [(0.0, a, b * golden) for a, b in product((-1, 1), repeat=2)]
     corners = [c[k:] + c[:k] for c in corners for k in range(3)]
     # Corners of one edge are 2 apart; the middle of two equal corners is the corner.
     for a, b in combinations_with_replacement(corners, 2):

@@ -75,7 +75,8 @@ class Nerf(Field):
         upload, stages = self.device.upload, self.stages
         rays = Rays(*(upload("rays", array) for array in (batch.origins, batch.directions, batch.radii)))
         passes = self._look(rays, lambda *shape: rng.uniform(size=shape), batch.background)
-        gradients, errors = {}, np.zeros(0)
+        gradients: dict[str, Any] = {}
+        errors = np.zeros(0)
         for name, seen in passes.items():
             errors = seen.image.rgb.get() - batch.colors
             v_rgb = upload("v_rgb", errors * (2 / errors.size))
