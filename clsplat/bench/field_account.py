@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from pyopencl.array import Array
 
 from clsplat.bench.environment import describe
 from clsplat.bench.kernel_report import Results, milliseconds, origin, table
@@ -56,7 +55,7 @@ class Work:
 
 
 def _arrays(value: Any) -> Iterator[Any]:
-    if isinstance(value, Array):
+    if hasattr(value, "nbytes"):
         yield value
     elif isinstance(value, tuple):
         for part in value:
@@ -167,11 +166,8 @@ def _share(rate: float, roof: float) -> str:
 
 
 def fields_text(results: Results) -> str:
-    """Two tables: what a pixel costs in an image and a ray in a step, and the stages of a step by method.
-
-    Where the device is the host's CPU, rates are those by processor time on all of its cores.
-    """
-    roof, cores = results["roof"], results["device"]["compute_units"]
+    """Two tables: what a pixel costs in an image and a ray in a step, and the stages of a step by method."""
+    roof = results["roof"]
     head = (
         "method",
         "for each",
@@ -187,8 +183,7 @@ def fields_text(results: Results) -> str:
     for found in results["methods"]:
         for name, what in (("image", "pixel of an image"), ("step", "ray of a step")):
             own = found[name]
-            seconds = own["cpu_seconds"] / cores if results["device"]["kind"] == "cpu" else own["seconds"]
-            rates = 1e-9 * own["operations"] / seconds, 1e-9 * own["bytes"] / seconds
+            rates = 1e-9 * own["operations"] / own["seconds"], 1e-9 * own["bytes"] / own["seconds"]
             texts = [_share(*pair) for pair in zip(rates, (roof["fma_gflops"], roof["copy_gbs"]), strict=True)]
             numbers = f"{own['evaluations']:.4g}", f"{1e-6 * own['operations']:.3g}", f"{1e-3 * own['bytes']:.3g}"
             times = (milliseconds(1e6 * own[key]) for key in ("seconds", "cpu_seconds"))

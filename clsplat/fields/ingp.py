@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.field_stages import HashLevels, Samples
 from clsplat.fields.field import Array, Field, Rays
-from clsplat.fields.networks import Parameters, first_weights, moments, restore_parameters
+from clsplat.fields.layers import Parameters, first_weights, moments, restore_parameters
 from clsplat.fields.occupancy import CELLS, EVERY, THRESHOLD, Occupancy
 from clsplat.fields.pixels import Batch
 from clsplat.fields.space import Space

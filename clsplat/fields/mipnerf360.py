@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.field_stages import CHUNK_WIDTH, frustum_width
 from clsplat.fields.field import Array, Field, Rays
-from clsplat.fields.networks import (
+from clsplat.fields.layers import (
     VIEW_LEVELS,
     Asked,
     Parameters,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat import reference
-from clsplat.fields.networks import VIEW_LEVELS, ViewNetwork
+from clsplat.fields.layers import VIEW_LEVELS, ViewNetwork
 from clsplat.ops import Launches
 from clsplat.testing import gradcheck
 
