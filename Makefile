@@ -28,11 +28,11 @@ CASES = 4000
 fuzz-cases:
 	CLSPLAT_FUZZ=$(CASES) $(PYTHON) -m pytest --hypothesis-profile=fuzz $(shell ls tests/stability/test_fuzz_*.py)
 
-# Fail each call of the system and of the device in turn, in every command of tests/training/measure_faults.py:
+# Fail each call of the system and of the device in turn, in every command of tests/training/fault_commands.py:
 # build/faults/faults.json. EVERY=10 takes each tenth call.
 EVERY = 1
 faults:
-	PYTHONPATH=tests/training:tests/commands:$(PYTHONPATH) $(PYTHON) tests/training/measure_faults.py --every $(EVERY) \
+	PYTHONPATH=tests/training:tests/commands:tests/dataset:$(PYTHONPATH) $(PYTHON) tests/training/measure_faults.py --every $(EVERY) \
 	  -o build/faults
 
 # Change the mathematics in COUNT places, one at a time, and list which changes the tests see: build/mutants.jsonl. It
@@ -81,8 +81,10 @@ check-builds:
 	$(PYTHON) tests/offline/compile_kernels.py --clang $(CLANG) --library $(CLC) -o build/kernels.json
 
 # Measure the figures of docs/benchmarks.md: some minutes, on a machine without other work.
+WORKLOADS = 10k-640x480 100k-640x480 1M-640x480 100k-1280x720 1M-1920x1080
 bench:
-	$(PYTHON) -m clsplat bench kernels -o docs/results/kernels.json --scaling docs/results/kernels.svg
+	$(PYTHON) -m clsplat bench kernels --workloads $(WORKLOADS) -o docs/results/kernels.json \
+	  --scaling docs/results/kernels.svg
 
 # Measure the charts of docs/benchmarks.md: make bench-quality DATA=folder of real scenes. This takes an hour and a half
 # on two cores. Finished trainings are not repeated (make bench-quality METHODS=paper-30k adds four hours).

@@ -74,7 +74,9 @@ __kernel void exposure_bwd(const uint pixels, const uint items, const uint first
     if (item >= items)
         return;
     real3 by_x = 0, by_y = 0, by_z = 0, by_1 = 0; // columns of the gradient of (A, b)
+#if RESPONSE
     real3 by_curve = 0, by_falloff = 0;
+#endif
     size_t i = item * first;
     for (uint k = 0; k < count && i < pixels; ++k, i += step) {
         const real3 x = load3(image, i), y = mapped(affine, x) + BENT(i, x);

@@ -135,7 +135,7 @@ def plan_refinement(jobs: list[Path], blocks: list[Block]) -> list[Path]:
 
 def _save(gaussians: Gaussians, folder: Path, config: TrainConfig) -> str:
     """Write a scene to a file that is named by its digest; return the name."""
-    with TemporaryDirectory(dir=folder) as beside:
+    with TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as beside:
         file = Path(beside) / "scene.ply"
         save_gaussians(file, gaussians, config.render.mode)
         name = f"{digest_of(file.read_bytes())}.ply"

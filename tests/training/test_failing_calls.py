@@ -25,7 +25,8 @@ from clsplat.training.run_folder import held
 if sys.platform == "win32":
     pytest.skip("needs fcntl", allow_module_level=True)
 
-from measure_faults import COMMANDS, Command, prepared
+from fault_commands import COMMANDS
+from measure_faults import Command, prepared
 
 PER_KIND = {"train": 2}
 """Points of each kind of call that the default run tries; 1 for the other commands."""

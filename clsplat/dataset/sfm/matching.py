@@ -151,7 +151,8 @@ def match(database: Path, pairs: list[tuple[int, int]], verbose: bool = False) -
         return
     pycolmap.Database.open(database).close()  # merges the write-ahead log into the file, which is copied below
     count = min(os.cpu_count() or 1, WORKERS_MAX, -(-len(pairs) // PAIRS_MIN))
-    with TemporaryDirectory(prefix="matches_", dir=database.parent) as folder, ExitStack() as running:
+    parts = TemporaryDirectory(prefix="matches_", dir=database.parent, ignore_cleanup_errors=True)
+    with parts as folder, ExitStack() as running:
         copies = [Path(folder) / f"{k}.db" for k in range(count)]
         for copy, share in zip(copies, np.array_split(np.array(pairs), count), strict=True):
             shutil.copyfile(database, copy)

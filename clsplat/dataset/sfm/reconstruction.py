@@ -18,6 +18,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from clsplat.atomic import replacing
 from clsplat.config import SfmConfig
 
 # This also imports Pillow before pycolmap. Loaded after pycolmap 4.2.1, Pillow uses parts of the zlib inside pycolmap
@@ -160,7 +161,8 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
         found.write_binary(work / "sparse" / "0")
         where = "." if output.resolve() == photos.resolve() else str(photos.resolve())
         record = {"photos": where, "registered": registered, "options": asdict(config), "hashes": hashes}
-        (work / "sparse" / RECORD).write_text(json.dumps(record, indent=1), encoding="utf-8")
+        with replacing(work / "sparse" / RECORD) as file:
+            file.write(json.dumps(record, indent=1).encode())
         if (output / "sparse").exists():
             os.replace(output / "sparse", work / "stale")
         os.replace(work / "sparse", output / "sparse")

@@ -81,7 +81,7 @@ def read_sparse(model: Path) -> SparseModel:
 
     colmap.read_model(model)  # COLMAP itself allocates and loops as often as a damaged file declares
     try:
-        with TemporaryDirectory() as folder:
+        with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             # Without rigs and frames: nothing else checks their counts, and nothing here needs them.
             for path in model.iterdir():
                 if path.stem in ("cameras", "images", "points3D"):
