@@ -163,6 +163,16 @@ typedef struct {
     reals mx, xx, xy;
 } Derivatives;
 
+// The rings hold the last WINDOW rows. On a CPU, the newest row takes the place of the oldest one. On a GPU, the rows
+// move instead, and the newest is the last one: indices that are not constants would keep a ring out of the registers.
+#if LANES == 1
+#define NEWEST       (WINDOW - 1)
+#define NEXT(newest) (newest)
+#else
+#define NEWEST       0
+#define NEXT(newest) ((newest + 1) % WINDOW)
+#endif
+
 // Returns 1 - SSIM.
 static inline reals differentiate(Moments m, Derivatives *d) {
     const reals a1 = 2 * m.mx * m.my + SSIM_C1, a2 = 2 * (m.xy - m.mx * m.my) + SSIM_C2;
@@ -190,14 +200,31 @@ __kernel void loss_ssim(const int width, const int height, const int band, const
     const size_t pitch = get_global_size(0) * VECTORS * LANES;
     const int vectors = min(VECTORS, (length + MARGIN - column + LANES - 1) / LANES);
     reals l1 = 0, dissimilarity = 0;
+    const Moments none = {0, 0, 0, 0};
     Moments ring[VECTORS][WINDOW];
     real x[FETCHED], y[FETCHED];
-    for (int row = begin - RADIUS, newest = 0; row < end + RADIUS; ++row, newest = (newest + 1) % WINDOW) {
+#if LANES == 1
+#pragma unroll
+    for (int k = 0; k < WINDOW; ++k)
+        ring[0][k] = none;
+#endif
+    for (int row = begin - RADIUS, newest = NEWEST; row < end + RADIUS; ++row, newest = NEXT(newest)) {
         const bool exists = row >= 0 && row < height;
+#if LANES == 1
+#pragma unroll
+        for (int i = 0; i < FETCHED; ++i) {
+            x[i] = y[i] = 0;
+            if (exists)
+                fetch(length, row, column + STEP * (i - TAP(RADIUS)), image, photo, masked, mask, x + i, y + i);
+        }
+#pragma unroll
+        for (int k = 0; k < WINDOW - 1; ++k)
+            ring[0][k] = ring[0][k + 1];
+#else
         for (int i = 0; exists && i < FETCHED - (VECTORS - vectors) * LANES; i += LANES)
             fetch(length, row, column - STEP * TAP(RADIUS) + STEP * i, image, photo, masked, mask, x + i, y + i);
+#endif
         for (int v = 0; v < vectors; ++v) {
-            const Moments none = {0, 0, 0, 0};
             ring[v][newest] = exists ? blur_row(x + v * LANES, y + v * LANES) : none;
             const int c = column + v * LANES, centre = TAP(RADIUS) + v * LANES;
             if (row >= begin && row < end) {
@@ -239,7 +266,17 @@ __kernel void loss_grad(const int width, const int height, const int band, const
     const int begin = get_global_id(1) * band, end = min(begin + band, height);
     const size_t pitch = get_global_size(0) * VECTORS * LANES;
     Derivatives ring[VECTORS][WINDOW];
-    for (int row = begin - RADIUS, newest = 0; row < end + RADIUS; ++row, newest = (newest + 1) % WINDOW) {
+#if LANES == 1
+#pragma unroll
+    for (int k = 0; k < WINDOW; ++k)
+        ring[0][k] = (Derivatives){0, 0, 0};
+#endif
+    for (int row = begin - RADIUS, newest = NEWEST; row < end + RADIUS; ++row, newest = NEXT(newest)) {
+#if LANES == 1
+#pragma unroll
+        for (int k = 0; k < WINDOW - 1; ++k)
+            ring[0][k] = ring[0][k + 1];
+#endif
         for (int v = 0; v < VECTORS; ++v) {
             const int c = column + v * LANES;
             if (c < 0 || c >= length)
