@@ -5,6 +5,8 @@
 //                                                                                  (Müller et al. 2022, section 5.4)
 // Plenoxels (Fridovich-Keil et al. 2022, section 3.1) has 28 features f of a sample, with the basis Y of degree 2:
 //   sigma = density_scale max(f_0, 0);  c_k = max(1/2 + sum_b Y_b(direction) f_{1+9k+b}, 0)
+// NeRF and Mip-NeRF 360 have, with softplus(x) = log(1 + exp(x)) (Barron et al. 2021, appendix):
+//   sigma = density_scale softplus(feature 0 - DENSITY_SHIFT);  c as above
 // See docs/stages/heads.md; clsplat/reference/heads.py is the twin.
 //
 // Mapping: one work-item per sample.
@@ -12,12 +14,17 @@
 // Buffers, R rays, S samples: in features[S,16], directions[R,3] of length 1, rays_of[S] u32, outputs[S,16]; out
 //   inputs[S,32], sigmas[S], colors[S,3]. Backward: in v_sigmas[S], v_colors[S,3], v_inputs[S,32]; out v_outputs[S,16],
 //   v_features[S,16]. Of Plenoxels: in features[S,28]; out v_features[S,28].
-// -DEXPONENT_MAX   largest exponent of a density
+//   With a softplus: in features[S,W], outputs[S,V]; in and out v_features[S,W], to which the gradient is added.
+// -DEXPONENT_MAX    largest exponent of a density
+// -DDENSITY_SHIFT   as above
 #include "common.h"
 #include "sh.h"
 
 #ifndef EXPONENT_MAX
 #error "-DEXPONENT_MAX, the largest exponent of a density, must be given"
+#endif
+#ifndef DENSITY_SHIFT
+#error "-DDENSITY_SHIFT, which is subtracted before the softplus of a density, must be given"
 #endif
 
 __kernel void heads_join(const uint samples, const __global real *features, const __global real *directions,
@@ -115,4 +122,24 @@ __kernel void heads_sh_bwd(const uint samples, const real density_scale, const _
         for (int b = 0; b < 9; ++b)
             v_own[1 + 9 * k + b] = v * basis[b];
     }
+}
+
+__kernel void heads_soft_fwd(const uint samples, const uint width, const uint outputs_width, const real density_scale,
+                             const __global real *features, const __global real *outputs, __global real *sigmas,
+                             __global real *colors) {
+    const size_t s = get_global_id(0);
+    if (s >= samples)
+        return;
+    const real x = features[s * width] - DENSITY_SHIFT;
+    sigmas[s] = density_scale * (GREATER(x, (real)0) + log1p(exp(-ABSOLUTE(x))));
+    for (int k = 0; k < 3; ++k)
+        colors[3 * s + k] = 1 / (1 + exp(-outputs[s * outputs_width + k]));
+}
+
+__kernel void heads_soft_bwd(const uint samples, const uint width, const real density_scale,
+                             const __global real *features, const __global real *v_sigmas,
+                             __global real *v_features) {
+    const size_t s = get_global_id(0);
+    if (s < samples)
+        v_features[s * width] += v_sigmas[s] * density_scale / (1 + exp(DENSITY_SHIFT - features[s * width]));
 }

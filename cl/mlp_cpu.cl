@@ -15,12 +15,12 @@
 //   v_outputs[S,w_L], turned[P]: each matrix transposed, from mlp_turn; between work[items,2,CHUNK,widest]; out
 //   v_inputs[S,w_0], parts[items,P], v_weights[P].
 // -DWIDTHS   w_0 to w_L, multiples of 16, separated by commas
-// -DWIDEST   the largest of them, at most 256
+// -DWIDEST   the largest of them, at most 2048
 // -DROWS     rows of a block: 6 for registers of 8 values, 12 for those of 16
 #include "common.h"
 
-#if !defined(WIDTHS) || !defined(WIDEST) || WIDEST < 16 || WIDEST > 256 || WIDEST % 16
-#error "-DWIDTHS and -DWIDEST must give the widths of the layers, multiples of 16 up to 256"
+#if !defined(WIDTHS) || !defined(WIDEST) || WIDEST < 16 || WIDEST > 2048 || WIDEST % 16
+#error "-DWIDTHS and -DWIDEST must give the widths of the layers, multiples of 16 up to 2048"
 #endif
 #if ROWS != 6 && ROWS != 12
 #error "-DROWS must be 6 or 12"

@@ -13,6 +13,7 @@ from typing import Annotated, get_args
 import tyro
 
 from clsplat.bench.bench_commands import Captures, Chart, Kernels, Knobs, Quality, Stability, Viewer
+from clsplat.bench.field_command import Fields
 from clsplat.commands import console
 from clsplat.commands.arguments import parsed, unknown
 from clsplat.commands.blockwise import Block
@@ -32,6 +33,7 @@ BENCHMARKS = (
     Annotated[Kernels, tyro.conf.subcommand("kernels")]
     | Annotated[Knobs, tyro.conf.subcommand("knobs")]
     | Annotated[Quality, tyro.conf.subcommand("quality")]
+    | Annotated[Fields, tyro.conf.subcommand("fields")]
     | Annotated[Captures, tyro.conf.subcommand("captures")]
     | Annotated[Chart, tyro.conf.subcommand("chart")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from clsplat import reference
-from clsplat.field_stages import NO_ROW, HashLevels, Marching
+from clsplat.field_stages import NO_ROW, HashLevels, Marching, Span
 
 Found = Iterator[tuple[Any, Any]]
 """Pairs of an array of the device and that of the twin."""
@@ -111,3 +111,75 @@ def test_heads(b: Any) -> Found:
         b.stages.heads_sh_bwd(b.up(harmonics), *on_device, 2.0, *up(b, *v)),
         reference.heads_sh_bwd(harmonics, *where, 2.0, *v),
     )
+    joint = b.random(SAMPLES, 16)
+    soft, v_soft = joint.copy(), b.up(joint)
+    yield from zip(
+        b.stages.heads_soft_fwd(*up(b, features, outputs), 2.0),
+        reference.heads_soft_fwd(features, outputs, 2.0),
+        strict=True,
+    )
+    b.stages.heads_soft_bwd(b.up(features), 2.0, b.up(v_sigmas), v_soft)
+    reference.heads_soft_bwd(features, 2.0, v_sigmas, soft)
+    yield v_soft, soft
+
+
+def test_encode(b: Any) -> Found:
+    points = b.rounded(b.rng.uniform(-1, 1, (SAMPLES, 3)))
+    yield b.stages.encode_points(b.up(points), 4), reference.encode_points(points, 4)
+    features, rows, v = b.random(SAMPLES, 16), b.random(SAMPLES // 4, 16), b.random(SAMPLES, 32)
+    joined = b.stages.encode_join(*up(b, features, rows), True)
+    yield joined, reference.encode_join(features, rows, True)
+    yield b.stages.encode_join_bwd(*up(b, v, features), True), reference.encode_join_bwd(v, features, True)
+
+
+def intervals(b: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of the intervals of rays, ascending, and a place in each."""
+    count = SAMPLES // 6
+    return b.rounded(np.sort(b.rng.uniform(size=(RAYS, count + 1)), axis=1)), b.rounded(
+        b.rng.uniform(size=(RAYS, count))
+    )
+
+
+def test_intervals(b: Any) -> Found:
+    edges, offsets = intervals(b)
+    along = directions(b)
+    rays = b.rounded(0.5 - 2 * along), along, edges, offsets
+    for span in (Span(0.0, 1e6, False), Span(0.1, 20.0, True)):
+        found = b.stages.intervals_along(*up(b, *rays), span)
+        yield from zip(found, reference.intervals_along(*rays, span), strict=True)
+    given = edges, b.rounded(b.rng.uniform(0.5, 1, offsets.size)), offsets
+    how = 0.01, 0.5, True
+    yield b.stages.intervals_resample(*up(b, *given), *how), reference.intervals_resample(*given, *how)
+
+
+def test_weights(b: Any) -> Found:
+    sigmas, deltas = np.abs(b.random(SAMPLES)), b.rounded(np.full(SAMPLES, 0.05))
+    v, count = b.random(SAMPLES), SAMPLES // 6
+    weights = reference.weights_fwd(sigmas, deltas, count)
+    given = sigmas, deltas
+    yield b.stages.weights_fwd(*up(b, *given), count), weights
+    found, expected = b.up(v), v.copy()
+    b.stages.weights_bwd(*up(b, *given), count, *up(b, b.rounded(weights), v), found)
+    reference.weights_bwd(*given, count, weights, v, expected)
+    yield found, expected
+
+
+def test_frustums(b: Any) -> Found:
+    edges, along, radii = intervals(b)[0], directions(b), b.rounded(b.rng.uniform(0.01, 0.02, RAYS))
+    for rays, span in (
+        (b.rounded(0.5 - 2 * along), Span(0.0, 1e6, False)),
+        (b.rounded(0.2 * along), Span(0.1, 20.0, True)),
+    ):
+        # At four frequencies, rounding is far below the error that counts.
+        found = b.stages.frustums_encode(*up(b, rays, along, radii, edges), span, 4)
+        yield from zip(found, reference.frustums_encode(rays, along, radii, edges, span, 4), strict=True)
+
+
+def test_histograms(b: Any) -> Found:
+    edges, outer = intervals(b)[0], intervals(b)[0]
+    weights, bounds = (b.rounded(b.rng.uniform(size=RAYS * (edges.shape[1] - 1))) for _ in range(2))
+    given = edges, weights, outer, b.rounded(0.3 * bounds)
+    found = b.stages.histograms_interlevel(*up(b, *given), 0.5)
+    yield from zip(found, reference.histograms_interlevel(*given, 0.5), strict=True)
+    found = b.stages.histograms_distortion(*up(b, *given[:2]), 0.5)
+    yield from zip(found, reference.histograms_distortion(*given[:2], 0.5), strict=True)

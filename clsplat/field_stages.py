@@ -3,7 +3,8 @@
 They belong to `clsplat.stages.Stages`. R rays, S samples, L levels.
 """
 
-from itertools import accumulate
+from itertools import accumulate, combinations_with_replacement, product
+from math import dist, hypot
 from typing import Any, NamedTuple, Protocol
 
 Array = Any
@@ -19,6 +20,46 @@ NO_ROW = 0xFFFFFFFF
 TV_EPS = 1e-9
 """Constant under the root of the total variation, which keeps its gradient finite (code of Fridovich-Keil et al.
 2022)."""
+
+
+DENSITY_SHIFT = 1.0
+"""Subtracted from a network's result, of which the softplus is a density (Barron et al. 2021, appendix)."""
+
+CHUNK_WIDTH = 16
+"""Widths of the layers of networks are multiples of it."""
+
+
+def encoded_width(levels: int) -> int:
+    """Width of an encoding with this number of frequencies: 3 + 6 levels + 1, up to a multiple of 16."""
+    return -(-(4 + 6 * levels) // CHUNK_WIDTH) * CHUNK_WIDTH
+
+
+def _icosahedron_axes() -> tuple[tuple[float, float, float], ...]:
+    """Directions of the vertices of an icosahedron and of the middles of its edges, one of each opposite pair."""
+    golden, found = (1 + 5**0.5) / 2, []
+    corners: list[tuple[float, ...]] = [(0.0, a, b * golden) for a, b in product((-1, 1), repeat=2)]
+    corners = [c[k:] + c[:k] for c in corners for k in range(3)]
+    # Corners of one edge are 2 apart; the middle of two equal corners is the corner.
+    for a, b in combinations_with_replacement(corners, 2):
+        if dist(a, b) < 2.1:
+            middle = (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+            if next(x for x in middle if abs(x) > 1e-9) > 0:
+                length = hypot(*middle)
+                found.append((middle[0] / length, middle[1] / length, middle[2] / length))
+    return tuple(sorted(found))
+
+
+FRUSTUM_AXES = _icosahedron_axes()
+"""Axes (21, 3) on which the encoding of frustums projects them (Barron et al. 2022, supplement)."""
+
+INTERLEVEL_EPS = 1e-7
+"""Constant in the denominator of the interlevel loss: rounding of float32 (code of Barron et al. 2022)."""
+
+
+def frustum_width(levels: int) -> int:
+    """Width of an encoding of frustums: a sine and a cosine of each axis and frequency, and 1, up to a multiple of
+    16."""
+    return -(-(2 * len(FRUSTUM_AXES) * levels + 1) // CHUNK_WIDTH) * CHUNK_WIDTH
 
 
 class RayColors(NamedTuple):
@@ -41,6 +82,18 @@ class Marching(NamedTuple):
 
     step: float
     cone: float
+    near: float
+    far: float
+    contracted: bool
+
+
+class Span(NamedTuple):
+    """Where rays have intervals: lengths in the field's coordinates, as for `Marching`.
+
+    Without `contracted`, rays begin and end at the unit cube, and intervals are equal in their lengths; with it, from
+    `near` to `far`, and equal in their inverse distances.
+    """
+
     near: float
     far: float
     contracted: bool
@@ -121,6 +174,28 @@ class FieldStages(Protocol):
         v_sigmas: Array,
         v_colors: Array,
     ) -> Array: ...
+    def heads_soft_fwd(self, features: Array, outputs: Array, density_scale: float) -> tuple[Array, Array]: ...
+    def heads_soft_bwd(self, features: Array, density_scale: float, v_sigmas: Array, v_features: Array) -> None: ...
+    def encode_points(self, points: Array, levels: int) -> Array: ...
+    def encode_join(self, features: Array, rows: Array, rectify: bool) -> Array: ...
+    def encode_join_bwd(self, v_joined: Array, features: Array, rectify: bool) -> Array: ...
+    def intervals_along(
+        self, origins: Array, directions: Array, edges: Array, offsets: Array, span: Span
+    ) -> tuple[Array, Array]: ...
+    def intervals_resample(
+        self, edges: Array, weights: Array, draws: Array, padding: float, power: float, keep: bool
+    ) -> Array: ...
+    def weights_fwd(self, sigmas: Array, deltas: Array, count: int) -> Array: ...
+    def weights_bwd(
+        self, sigmas: Array, deltas: Array, count: int, weights: Array, v_weights: Array, v_sigmas: Array
+    ) -> None: ...
+    def frustums_encode(
+        self, origins: Array, directions: Array, radii: Array, edges: Array, span: Span, levels: int
+    ) -> tuple[Array, Array]: ...
+    def histograms_interlevel(
+        self, edges: Array, weights: Array, outer_edges: Array, outer_weights: Array, scale: float
+    ) -> tuple[Array, Array]: ...
+    def histograms_distortion(self, edges: Array, weights: Array, scale: float) -> tuple[Array, Array]: ...
     def rays_fwd(self, sigmas: Array, colors: Array, deltas: Array, first: Array, background: Any) -> RayColors: ...
     def rays_bwd(
         self,

@@ -105,3 +105,38 @@ def test_gradients_of_harmonics_by_central_differences(device64):
         return float(sigmas @ v_sigmas + (colors * v_colors).sum())
 
     gradcheck(total, {"features": features}, {"features": sh_by_kernel(device64, features, *rest)[2]})
+
+
+def soft_by_kernel(device, features, outputs, v_sigmas, v_features):
+    x, y, v_s, v_x = (device.upload("array", a) for a in (features, outputs, v_sigmas, v_features))
+    results = ops.heads_soft_fwd(device, x, y, SCALE)
+    ops.heads_soft_bwd(device, x, SCALE, v_s, v_x)
+    return [a.get() for a in (*results, v_x)]
+
+
+def test_soft_densities_match_twin(any_device):
+    """Also far from 0 on both sides, where the softplus is 0 or the feature itself."""
+    features, _, outputs, v_sigmas, _, v_joined, _ = inputs()
+    features, v_features = v_joined.copy(), v_joined[::-1].copy()
+    features[:2, 0] = [200, -200]
+    sigmas, colors = reference.heads_soft_fwd(features, outputs, SCALE)
+    np.testing.assert_allclose(sigmas[:2], [199 * SCALE, 0], atol=1e-80)
+    expected = v_features.copy()
+    reference.heads_soft_bwd(features, SCALE, v_sigmas, expected)
+    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    found = soft_by_kernel(any_device, features, outputs, v_sigmas, v_features)
+    for name, array, wanted in zip(
+        ("sigmas", "sample colours", "v_features"), found, (sigmas, colors, expected), strict=True
+    ):
+        assert_matches(name, array, wanted, tolerances)
+
+
+def test_gradients_of_soft_densities_by_central_differences(device64):
+    features, _, outputs, v_sigmas, *_ = inputs(40)
+    features[:2, 0] = 0.5
+
+    def total(features):
+        return float(soft_by_kernel(device64, features, outputs, v_sigmas, features)[0] @ v_sigmas)
+
+    v_features = soft_by_kernel(device64, features, outputs, v_sigmas, 0 * features)[2]
+    gradcheck(total, {"features": features}, {"features": v_features})

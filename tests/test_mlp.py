@@ -10,8 +10,9 @@ from clsplat import ops, reference
 from clsplat.errors import InputError
 from clsplat.testing import assert_matches, gradcheck
 
-# Instant-NGP's networks, one layer alone, and widths that are odd multiples of 16, up to the widest.
-WIDTHS = [(32, 64, 16), (32, 64, 64, 16), (16, 16), (48, 256, 16, 80, 48)]
+# Instant-NGP's networks, one layer alone, widths that are odd multiples of 16, and the widest
+# inputs of NeRF and Mip-NeRF 360.
+WIDTHS = [(32, 64, 16), (32, 64, 64, 16), (16, 16), (48, 256, 16, 80, 48), (320, 16), (1536, 16, 32)]
 # Less than a block of rows, a part of the last block, less and more than a chunk, and than the bands of all cores.
 ROWS = [1, 13, 96, 1000]
 
@@ -97,7 +98,7 @@ def test_gradients_repeat_to_the_bit(configured_device):
             np.testing.assert_array_equal(again, before)
 
 
-@pytest.mark.parametrize("widths", [(32,), (32, 20), (32, 272), (0, 16)])
+@pytest.mark.parametrize("widths", [(32,), (32, 20), (32, 2064), (0, 16)])
 def test_widths_out_of_range_are_refused(device, widths):
-    with pytest.raises(InputError, match="expected two or more multiples of 16 up to 256"):
+    with pytest.raises(InputError, match="expected two or more multiples of 16 up to 2048"):
         ops.mlp_fwd(device, device.empty("x", (1, 32)), device.empty("w", 16), widths)

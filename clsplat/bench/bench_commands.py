@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 CHART_SUFFIXES = (".png", ".svg", ".pdf")
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
@@ -64,15 +64,15 @@ class Kernels:
         from clsplat.bench.time_report import model_text
         from clsplat.device import Device, select_device
 
-        _check(self.out, "--scaling", self.scaling)
+        check_files(self.out, "--scaling", self.scaling)
         workloads = self._workloads()
         device = Device(select_device(self.device))
-        _say(f"device: {device.label}")
-        results = bench_kernels(workloads, self.render, device, self.repeats, lambda text: _say(f"timing: {text}"))
-        _write(self.out, results)
+        say(f"device: {device.label}")
+        results = bench_kernels(workloads, self.render, device, self.repeats, lambda text: say(f"timing: {text}"))
+        write_results(self.out, results)
         if self.scaling is not None:
             save_scaling_chart(results, self.scaling)
-            _say(f"chart: {self.scaling}")
+            say(f"chart: {self.scaling}")
         print(f"{summary(results)}\n\n{networks(results)}")
         for workload in results["workloads"]:
             print(f"\n{details(workload)}")
@@ -106,12 +106,12 @@ class Viewer:
         from clsplat.bench.frame_rates import bench_frames, frames_text
         from clsplat.device import Device, select_device
 
-        _check(self.out, "--out", None)
+        check_files(self.out, "--out", None)
         device = Device(select_device(self.device))
-        _say(f"device: {device.label}")
+        say(f"device: {device.label}")
         workloads = [synthetic(name) for name in self.workloads]
-        results = bench_frames(workloads, device, self.frames, lambda text: _say(f"drawing: {text}"))
-        _write(self.out, results)
+        results = bench_frames(workloads, device, self.frames, lambda text: say(f"drawing: {text}"))
+        write_results(self.out, results)
         print(frames_text(results))
 
 
@@ -146,16 +146,16 @@ class Knobs:
         from clsplat.bench.knobs import bench_knobs
         from clsplat.device import Device, select_device
 
-        _check(self.out, "--chart", self.chart)
+        check_files(self.out, "--chart", self.chart)
         files = _of_files(self.scene, self.cameras, self.views, self.downscale)
         device = Device(select_device(self.device))
-        _say(f"device: {device.label}")
+        say(f"device: {device.label}")
         workloads = files or [synthetic(self.workload)]
-        results = bench_knobs(workloads, self.render, device, self.repeats, lambda text: _say(f"turning: {text}"))
-        _write(self.out, results)
+        results = bench_knobs(workloads, self.render, device, self.repeats, lambda text: say(f"turning: {text}"))
+        write_results(self.out, results)
         if self.chart is not None:
             save_knobs_chart(results, self.chart)
-            _say(f"chart: {self.chart}")
+            say(f"chart: {self.chart}")
         print(knobs_text(results))
 
 
@@ -176,7 +176,7 @@ class Stability:
         from clsplat.bench.stability.stability_report import table
         from clsplat.device import Device, select_device
 
-        results, failed = measure_rows(self.names, Device(select_device(self.device)), self.out, _say)
+        results, failed = measure_rows(self.names, Device(select_device(self.device)), self.out, say)
         print(table(results))
         if failed:
             raise ClsplatError(f"experiments failed, see above: {', '.join(failed)}")
@@ -256,7 +256,7 @@ class Captures:
         text = summary(records)
         with replacing(self.out / "captures.md") as file:
             file.write(f"{text}\n\n{details(records)}\n".encode())
-        _say(f"all captures: {self.out / 'captures.md'}")
+        say(f"all captures: {self.out / 'captures.md'}")
         print(text)
 
 
@@ -267,15 +267,15 @@ def _train(cells: "list[Cell]", device_name: str | None, out: Path) -> None:
     from clsplat.device import Device, select_device
 
     device = Device(select_device(device_name))
-    _say(f"device: {device.label}")
+    say(f"device: {device.label}")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot create {out}: {error.strerror}") from error
     try:
-        run_cells(cells, device, out / FILE, _say)
+        run_cells(cells, device, out / FILE, say)
     except KeyboardInterrupt:
-        _say(f"{out}: the same command continues after the last finished training")
+        say(f"{out}: the same command continues after the last finished training")
         raise
 
 
@@ -294,10 +294,10 @@ class Chart:
         if not (self.out / FILE).is_file():
             raise InputError(f"{self.out}: expected a folder with {FILE}, which `bench quality` writes, found none")
         write_charts(read_records(self.out / FILE), self.out)
-        _say(f"charts: {self.out / 'index.html'}")
+        say(f"charts: {self.out / 'index.html'}")
 
 
-def _check(out: Path | None, chart_option: str, chart: Path | None) -> None:
+def check_files(out: Path | None, chart_option: str, chart: Path | None) -> None:
     """Check arguments that would otherwise fail after minutes of measuring."""
     if chart is not None and chart.suffix.lower() not in CHART_SUFFIXES:
         raise InputError(f"{chart_option}: expected a file named *{', *'.join(CHART_SUFFIXES)}, found {chart}")
@@ -306,14 +306,14 @@ def _check(out: Path | None, chart_option: str, chart: Path | None) -> None:
             raise InputError(f"{path}: expected a file in a folder that exists, found no folder {path.parent}")
 
 
-def _write(out: Path | None, results: dict[str, Any]) -> None:
+def write_results(out: Path | None, results: dict[str, Any]) -> None:
     """Write the results as JSON. This happens before anything is printed, because a pipe may be closed early."""
     from clsplat.atomic import replacing
 
     if out is not None:
         with replacing(out) as file:
             file.write((json.dumps(results, indent=1) + "\n").encode())
-        _say(f"results: {out}")
+        say(f"results: {out}")
 
 
 def _of_files(

@@ -53,8 +53,8 @@ class Train:
     """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians, such as scene.spz, which is
     written as well; its name without the suffix becomes the folder."""
     method: Annotated[str, name_in("clsplat.fields:method_names")] = "gaussians"
-    """Gaussians, or a radiance field to compare them with. For a field only --iterations, --seed, the settings of the
-    photos, of evaluations and of checkpoints, --device and --memory-limit count."""
+    """Gaussians or a radiance field. For a field only --iterations, --seed, the settings of the photos, of
+    evaluations and of checkpoints, --device and --memory-limit count."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
     viewer: bool = False

@@ -6,9 +6,13 @@ files. Does not belong here: kernels and launches, which are stages, and anythin
 
 from clsplat.fields.field import Field
 from clsplat.fields.ingp import IngpBase, IngpBig
+from clsplat.fields.mipnerf360 import MipNerf360, MipNerf360Small
+from clsplat.fields.nerf import Nerf, NerfSmall
 from clsplat.fields.plenoxels import Plenoxels
 
-METHODS: dict[str, type[Field]] = {method.name: method for method in (Plenoxels, IngpBase, IngpBig)}
+METHODS: dict[str, type[Field]] = {
+    method.name: method for method in (Nerf, NerfSmall, Plenoxels, IngpBase, IngpBig, MipNerf360, MipNerf360Small)
+}
 """Methods by the name that `--method` takes."""
 
 GAUSSIANS = "gaussians"

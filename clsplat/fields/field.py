@@ -1,7 +1,7 @@
 """What all fields share: where they lie, their rays, their images and their arrays."""
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,17 @@ Array = NDArray[Any]
 
 RENDERED_RAYS = 1024
 """Number of rays that are rendered at once. With 500 samples each, Instant-NGP takes half a gigabyte for them."""
+
+
+class Rays(NamedTuple):
+    """Rays on the device.
+
+    origins, directions (R, 3) in the field's coordinates, directions of length 1; radii (R,), see `Space.radii`.
+    """
+
+    origins: Any
+    directions: Any
+    radii: Any
 
 
 class Field(ABC):
@@ -69,7 +80,7 @@ class Field(ABC):
         """
 
     @abstractmethod
-    def colors(self, origins: Any, directions: Any, offsets: Any, background: Color) -> Any:
+    def colors(self, rays: Rays, background: Color) -> Any:
         """Colours (R, 3) of rays, on the device, in front of a background."""
 
     @abstractmethod
@@ -94,10 +105,10 @@ class Field(ABC):
         rgb = np.empty((len(u), 3), np.float32)
         for begin in range(0, len(u), RENDERED_RAYS):
             part = slice(begin, begin + RENDERED_RAYS)
-            origins, directions = self.space.rays(camera, u[part] + 0.5, v[part] + 0.5)
+            at = camera, u[part] + 0.5, v[part] + 0.5
+            origins, directions = self.space.rays(*at)
             seen = np.isfinite(directions).all(axis=1, keepdims=True)
-            offsets = self.device.upload("offsets", np.full(len(origins), 0.5))
-            rays = self.device.upload("origins", origins), self.device.upload("directions", np.nan_to_num(directions))
-            colors = self.colors(*rays, offsets, background).get()
+            arrays = origins, np.nan_to_num(directions), self.space.radii(*at)
+            colors = self.colors(Rays(*(self.device.upload("rays", array) for array in arrays)), background).get()
             rgb[part] = np.where(seen, colors, background)
         return rgb.reshape(camera.height, camera.width, 3)

@@ -1,12 +1,12 @@
 """Instant-NGP (Müller et al. 2022): a hash grid and two small networks."""
 
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from clsplat.field_stages import HashLevels, Samples
-from clsplat.fields.field import Array, Field
+from clsplat.fields.field import Array, Field, Rays
+from clsplat.fields.layers import Parameters, first_weights, moments, restore_parameters
 from clsplat.fields.occupancy import CELLS, EVERY, THRESHOLD, Occupancy
 from clsplat.fields.pixels import Batch
 from clsplat.fields.space import Space
@@ -61,14 +61,6 @@ class Evaluation(NamedTuple):
     colors: Any
 
 
-class Parameters:
-    """An array of parameters with Adam's moments, on the device."""
-
-    def __init__(self, device: "Device", values: Array):
-        self.values = device.upload("parameters", values)
-        self.first, self.second = (device.upload("moments", np.zeros(values.shape)) for _ in range(2))
-
-
 class IngpBase(Field):
     """Instant-NGP with tables of 2^19 entries per level."""
 
@@ -87,7 +79,7 @@ class IngpBase(Field):
         )
         rng = stream(seed, "parameters of a field")
         table = rng.uniform(-TABLE_RANGE, TABLE_RANGE, (self.levels.offsets[-1], 2))
-        networks = [_network(rng, widths) for widths in (DENSITY_WIDTHS, COLOR_WIDTHS)]
+        networks = [first_weights(rng, widths) for widths in (DENSITY_WIDTHS, COLOR_WIDTHS)]
         self.parameters = {
             name: Parameters(device, values)
             for name, values in zip(("table", "density", "color"), (table, *networks), strict=True)
@@ -162,10 +154,11 @@ class IngpBase(Field):
             depths[part] = sigmas.get() * self.space.marching.step
         return depths
 
-    def colors(self, origins: Any, directions: Any, offsets: Any, background: Color) -> Any:
+    def colors(self, rays: Rays, background: Color) -> Any:
         """See `Field`."""
-        samples = self.stages.march(origins, directions, offsets, self._occupied, self.space.marching)
-        run = self._evaluate(samples, directions)
+        offsets = self.device.upload("offsets", np.full(len(rays.radii), 0.5))
+        samples = self.stages.march(*rays[:2], offsets, self._occupied, self.space.marching)
+        run = self._evaluate(samples, rays.directions)
         return self.stages.rays_fwd(run.sigmas, run.colors, samples.deltas, samples.first, background).rgb
 
     def model(self) -> dict[str, Array]:
@@ -175,17 +168,11 @@ class IngpBase(Field):
 
     def optimiser(self) -> dict[str, Array]:
         """See `Field`."""
-        arrays = {f"{name}.first": p.first.get() for name, p in self.parameters.items()}
-        arrays |= {f"{name}.second": p.second.get() for name, p in self.parameters.items()}
-        return arrays | {"occupancy": self.occupancy.values, "rays": np.array(self._rays)}
+        return moments(self.parameters) | {"occupancy": self.occupancy.values, "rays": np.array(self._rays)}
 
     def restore(self, arrays: dict[str, Array]) -> None:
         """See `Field`."""
-        for name, p in self.parameters.items():
-            p.values.set(arrays[name].astype(self.device.real).reshape(p.values.shape))
-            if f"{name}.first" in arrays:
-                p.first.set(arrays[f"{name}.first"].astype(self.device.real))
-                p.second.set(arrays[f"{name}.second"].astype(self.device.real))
+        restore_parameters(self.parameters, arrays, self.device.real)
         shape = self.occupancy.values.shape
         occupied = np.unpackbits(arrays["occupied"])[: self.occupancy.values.size].reshape(shape)
         if "occupancy" in arrays:
@@ -203,10 +190,3 @@ class IngpBig(IngpBase):
 
     name = "ingp-big"
     entries = 2**21
-
-
-def _network(rng: np.random.Generator, widths: tuple[int, ...]) -> Array:
-    """First weights, uniform with the variance 2 / (inputs + outputs) of a layer (Glorot and Bengio 2010)."""
-    limits = [(6 / (a + b)) ** 0.5 for a, b in pairwise(widths)]
-    sizes = [a * b for a, b in pairwise(widths)]
-    return np.concatenate([rng.uniform(-limit, limit, size) for limit, size in zip(limits, sizes, strict=True)])

@@ -14,11 +14,13 @@ Array = NDArray[Any]
 class Batch(NamedTuple):
     """Rays of an iteration, and what they should see.
 
-    origins, directions (R, 3) in the field's coordinates; colors (R, 3) in [0, 1], on the background; background RGB.
+    origins, directions (R, 3) in the field's coordinates; radii (R,), see `Space.radii`; colors (R, 3) in [0, 1], on
+    the background; background RGB.
     """
 
     origins: Array
     directions: Array
+    radii: Array
     colors: Array
     background: Color
 
@@ -51,17 +53,19 @@ class Pixels:
         chosen = rng.integers(self._first[-1] if self._used is None else len(self._used), size=count)
         pixels = np.sort(chosen if self._used is None else self._used[chosen])
         starts = np.searchsorted(pixels, self._first)
-        origins, directions = np.empty((count, 3)), np.empty((count, 3))
+        origins, directions, radii = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
         for view, first, begin, end in zip(self._views, self._first, starts, starts[1:], strict=False):
             if begin < end:
                 v, u = np.divmod(pixels[begin:end] - first, view.camera.width)
-                origins[begin:end], directions[begin:end] = self._space.rays(view.camera, u + 0.5, v + 0.5)
+                at = view.camera, u + 0.5, v + 0.5
+                origins[begin:end], directions[begin:end] = self._space.rays(*at)
+                radii[begin:end] = self._space.radii(*at)
         colors = self._colors[pixels] / 255
         if self.transparent:
             colors += self._clear[pixels, None] / 255 * (background - self._loaded_on)
         seen = np.isfinite(directions).all(axis=1)  # a fisheye sees nothing in its corners
         light = (float(background[0]), float(background[1]), float(background[2]))
-        return Batch(origins[seen], directions[seen], np.clip(colors[seen], 0, 1), light)
+        return Batch(origins[seen], directions[seen], radii[seen], np.clip(colors[seen], 0, 1), light)
 
 
 def _clear(view: View) -> NDArray[np.uint8]:

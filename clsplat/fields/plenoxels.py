@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.field_stages import NO_ROW, Marching, Samples
-from clsplat.fields.field import Array, Field
+from clsplat.fields.field import Array, Field, Rays
 from clsplat.fields.pixels import Batch
 from clsplat.fields.space import CONE, FAR, Space
 from clsplat.randomness import stream
@@ -169,11 +169,12 @@ class Plenoxels(Field):
         positions = self.device.upload("positions", places)
         self._place(occupied, self.stages.voxels_fwd(positions, self._index, self.table).get())
 
-    def colors(self, origins: Any, directions: Any, offsets: Any, background: Color) -> Any:
+    def colors(self, rays: Rays, background: Color) -> Any:
         """See `Field`."""
-        samples = self.stages.march(origins, directions, offsets, self._occupied, self._marching)
+        offsets = self.device.upload("offsets", np.full(len(rays.radii), 0.5))
+        samples = self.stages.march(*rays[:2], offsets, self._occupied, self._marching)
         features = self.stages.voxels_fwd(samples.positions, self._index, self.table)
-        sigmas, colors = self.stages.heads_sh_fwd(features, directions, samples.rays_of, DENSITY_SCALE)
+        sigmas, colors = self.stages.heads_sh_fwd(features, rays.directions, samples.rays_of, DENSITY_SCALE)
         return self.stages.rays_fwd(sigmas, colors, samples.deltas, samples.first, background).rgb
 
     def model(self) -> dict[str, Array]:

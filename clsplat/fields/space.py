@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera, focus_point
-from clsplat.field_stages import Marching
+from clsplat.field_stages import Marching, Span
 from clsplat.scene import View
 
 BOX_SHARE = 0.375
@@ -23,6 +23,12 @@ with three times as many samples on a ray."""
 FAR = 100.0
 """Distance at which rays end where there is a background, in distances of the farthest camera from the centre. The
 contraction maps it to 1.99 of 2."""
+
+CUBE_EDGE = 3.0
+"""Edge of the cube in the units of NeRF's synthetic scenes (Mildenhall et al. 2020)."""
+
+CUBE_FAR = 1e6
+"""Distance at which rays end without a background, in edges of the cube, unless they leave it before."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +65,18 @@ class Space:
     def marching(self) -> Marching:
         """How rays are sampled."""
         if not self.contracted:
-            return Marching(STEP, 0.0, 0.0, 1e6, False)
+            return Marching(STEP, 0.0, 0.0, CUBE_FAR, False)
         return Marching(2 * STEP, CONE, self.near, FAR, True)  # the unit ball is two wide
+
+    @property
+    def density_scale(self) -> float:
+        """Factor on the densities of networks: the length of a unit in the units of the papers."""
+        return 1.0 if self.contracted else CUBE_EDGE
+
+    @property
+    def span(self) -> Span:
+        """Where rays have intervals."""
+        return Span(self.near, FAR if self.contracted else CUBE_FAR, self.contracted)
 
     def rays(self, camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         """Origins and directions (R, 3) of the rays through points of an image, in px, in the field's coordinates.
@@ -71,3 +87,13 @@ class Space:
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)  # poses may be printed with few digits
         origin = (camera.position - self.centre) / self.scale + (0.0 if self.contracted else 0.5)
         return np.broadcast_to(origin, directions.shape), directions
+
+    @staticmethod
+    def radii(camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Radii (R,) of the cones of pixels at a distance of 1, for points of an image as for `rays`.
+
+        A disc with this radius has the variance of a pixel (Barron et al. 2021, section 3.1). It is 0 where a fisheye
+        sees nothing.
+        """
+        widths = np.linalg.norm(camera.rays(u + 1, v) - camera.rays(u, v), axis=1)
+        return np.nan_to_num(widths) * 2 / 12**0.5

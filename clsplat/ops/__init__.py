@@ -14,11 +14,24 @@ from clsplat.ops.composite import composite_bwd, composite_fwd
 from clsplat.ops.count import count_pairs
 from clsplat.ops.disparity import disparity_bwd, disparity_fwd, disparity_grad, disparity_loss
 from clsplat.ops.dropout import dropout_bwd, dropout_fwd
+from clsplat.ops.encode import encode_join, encode_join_bwd, encode_points
 from clsplat.ops.exposure import exposure_bwd, exposure_fwd
 from clsplat.ops.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.ops.finite import count_not_finite
+from clsplat.ops.frustums import frustums_encode
 from clsplat.ops.hashgrid import hashgrid_bwd, hashgrid_fwd
-from clsplat.ops.heads import heads_bwd, heads_fwd, heads_join, heads_join_bwd, heads_sh_bwd, heads_sh_fwd
+from clsplat.ops.heads import (
+    heads_bwd,
+    heads_fwd,
+    heads_join,
+    heads_join_bwd,
+    heads_sh_bwd,
+    heads_sh_fwd,
+    heads_soft_bwd,
+    heads_soft_fwd,
+)
+from clsplat.ops.histograms import histograms_distortion, histograms_interlevel
+from clsplat.ops.intervals import intervals_along, intervals_resample
 from clsplat.ops.loss import l1_ssim
 from clsplat.ops.march import march
 from clsplat.ops.median import median_splats
@@ -32,6 +45,7 @@ from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
 from clsplat.ops.take import take_rows
 from clsplat.ops.voxels import voxels_bwd, voxels_fwd, voxels_tv
+from clsplat.ops.weights import weights_bwd, weights_fwd
 
 
 class Launches:
@@ -87,3 +101,15 @@ class Launches:
         self.voxels_fwd = partial(voxels_fwd, device)
         self.voxels_bwd = partial(voxels_bwd, device)
         self.voxels_tv = partial(voxels_tv, device)
+        self.heads_soft_fwd = partial(heads_soft_fwd, device)
+        self.heads_soft_bwd = partial(heads_soft_bwd, device)
+        self.encode_points = partial(encode_points, device)
+        self.encode_join = partial(encode_join, device)
+        self.encode_join_bwd = partial(encode_join_bwd, device)
+        self.intervals_along = partial(intervals_along, device)
+        self.intervals_resample = partial(intervals_resample, device)
+        self.weights_fwd = partial(weights_fwd, device)
+        self.weights_bwd = partial(weights_bwd, device)
+        self.frustums_encode = partial(frustums_encode, device)
+        self.histograms_interlevel = partial(histograms_interlevel, device)
+        self.histograms_distortion = partial(histograms_distortion, device)

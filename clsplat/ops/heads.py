@@ -3,9 +3,9 @@
 from pyopencl.array import Array
 
 from clsplat.device import Device
-from clsplat.field_stages import EXPONENT_MAX
+from clsplat.field_stages import DENSITY_SHIFT, EXPONENT_MAX
 
-DEFINES = {"EXPONENT_MAX": EXPONENT_MAX}
+DEFINES = {"EXPONENT_MAX": EXPONENT_MAX, "DENSITY_SHIFT": DENSITY_SHIFT}
 
 
 def heads_join(device: Device, features: Array, directions: Array, rays_of: Array) -> Array:
@@ -126,3 +126,33 @@ def heads_sh_bwd(
     arguments = [samples, float(density_scale), features, directions, rays_of, v_sigmas, v_colors, v_features]
     device.launch("heads", "heads_sh_bwd", (samples,), arguments, defines=DEFINES)
     return v_features
+
+
+def heads_soft_fwd(device: Device, features: Array, outputs: Array, density_scale: float) -> tuple[Array, Array]:
+    """Densities density_scale softplus(features[:, 0] - DENSITY_SHIFT) and colours, the sigmoid of outputs[:, :3].
+
+    Parameters
+    ----------
+    features : (S, W) real
+    outputs : (S, V) real
+    density_scale : float
+        Factor on the densities.
+
+    Returns
+    -------
+    sigmas : (S,) real
+    colors : (S, 3) real
+    """
+    samples, width = features.shape
+    sigmas, colors = device.empty("sigmas", samples), device.empty("colours of samples", (samples, 3))
+    scalars = [samples, width, outputs.shape[1], float(density_scale)]
+    arguments = [*scalars, features, outputs, sigmas, colors]
+    device.launch("heads", "heads_soft_fwd", (samples,), arguments, defines=DEFINES)
+    return sigmas, colors
+
+
+def heads_soft_bwd(device: Device, features: Array, density_scale: float, v_sigmas: Array, v_features: Array) -> None:
+    """Add the gradient of the densities of `heads_soft_fwd`, from v_sigmas (S,), to v_features (S, W)."""
+    samples, width = features.shape
+    arguments = [samples, width, float(density_scale), features, v_sigmas, v_features]
+    device.launch("heads", "heads_soft_bwd", (samples,), arguments, defines=DEFINES)

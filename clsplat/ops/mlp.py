@@ -17,8 +17,8 @@ TILE, HEIGHT = 16, 64
 # Number of slabs of rows on a GPU, each with its own sum of the gradient of the weights.
 SLABS = 32
 
-WIDTH_MAX = 256
-"""Largest width of a layer."""
+WIDTH_MAX = 2048
+"""Largest width of a layer: that of Mip-NeRF 360 whose inputs are 1024 features and an encoding of 512 has 1536."""
 
 
 def mlp_fwd(device: Device, inputs: Array, weights: Array, widths: tuple[int, ...]) -> tuple[Array, Array]:
@@ -30,7 +30,7 @@ def mlp_fwd(device: Device, inputs: Array, weights: Array, widths: tuple[int, ..
     weights : (P,) real
         The matrices (widths[l], widths[l + 1]) of all layers, one after the other.
     widths : tuple of int
-        Of the inputs and of each layer's results: multiples of 16, at most 256.
+        Of the inputs and of each layer's results: multiples of 16, at most `WIDTH_MAX`.
 
     Returns
     -------

@@ -11,11 +11,24 @@ from clsplat.reference.composite import composite_bwd, composite_fwd
 from clsplat.reference.count import count_pairs
 from clsplat.reference.disparity import disparity_bwd, disparity_fwd, disparity_grad, disparity_loss
 from clsplat.reference.dropout import dropout_bwd, dropout_fwd
+from clsplat.reference.encode import encode_join, encode_join_bwd, encode_points
 from clsplat.reference.exposure import exposure_bwd, exposure_fwd
 from clsplat.reference.filter import filter_bwd, filter_fwd, pixel_sizes
 from clsplat.reference.finite import count_not_finite
+from clsplat.reference.frustums import frustums_encode
 from clsplat.reference.hashgrid import hashgrid_bwd, hashgrid_fwd
-from clsplat.reference.heads import heads_bwd, heads_fwd, heads_join, heads_join_bwd, heads_sh_bwd, heads_sh_fwd
+from clsplat.reference.heads import (
+    heads_bwd,
+    heads_fwd,
+    heads_join,
+    heads_join_bwd,
+    heads_sh_bwd,
+    heads_sh_fwd,
+    heads_soft_bwd,
+    heads_soft_fwd,
+)
+from clsplat.reference.histograms import histograms_distortion, histograms_interlevel
+from clsplat.reference.intervals import intervals_along, intervals_resample
 from clsplat.reference.loss import l1_ssim
 from clsplat.reference.march import march
 from clsplat.reference.median import median_splats
@@ -29,3 +42,4 @@ from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
 from clsplat.reference.take import take_rows
 from clsplat.reference.voxels import voxels_bwd, voxels_fwd, voxels_tv
+from clsplat.reference.weights import weights_bwd, weights_fwd

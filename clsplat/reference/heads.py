@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.field_stages import EXPONENT_MAX
+from clsplat.field_stages import DENSITY_SHIFT, EXPONENT_MAX
 from clsplat.reference.sh import sh_basis
 
 Array = NDArray[Any]
@@ -61,3 +61,14 @@ def heads_sh_bwd(
     v_density = np.where(features[:, 0] > 0, density_scale * v_sigmas, 0)
     v_harmonics = np.where(colors > 0, v_colors, 0)[:, :, None] * basis[:, None]
     return np.concatenate([v_density[:, None], v_harmonics.reshape(-1, 27)], axis=1)
+
+
+def heads_soft_fwd(features: Array, outputs: Array, density_scale: float) -> tuple[Array, Array]:
+    """Densities by softplus, and colours. Arguments and results as for `clsplat.ops.heads_soft_fwd`."""
+    sigmas = density_scale * np.logaddexp(features[:, 0] - DENSITY_SHIFT, 0)
+    return sigmas, 1 / (1 + np.exp(-outputs[:, :3]))
+
+
+def heads_soft_bwd(features: Array, density_scale: float, v_sigmas: Array, v_features: Array) -> None:
+    """Add the gradient of the densities. Arguments as for `clsplat.ops.heads_soft_bwd`."""
+    v_features[:, 0] += v_sigmas * density_scale / (1 + np.exp(DENSITY_SHIFT - features[:, 0]))

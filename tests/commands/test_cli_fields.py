@@ -56,7 +56,7 @@ def test_settings_of_gaussians_are_refused(dataset, tmp_path, capsys):
     assert "found strategy, optim" in message("--strategy", "mcmc", "--optim.ssim-weight", "0.1")
     assert "expected a folder after -o and no viewer" in message(out=tmp_path / "run.spz")
     assert "expected a folder after -o and no viewer" in message("--viewer")
-    assert "expected one of gaussians, plenoxels, ingp-base" in fails(
+    assert "expected one of gaussians, nerf, nerf-small, plenoxels" in fails(
         capsys, "train", dataset, "-o", tmp_path, "--method", "nerd"
     )
 

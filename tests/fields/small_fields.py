@@ -1,6 +1,8 @@
 """Fields of few parameters and short steps, for tests."""
 
 from clsplat.fields.ingp import IngpBase
+from clsplat.fields.mipnerf360 import MipNerf360Small
+from clsplat.fields.nerf import NerfSmall
 from clsplat.fields.plenoxels import Plenoxels
 
 
@@ -14,3 +16,18 @@ class SmallPlenoxels(Plenoxels):
     """Plenoxels of few cells and short steps."""
 
     cells, samples = 8, 2**13
+
+
+class SmallNerf(NerfSmall):
+    """NeRF with small networks and few samples."""
+
+    width, coarse, fine, rays = 32, 16, 16, 128
+    rate = 8e-3
+
+
+class SmallMipNerf360(MipNerf360Small):
+    """Mip-NeRF 360 with small networks and few samples."""
+
+    width, features, color_width, proposal_width, levels = 32, 32, 16, 16, 4
+    proposals, samples, rays = 16, 12, 128
+    rate = 1e-2

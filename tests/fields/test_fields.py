@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ball_photos import ball
-from small_fields import SmallIngp, SmallPlenoxels
+from small_fields import SmallIngp, SmallMipNerf360, SmallNerf, SmallPlenoxels
 
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.errors import InputError
@@ -23,7 +23,7 @@ WHITE = BACKGROUNDS["white"]
 CONFIG = TrainConfig(iterations=250, data=DataConfig(background="white"))
 
 
-SMALL = [SmallIngp, SmallPlenoxels]
+SMALL = [SmallIngp, SmallPlenoxels, SmallNerf, SmallMipNerf360]
 EACH = pytest.mark.parametrize("method", SMALL, ids=lambda m: m.name)
 
 
@@ -110,7 +110,7 @@ def test_damaged_files_are_refused(device, tmp_path):
     with pytest.raises(InputError, match="damaged"):
         load_field(path, METHODS, device)
     np.savez(path, about=json.dumps({"method": "nerd"}))
-    with pytest.raises(InputError, match="expected a field of plenoxels, ingp-base"):
+    with pytest.raises(InputError, match="expected a field of nerf, nerf-small, plenoxels"):
         load_field(path, METHODS, device)
 
 

@@ -67,6 +67,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "removal_gpu": REMOVAL,
     "removal_sums": REMOVAL,
     "sh": PROJECT,
+    "spans": ("tests/test_intervals.py", "tests/test_frustums.py"),
     "structs": PROJECT,
     "mlp_cpu": ("tests/test_mlp.py",),
     "mlp_gpu": ("tests/test_mlp.py",),
