@@ -72,7 +72,10 @@ class Plan(NamedTuple):
     def describe(self, config: TrainConfig, scene: Scene, seconds: float) -> str:
         """A sentence on blocks, photos, memory, time and size; seconds: of an iteration with photos of full size."""
         photos = [len(block.photos) for block in self.blocks]
-        bytes_of = [sum(scene.train[i].image.nbytes for i in block.photos) for block in self.blocks]
+        bytes_of = [
+            sum(3 * scene.train[i].camera.width * scene.train[i].camera.height for i in block.photos)
+            for block in self.blocks
+        ]
         steps = sum(block_config(config, scene, block).iterations for block in self.blocks)
         steps += round(REFINING_LENGTH * steps)
         largest = max(block.gaussians for block in self.blocks)

@@ -33,7 +33,10 @@ def shrunk(view: View, factor: int) -> View:
     def boxes(array: np.ndarray) -> np.ndarray:
         return np.asarray(Image.fromarray(array).resize((width, height), Image.Resampling.BOX))
 
-    mask = None if view.mask is None else boxes(np.where(view.mask, 255, 0).astype(np.uint8)) == 255
-    clear = None if view.clear is None else boxes(view.clear)
+    def reduced(full: View) -> View:
+        mask = None if full.mask is None else boxes(np.where(full.mask, 255, 0).astype(np.uint8)) == 255
+        clear = None if full.clear is None else boxes(full.clear)
+        return replace(full, camera=camera, image=boxes(full.image), mask=mask, clear=clear)
+
     camera = view.camera.resized(width, height)
-    return replace(view, camera=camera, image=boxes(view.image), mask=mask, clear=clear)
+    return view.changed(reduced, camera)

@@ -72,7 +72,7 @@ def prepare(
         masks = str(mask_folder(Path(path), config.data.masks).resolve())
         config = replace(config, data=replace(config.data, masks=masks))
     if scene is None:
-        scene = load_scene(path, config.data, verbose)
+        scene = load_scene(path, config.data, verbose, photo_memory(config))
     scene = with_near_planes(scene)
     tell(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
     few_photos = len(scene.train) < config.few.below  # their points limit the number of Gaussians
@@ -89,6 +89,11 @@ def prepare(
         )
     check_memory(scene, few, device or open_device(config), tell)
     return scene, few
+
+
+def photo_memory(config: TrainConfig) -> int | None:
+    """Bytes of decoded photos in the machine's memory; None without a limit."""
+    return None if config.memory_limit is None else parse_bytes(config.memory_limit, "--memory-limit")
 
 
 def check_memory(scene: Scene, config: TrainConfig, device: "Device", tell: Callable[[str], None]) -> None:
