@@ -184,12 +184,12 @@ class Photos:
     def __call__(self, view: View) -> tuple[Any, Any]:
         if view.name in self._kept:
             return self._kept[view.name]
+        # The memory of a CPU is that of the machine, in which photos that stream have a budget of their own.
+        keeps = not (view.ahead and self._device.is_cpu)
         view = view.loaded()
         photo = self._device.upload("photo", view.image, np.uint8)
         mask = None if view.mask is None else self._device.upload("mask", view.mask, np.uint8)
         size = photo.nbytes + (0 if mask is None else mask.nbytes)
-        # The memory of a CPU is that of the machine, in which photos that stream have a budget of their own.
-        keeps = not (view.ahead and self._device.is_cpu)
         if keeps and self._bytes + size <= self._budget:
             self._kept[view.name] = photo, mask
             self._bytes += size
