@@ -59,9 +59,12 @@ class RenderConfig:
 class SfmConfig:
     """Settings of structure from motion (pycolmap: SIFT, matching, mapping)."""
 
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Pairs of photos that are matched. exhaustive: all. sequential: neighbours by file name. auto: sequential for
-    frames that clsplat extracted from a video, exhaustive otherwise."""
+    matching: Literal["auto", "exhaustive", "sequential", "gps", "vocabulary"] = "auto"
+    """Pairs of photos that are matched. exhaustive: all. sequential: neighbours by file name. gps: neighbours by the
+    positions in the photos' EXIF data. vocabulary: those that look alike. auto: sequential for frames that clsplat
+    extracted from a video, exhaustive otherwise."""
+    vocabulary: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
+    """COLMAP's vocabulary tree for SIFT, for matching by vocabulary."""
     mapper: Literal["incremental", "global"] = "incremental"
     """incremental: photos are added one after the other. global: all poses are found at once, in less time for many
     photos (GLOMAP)."""

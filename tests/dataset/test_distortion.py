@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_decoding import load, noise, posed, save
 
-from clsplat.dataset.undistortion import lens_positions
 from clsplat.dataset.lenses import Intrinsics, project, undistorted
+from clsplat.dataset.undistortion import lens_positions
 from clsplat.errors import InputError
 
 DISTORTED = {
