@@ -4,15 +4,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from clsplat.config import TrainConfig
+from clsplat.config import CoarseConfig, TrainConfig
 from clsplat.dataset import load_scene, with_points
 from clsplat.dataset.finding import mask_folder
 from clsplat.dataset.near_planes import with_near_planes
 from clsplat.ranges import check, parse_bytes
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
+from clsplat.training.densify import STRATEGIES
 from clsplat.training.few_views import adapted
 from clsplat.training.initialize import start_count
 from clsplat.training.memory import Footprint
@@ -104,6 +105,28 @@ def check_memory(scene: Scene, config: TrainConfig, device: "Device", tell: Call
     need, start = Footprint.of(scene, config, device), start_count(scene, start_config(config), config.max_gaussians)
     need.check(start, limit)
     tell(need.describe(start, config.max_gaussians, limit))
+
+
+def of_fixed_size(config: TrainConfig, gaussians: int, rate: float) -> TrainConfig:
+    """The configuration of a training that goes on with Gaussians that have been trained, and edits none.
+
+    Parameters
+    ----------
+    config : TrainConfig
+    gaussians : int
+        Their number.
+    rate : float
+        Factor on the first learning rate of the means.
+    """
+    still: dict[str, Any] = {name: replace(getattr(config, name), stop_fraction=0.0) for name in STRATEGIES}
+    return replace(
+        config,
+        **still,
+        size="fixed",
+        max_gaussians=gaussians,
+        optim=replace(config.optim, means_lr=rate * config.optim.means_lr, sh_degree_every=1),
+        coarse=CoarseConfig(),
+    )
 
 
 def open_device(config: TrainConfig) -> "Device":
