@@ -59,14 +59,14 @@ def _gps_pairs(database: Any, folder: Path) -> list[tuple[int, int]]:
     """
     images = sorted(database.read_all_images(), key=lambda image: image.image_id)
     positions = {image.image_id: gps_position(folder / image.name) for image in images}
-    placed = [number for number, position in positions.items() if position is not None]
-    if not placed:
+    known = {number: position for number, position in positions.items() if position is not None}
+    if not known:
         raise InputError(
             "--sfm.matching gps: expected photos with GPS positions in their EXIF data, found none in "
             f"{len(images)} photos; use the original files, or --sfm.matching exhaustive"
         )
-    others = [pair for pair in combinations(positions, 2) if None in (positions[pair[0]], positions[pair[1]])]
-    return sorted(_near(placed, np.radians([positions[number] for number in placed]), GPS_NEIGHBOURS) + others)
+    others = [pair for pair in combinations(positions, 2) if not known.keys() >= set(pair)]
+    return sorted(_near([*known], np.radians([*known.values()]), GPS_NEIGHBOURS) + others)
 
 
 def _near(numbers: list[int], angles: NDArray[np.float64], count: int) -> list[tuple[int, int]]:
