@@ -2,10 +2,10 @@
 
 Usage: python tests/training/measure_streaming.py [COUNT ...]
 
-Writes datasets of COUNT JPEGs of 1200 x 900 pixels (default: 100 and 300) into a temporary folder, and trains each for
-one epoch in a process of its own: once with all photos in memory, once with `MEMORY` for them. Prints the processor
-time and the wall time from the start of loading to the end of the first iteration, and the largest resident size of
-the process.
+Writes datasets of COUNT JPEGs of 1200 x 900 pixels (default: 100 and 300) into a temporary folder, and trains each
+for one epoch in a process of its own: once with all photos in memory, once with `MEMORY` for them. Prints the
+processor time and the wall time from the start of loading to the end of the first iteration, and the largest resident
+size of the process.
 """
 
 import json
