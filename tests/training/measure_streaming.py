@@ -2,8 +2,8 @@
 
 Usage: python tests/training/measure_streaming.py [COUNT ...]
 
-Writes datasets of COUNT JPEGs of 1200 x 900 pixels (default: 100 and 300) into a temporary folder, and trains each
-for one epoch in a process of its own: once with all photos in memory, once with `MEMORY` for them. Prints the
+Writes datasets of COUNT JPEGs of 600 x 450 pixels (default: 100 and 300) into a temporary folder, and trains each for
+`ITERATIONS` in a process of its own: once with `MEMORY` for the photos, once with all in memory. Prints the
 processor time and the wall time from the start of loading to the end of the first iteration, and the largest resident
 size of the process.
 """
@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-WIDTH, HEIGHT = 1200, 900
-MEMORY = 100_000_000
+WIDTH, HEIGHT = 600, 450
+MEMORY = 25_000_000
+ITERATIONS = 300
 
 
 def write_photos(folder: Path, count: int) -> None:
@@ -44,7 +45,7 @@ def write_photos(folder: Path, count: int) -> None:
 
 
 def measure(folder: Path, count: int, memory: int) -> None:
-    """Train for an epoch; runs in a process of its own."""
+    """Train; runs in a process of its own."""
     from clsplat.config import DataConfig, InitConfig, TrainConfig
     from clsplat.dataset import load_scene
     from clsplat.device import Device
@@ -52,7 +53,7 @@ def measure(folder: Path, count: int, memory: int) -> None:
 
     device = Device()
     init = InitConfig(triangulate=False, random_points=2000, sh_degree=0)
-    config = TrainConfig(iterations=count, size="fixed", max_gaussians=2000, eval_every=0, init=init)
+    config = TrainConfig(iterations=ITERATIONS, size="fixed", max_gaussians=2000, eval_every=0, init=init)
     started = time.process_time(), time.perf_counter()
     first: list[float] = []
 
@@ -64,10 +65,10 @@ def measure(folder: Path, count: int, memory: int) -> None:
         load_scene(folder, DataConfig(test_every=0), memory=memory), config, folder / "out", device, progress=progress
     )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    epoch = time.process_time() - started[0]
+    end = time.process_time() - started[0]
     print(
         f"{count} photos, {memory / 1e6:.0f} MB for them: first iteration after {first[0]:.2f} s of processor time "
-        f"({first[1]:.2f} s), epoch after {epoch:.1f} s; peak {peak:.0f} MB",
+        f"({first[1]:.2f} s), end after {end:.1f} s; peak {peak:.0f} MB",
         flush=True,
     )
 
@@ -76,8 +77,8 @@ def main() -> None:
     if sys.argv[1:2] == ["--child"]:
         measure(Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
         return
-    for count in map(int, sys.argv[1:] or ("100", "300")):
-        for memory in (10**12, MEMORY):
+    for memory in (MEMORY, 10**12):
+        for count in map(int, sys.argv[1:] or ("100", "300")):
             with tempfile.TemporaryDirectory() as folder:
                 write_photos(Path(folder), count)
                 subprocess.run(
