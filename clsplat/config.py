@@ -321,7 +321,8 @@ class TrainConfig:
     """Part of the platform's or device's name. Default: PYOPENCL_CTX, or the first GPU, or a CPU."""
     memory_limit: Annotated[str | None, byte_size()] = None
     """Limit of device memory, such as 4GB or 512MiB (default: all memory of the device). The number of Gaussians
-    stops growing where more would exceed it. Photos that do not fit are uploaded each time they are needed."""
+    stops growing where more would exceed it. Photos that do not fit are uploaded each time they are needed. Decoded
+    photos in the machine's memory have the same limit (default: half of it); the others stream from the disk."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     init: InitConfig = field(default_factory=InitConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
