@@ -81,8 +81,10 @@ check-builds:
 	$(PYTHON) tests/offline/compile_kernels.py --clang $(CLANG) --library $(CLC) -o build/kernels.json
 
 # Measure the figures of docs/benchmarks.md: some minutes, on a machine without other work.
+WORKLOADS = 10k-640x480 100k-640x480 1M-640x480 100k-1280x720 1M-1920x1080
 bench:
-	$(PYTHON) -m clsplat bench kernels -o docs/results/kernels.json --scaling docs/results/kernels.svg
+	$(PYTHON) -m clsplat bench kernels --workloads $(WORKLOADS) -o docs/results/kernels.json \
+	  --scaling docs/results/kernels.svg
 
 # Measure the charts of docs/benchmarks.md: make bench-quality DATA=folder of real scenes. This takes an hour and a half
 # on two cores. Finished trainings are not repeated (make bench-quality METHODS=paper-30k adds four hours).

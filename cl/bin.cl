@@ -25,6 +25,10 @@
 //   bin_list_keys  the depth key of each entry
 //   (sort)         the entries of each tile by this key, stable, and bin_gather
 //
+// The host does not wait for M before it queues bin_scatter or bin_emit. Lists have room for about as many entries as
+// the lists before them. Where M, which is sums[last] of the scan, exceeds this room, these two kernels write nothing;
+// they run again with enough room.
+//
 // Counting and emitting use the same function, walk_tiles, so that they always agree.
 //
 // Buffers: N splats, M intersections, T = tiles_x tiles_y tiles in row-major order, W runs; see above and project.cl.
@@ -184,9 +188,10 @@ __kernel void bin_totals(const uint runs, const uint tile_count, __global uint *
 
 __kernel void bin_scatter(const uint n, const uint runs, const uint tile_count, const int width, const int height,
                           const __global uint *order, const __global Ellipse *ellipses, __global uint *counters,
-                          const __global uint *tile_begins, const __global uint *first_slots,
-                          __global uint *gauss_ids, __global uint *slots) {
-    if (get_global_id(0) >= runs)
+                          const __global uint *tile_begins, const __global uint *first_slots, const uint room,
+                          const uint last, const __global ulong *sums, __global uint *gauss_ids,
+                          __global uint *slots) {
+    if (get_global_id(0) >= runs || sums[last] > room)
         return;
     const uint run = run_of(get_global_id(0), runs);
     counters += (size_t)tile_count * run;
@@ -215,10 +220,10 @@ __kernel void bin_count(const uint n, const int width, const int height, const _
 }
 
 __kernel void bin_emit(const uint n, const int width, const int height, const __global uint *order,
-                       const __global Ellipse *ellipses, const __global uint *first_slots, __global uint *tiles,
-                       __global uint *slot_gauss) {
+                       const __global Ellipse *ellipses, const __global uint *first_slots, const uint room,
+                       const uint last, const __global ulong *sums, __global uint *tiles, __global uint *slot_gauss) {
     const uint i = get_global_id(0);
-    if (i < n)
+    if (i < n && sums[last] <= room)
         walk_tiles(LIST, order[i], ellipses[order[i]], width, height, first_slots[i], 0, tiles, slot_gauss);
 }
 

@@ -1,9 +1,8 @@
 """Device memory: blocks of a pool within a limit, and arrays of them."""
 
-from copy import copy
 from functools import lru_cache
 from math import prod
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyopencl as cl
@@ -17,6 +16,27 @@ SAME_ORDER = 4
 
 BLANKS = 256
 """Number of shapes whose arrays are made by copying one. A training step has some forty."""
+
+
+class Reading:
+    """The last value of an array, copied to the host while the host queues more work.
+
+    It waits for the value when it is converted to a number, not before.
+    """
+
+    def __init__(self, array: cl.array.Array):
+        self._value = np.empty(1, array.dtype)
+        last = array.nbytes - array.dtype.itemsize
+        queue, memory = cast(cl.CommandQueue, array.queue), cast(cl.Buffer, array.base_data)
+        self._event = cl.enqueue_copy(queue, self._value, memory, src_offset=last, is_blocking=False)
+
+    def __int__(self) -> int:
+        self._event.wait()
+        return int(self._value[0])
+
+    def __float__(self) -> float:
+        self._event.wait()
+        return float(self._value[0])
 
 
 class Buffers:
@@ -64,9 +84,15 @@ class Buffers:
                 f"{what}: needs a buffer of {nbytes / 2**20:.0f} MiB, but {self._label} allows at most "
                 f"{self._most / 2**20:.0f} MiB per buffer; use fewer Gaussians or a smaller image (--downscale)"
             )
-        result = copy(self._blank(shape, dtype))
-        result.events = []
-        result.base_data = self.allocate(what, nbytes) if nbytes else None
+        return self._array(shape, dtype, self.allocate(what, nbytes) if nbytes else None)
+
+    def first(self, array: cl.array.Array, count: int) -> cl.array.Array:
+        """The first `count` values of a flat array, in the same memory."""
+        return array if array.shape == (count,) else self._array((count,), array.dtype, array.base_data)
+
+    def _array(self, shape: tuple[int, ...], dtype: np.dtype[Any], memory: Any) -> cl.array.Array:
+        result = cl.array.Array.__new__(cl.array.Array)
+        vars(result).update(vars(self._blank(shape, dtype)), events=[], base_data=memory)
         return result
 
     def _new_blank(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> cl.array.Array:
@@ -80,7 +106,7 @@ class Buffers:
         """Bytes that the pool allocates for a buffer of `nbytes`: it rounds up to a size class."""
         return int(self.pool.alloc_size(self.pool.bin_number(nbytes)))
 
-    def _capacity(self, what: str, nbytes: int) -> int:
+    def capacity(self, what: str, nbytes: int) -> int:
         """Bytes to allocate for `nbytes`: the largest size of this name so far, if within `SAME_ORDER`.
 
         Lists of intersections differ in length from image to image. Blocks of one size can be reused.
@@ -96,7 +122,7 @@ class Buffers:
 
     def allocate(self, what: str, nbytes: int) -> cl.MemoryObjectHolder:
         """A block of at least `nbytes`. Errors as for `empty`."""
-        capacity = self._capacity(what, nbytes)
+        capacity = self.capacity(what, nbytes)
         if self.memory + self._block(capacity) > self._limit:
             self.pool.free_held()
             capacity = nbytes

@@ -109,7 +109,7 @@ class Camera:
         """Depth of the near plane, world units: `near`, or NEAR where it is not given."""
         return NEAR if self.near is None else self.near
 
-    @property
+    @cached_property
     def position(self) -> NDArray[np.float64]:
         """Camera centre in world units, (3,)."""
         return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), dtype=np.float64)

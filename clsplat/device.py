@@ -93,6 +93,13 @@ def select_device(name: str | None = None) -> cl.Device:
     return min(devices, key=lambda d: next((i for i, kind in enumerate(kinds) if d.type & kind), len(kinds)))
 
 
+def _converted(argument: Any) -> Any:
+    """A kernel's argument as pyopencl takes it. An int becomes its lower 32 bits, unsigned or not the same."""
+    if isinstance(argument, cl.array.Array):
+        return argument.data
+    return argument & 0xFFFFFFFF if isinstance(argument, int) else argument
+
+
 class Device:
     """An OpenCL device with its queue, programs and buffers.
 
@@ -116,6 +123,8 @@ class Device:
         Values of the constants of the rendering model.
     buffers : Buffers
         Its memory.
+    lengths : dict
+        Lengths of lists when they were last made, by name. The next ones are probably similar.
     """
 
     def __init__(
@@ -141,7 +150,9 @@ class Device:
         self.queue = cl.CommandQueue(self.context)
         self.memory_limit = min(memory_limit or self.cl_device.global_mem_size, self.cl_device.global_mem_size)
         self.buffers = Buffers(self.queue, self.label, self.memory_limit)
+        self.lengths: dict[str, int] = {}
         self._constants: dict[str, tuple[bytes, cl.array.Array]] = {}
+        self._programs: dict[tuple[Any, ...], cl.Program] = {}
         self._kernels: dict[tuple[str, tuple[Any, ...]], cl.Kernel] = {}
         self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}
         self._kept: dict[str, tuple[Any, ...]] = {}
@@ -266,19 +277,23 @@ class Device:
             global_size = (-(-global_size[0] // group[0]) * group[0],)
         program = (stage, *sorted((defines or {}).items()))
         if (kernel, program) not in self._kernels:
-            for built in self.program(stage, defines or {}).all_kernels():
-                self._kernels[built.function_name, program] = built
-        converted = [self._argument(a) for a in arguments]
+            if program not in self._programs:
+                self._programs[program] = self.program(stage, defines or {})
+            built = cl.Kernel(self._programs[program], kernel)
+            # pyopencl passes a value whose type it does not know beforehand several times more slowly.
+            built.set_scalar_arg_dtypes([self._type_of(a) for a in arguments])
+            self._kernels[kernel, program] = built
+        converted = [_converted(a) for a in arguments]
         self._kernels[kernel, program](self.queue, global_size, group, *converted)
 
-    def _argument(self, value: Any) -> Any:
-        if isinstance(value, cl.array.Array):
-            return value.data
-        if isinstance(value, int):
-            return np.int32(value) if value < 2**31 else np.uint32(value)
-        if isinstance(value, float):
-            return self.real.type(value)
-        return value
+    def _type_of(self, argument: Any) -> np.dtype[Any] | None:
+        """Type of a number or struct passed to a kernel; None for arrays, vectors and local memory."""
+        if isinstance(argument, int):
+            return np.dtype(np.uint32)
+        if isinstance(argument, float):
+            return self.real
+        known = isinstance(argument, np.generic) or (isinstance(argument, np.ndarray) and argument.dtype.names)
+        return argument.dtype if known else None
 
     def program(self, stage: str, defines: dict[str, Any]) -> cl.Program:
         """Build cl/`stage`.cl with `defines`, the model's constants and the device's real type.

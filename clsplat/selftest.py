@@ -170,11 +170,16 @@ def test_finite(b: Bench) -> Found:
     yield np.array(b.stages.count_not_finite(b.up(values))), np.array(2)
 
 
+def test_take(b: Bench) -> Found:
+    values, rows = b.random(40, 3), np.array([39, -1, 0, 0, 7])
+    yield b.stages.take_rows(b.up(values), rows), reference.take_rows(values, rows)
+
+
 def test_loss(b: Bench) -> Found:
     photo = b.rng.integers(0, 256, b.image.rgb.shape, dtype=np.uint8)
     loss, v_image = b.stages.l1_ssim(b.up(b.image.rgb), b.up(photo), 0.2)
     expected, v_expected = reference.l1_ssim(b.image.rgb, photo, 0.2)
-    yield np.array(loss), np.array(expected)
+    yield np.array(float(loss)), np.array(expected)
     yield v_image, v_expected
 
 

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 import pytest
+from device_opening import open_device
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MIN, EXTENT_SLACK
@@ -253,3 +254,38 @@ def test_too_many_intersections(device):
     )
     with pytest.raises(DeviceError, match="intersections of Gaussians and tiles: expected a total below 2"):
         bins_on(device, splats, 8192, 8192, 16)
+
+
+@pytest.mark.parametrize("variants", ["cpu", "gpu"])
+def test_lists_longer_than_the_last_ones(monkeypatch, variants):
+    """Their kernel, queued with too little room, writes nothing and runs again."""
+    monkeypatch.setenv("CLSPLAT_VARIANTS", variants)
+    device = open_device(np.float64)
+    few, many = make_splats(30, seed=1), make_splats()
+    launched = []
+    launch = Device.launch
+
+    def recorded(self, stage, kernel, *arguments, **options):
+        launched.append(kernel)
+        launch(self, stage, kernel, *arguments, **options)
+
+    monkeypatch.setattr(Device, "launch", recorded)
+    for splats, runs in ((few, 2), (few, 1), (many, 2), (many, 1), (few, 1), (many, 2)):
+        launched.clear()
+        actual = bins_on(device, splats, 150, 110, 16)
+        assert_same(actual, reference.bin_splats(splats, 150, 110, 16))
+        assert sum(kernel in ("bin_scatter", "bin_emit") for kernel in launched) == runs
+
+
+def test_little_memory_for_lists_as_long_as_the_last_ones():
+    """Shorter lists fit where those of the last length, which are tried first, do not."""
+    device = open_device(np.float64)
+    few, many = make_splats(30, seed=1), make_splats(3000)
+    expected = bins_on(device, few, 150, 110, 16)
+    bins_on(device, many, 150, 110, 16)
+    device.buffers.pool.free_held()
+    m = device.lengths["intersections"]
+    held = device.upload("held", np.zeros(4 * m, np.uint32), np.uint32)
+    device.buffers._limit = device.memory + 3 * m  # less than a list of m entries of 4 bytes
+    assert len(held)
+    assert_same(bins_on(device, few, 150, 110, 16), expected)

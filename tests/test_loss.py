@@ -48,7 +48,7 @@ def on_device(device, image, photo, weight, mask=None):
     loss, v_image = ops.l1_ssim(
         device, *arrays, weight, None if mask is None else device.upload("mask", mask, np.uint8)
     )
-    return loss, v_image.get()
+    return float(loss), v_image.get()
 
 
 def check(device, tolerances, image, photo, weight=0.2, mask=None):

@@ -165,7 +165,7 @@ def test_nothing_depends_on_uninitialised_memory(configured_device, compositor, 
         photo = configured_device.upload("photo", np.full((38, 53, 3), 99), np.uint8)
         image = configured_device.upload("image", rendering.rgb)
         loss, v_image = ops.l1_ssim(configured_device, image, photo, 0.2)
-        return [*images(rendering), *v.gaussians.arrays().values(), v.means2d, v.viewmat, loss, v_image.get()]
+        return [*images(rendering), *v.gaussians.arrays().values(), v.means2d, v.viewmat, float(loss), v_image.get()]
 
     expected = everything()
     assert (expected[1] > 0.999).any() and (expected[1] == 0).any()

@@ -60,6 +60,8 @@ class Kernels:
         """Run the command."""
         from clsplat.bench.kernel_report import details, networks, save_scaling_chart, summary
         from clsplat.bench.kernels import bench_kernels
+        from clsplat.bench.time_model import LEAST_WORKLOADS
+        from clsplat.bench.time_report import model_text
         from clsplat.device import Device, select_device
 
         _check(self.out, "--scaling", self.scaling)
@@ -74,6 +76,8 @@ class Kernels:
         print(f"{summary(results)}\n\n{networks(results)}")
         for workload in results["workloads"]:
             print(f"\n{details(workload)}")
+        if len(results["workloads"]) > LEAST_WORKLOADS:
+            print(f"\n{model_text(results)}")
 
     def _workloads(self) -> list[Workload]:
         if self.scene is not None and self.scaling is not None:

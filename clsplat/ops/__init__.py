@@ -28,6 +28,7 @@ from clsplat.ops.rays import rays_bwd, rays_fwd
 from clsplat.ops.removal import removal
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
+from clsplat.ops.take import take_rows
 from clsplat.ops.voxels import voxels_bwd, voxels_fwd, voxels_tv
 
 
@@ -54,6 +55,7 @@ class Launches:
         self.observe = partial(observe, device)
         self.adam_step = partial(adam_step, device)
         self.add_noise = partial(add_noise, device)
+        self.take_rows = partial(take_rows, device)
         self.count_not_finite = partial(count_not_finite, device)
         self.pixel_sizes = partial(pixel_sizes, device)
         self.filter_fwd = partial(filter_fwd, device)

@@ -1,17 +1,22 @@
 """Launch of the stage bin (cl/bin.cl)."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
+from clsplat.buffers import Reading
 from clsplat.device import Device
-from clsplat.errors import InputError
+from clsplat.errors import DeviceError, InputError
 from clsplat.ops.scan import checked_total, queue_scan
 from clsplat.ops.sort import argsort, argsort_segments
 from clsplat.stages import AnySplats, Bins
 
 WHAT = "intersections of Gaussians and tiles"
+
+# Name of the lists of intersections in device memory, and bytes of an entry.
+LIST, ENTRY = "intersections", 4
 
 
 def bin_splats(
@@ -80,7 +85,34 @@ def bin_splats(
 
 def _list(device: Device, m: int) -> Array:
     """A list of m entries. A buffer cannot be empty, so a list without entries has one unused entry."""
-    return device.empty("intersections", max(m, 1), np.uint32)[:m]
+    return device.buffers.first(device.empty(LIST, max(m, 1), np.uint32), m)
+
+
+def _filled(device: Device, sums: Array, count: int, fill: Callable[[list[Any], list[Array]], None]) -> list[Array]:
+    """Make `count` lists of M entries by `fill`, where `sums` of `queue_scan` ends with M.
+
+    The device fills them while the host waits for M: they have room for as many entries as the largest lists of late.
+    If there are more, nothing was written, and `fill` runs again. Its arguments are those of the kernel that tell the
+    room and M, and the lists.
+    """
+    reading, last = Reading(sums), sums.shape[0] - 1
+
+    def made(room: int) -> list[Array]:
+        lists = [device.empty(LIST, room, np.uint32) for _ in range(count)]
+        fill([room, last, sums], lists)
+        return lists
+
+    room = device.buffers.capacity(LIST, ENTRY * device.lengths.get(LIST, 1)) // ENTRY
+    try:
+        lists = made(room)
+    except DeviceError:  # there may be memory for lists of M entries
+        room, lists = -1, []
+    m = checked_total(reading, WHAT)
+    device.lengths[LIST] = max(m, 1)
+    if m > room:
+        lists.clear()  # their memory is free before that of the others is needed
+        lists = made(max(m, 1))
+    return [device.buffers.first(a, m) for a in lists]
 
 
 def _gather(device: Device, m: int, permutation: Array, values: Array, defines: dict[str, Any]) -> Array:
@@ -97,7 +129,7 @@ def _counting_sort(
     head = [n, runs, tile_count, *geometry]
     counters = device.empty("tile counters", (runs, tile_count), np.uint32)
     # Without gradients, the kernels do not access these.
-    counts = first_slots = slots = counters
+    counts = first_slots = counters
     if defines["GRADIENTS"]:
         counts = device.empty("tiles per Gaussian", n, np.uint32)
     device.launch("bin", "bin_histogram", (runs,), [*head, counters, counts], defines=defines, group=(1,))
@@ -106,16 +138,15 @@ def _counting_sort(
     tile_begins, partial = queue_scan(device, totals)
     if defines["GRADIENTS"]:
         first_slots, _ = queue_scan(device, counts)
-    m = checked_total(partial, WHAT)
-    gauss_ids = _list(device, m)
-    if defines["GRADIENTS"]:
-        slots = _list(device, m)
-    if m:
-        arguments = [*head, counters, tile_begins, first_slots, gauss_ids, slots]
+
+    def scatter(room: list[Any], lists: list[Array]) -> None:
+        arguments = [*head, counters, tile_begins, first_slots, *room, lists[0], lists[-1]]
         device.launch("bin", "bin_scatter", (runs,), arguments, defines=defines, group=(1,))
+
+    gauss_ids, *slots = _filled(device, partial, 1 + defines["GRADIENTS"], scatter)
     tile_ranges = device.empty("tile ranges", (tile_count, 2), np.uint32)
     device.launch("bin", "bin_ranges", (tile_count,), [tile_count, tile_begins, tile_ranges], defines=defines)
-    return gauss_ids, slots, first_slots, tile_ranges
+    return gauss_ids, slots[0] if slots else gauss_ids, first_slots, tile_ranges
 
 
 def _radix_sort(
@@ -125,13 +156,15 @@ def _radix_sort(
     counts = device.empty("tiles per Gaussian", n, np.uint32)
     device.launch("bin", "bin_count", (n,), [n, *geometry, counts], defines=defines)
     first_slots, partial = queue_scan(device, counts)
-    m = checked_total(partial, WHAT)
-    tiles, slot_gauss = _list(device, m), _list(device, m)
+
+    def emit(room: list[Any], lists: list[Array]) -> None:
+        device.launch("bin", "bin_emit", (n,), [n, *geometry, first_slots, *room, *lists], defines=defines)
+
+    tiles, slot_gauss = _filled(device, partial, 2, emit)
+    m = tiles.shape[0]
     tile_ranges = device.empty("tile ranges", (tile_count, 2), np.uint32)
     gauss_ids = slots = slot_gauss
     if m:
-        arguments = [n, *geometry, first_slots, tiles, slot_gauss]
-        device.launch("bin", "bin_emit", (n,), arguments, defines=defines)
         if defines["GRADIENTS"]:
             tiles, slots = argsort(device, tiles, tile_count.bit_length())
             gauss_ids = _gather(device, m, slots, slot_gauss, defines)

@@ -2,6 +2,7 @@
 
 from pyopencl.array import Array
 
+from clsplat.buffers import Reading
 from clsplat.constants import SSIM_C1, SSIM_C2, SSIM_TAPS
 from clsplat.device import GROUP, Device
 
@@ -19,7 +20,7 @@ BAND_MIN, BAND_MAX = 16, 64
 
 def l1_ssim(
     device: Device, image: Array, photo: Array, ssim_weight: float, mask: Array | None = None
-) -> tuple[float, Array]:
+) -> tuple[Reading, Array]:
     """Training loss and its gradient.
 
     Parameters
@@ -33,7 +34,8 @@ def l1_ssim(
 
     Returns
     -------
-    loss : float
+    loss : Reading
+        The host waits for it when it is converted to a number.
     v_image : (H, W, 3) real
     """
     height, width, _ = image.shape
@@ -67,4 +69,6 @@ def l1_ssim(
         ("loss_grad", (groups * group, bands), (group, 1), [*shared, v_image]),
     ):
         device.launch("loss", kernel, size, arguments, defines=defines, group=local)
-    return float(loss.get()[0]), v_image
+        if kernel == "loss_sum":
+            reading = Reading(loss)
+    return reading, v_image

@@ -3,6 +3,7 @@
 import numpy as np
 from pyopencl.array import Array
 
+from clsplat.buffers import Reading
 from clsplat.device import GROUP, Device
 from clsplat.errors import DeviceError
 
@@ -32,12 +33,12 @@ def exclusive_scan(device: Device, values: Array, what: str = "scan") -> tuple[A
         If the total exceeds 2^32 - 1.
     """
     sums, partial = queue_scan(device, values)
-    return sums, checked_total(partial, what)
+    return sums, checked_total(Reading(partial), what)
 
 
-def checked_total(partial: Array, what: str) -> int:
-    """Read back the total of `queue_scan` from the device. Errors as for `exclusive_scan`."""
-    total = int(partial[-1].get())
+def checked_total(reading: Reading, what: str) -> int:
+    """Wait for the total of `queue_scan`. Errors as for `exclusive_scan`."""
+    total = int(reading)
     if total >= 2**32:
         raise DeviceError(
             f"{what}: expected a total below 2^32, found {total}; use fewer Gaussians or a smaller image"

@@ -25,4 +25,5 @@ from clsplat.reference.rays import rays_bwd, rays_fwd
 from clsplat.reference.removal import removal
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
+from clsplat.reference.take import take_rows
 from clsplat.reference.voxels import voxels_bwd, voxels_fwd, voxels_tv

@@ -1,6 +1,6 @@
 """Corrections per photo around a step: camera, mask and background before it, exposure within it, pose after it."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
 
@@ -43,7 +43,7 @@ def example(
 
 def compare(
     image: Image, seen: Example, progress: float, state: State, config: TrainConfig, renderer: Renderer
-) -> tuple[float, Image]:
+) -> tuple[SupportsFloat, Image]:
     """Loss of a render against its photo, and its gradients; takes a step on the photo's exposure, if it is learned.
 
     Parameters
@@ -57,7 +57,8 @@ def compare(
 
     Returns
     -------
-    loss : float
+    loss : convertible to float
+        That of a device is waited for when it is converted.
     v_image : Image
         Gradients with respect to the render.
     """

@@ -32,12 +32,13 @@ class Moments:
         first, second = (Gaussians(**{k: np.zeros_like(a) for k, a in gaussians.arrays().items()}) for _ in range(2))
         return cls(first, second)
 
-    def take(self, rows: Array, fresh: Array) -> "Moments":
-        """Moments after an edit: row i continues row rows[i], or starts at 0 where fresh[i]."""
-        moved = Moments(self.first.take(rows), self.second.take(rows))
-        for array in (*moved.first.arrays().values(), *moved.second.arrays().values()):
-            array[fresh] = 0
-        return moved
+    def take(self, rows: Array, stages: Stages = reference) -> "Moments":
+        """Moments whose row i continues row rows[i], or is 0 where that is negative, where `stages` run."""
+
+        def taken(moments: Gaussians) -> Gaussians:
+            return Gaussians(**{name: stages.take_rows(a, rows) for name, a in moments.arrays().items()})
+
+        return Moments(taken(self.first), taken(self.second))
 
 
 def sh_degree_at(iteration: int, every: int, stored: int) -> int:

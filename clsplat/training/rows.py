@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import with_degree
 from clsplat.renderer import fetch
+from clsplat.stages import Stages
 from clsplat.training.densify import Edit, Strategy
 from clsplat.training.optimizer import Moments
 
@@ -38,15 +39,18 @@ class Rows(NamedTuple):
 
     def take(self, rows: NDArray[Any]) -> "Rows":
         """Copies of some rows, on the host."""
-        moments = self.moments.take(rows, np.zeros(len(rows), bool))
-        return Rows(self.gaussians.take(rows), moments, self.strategy.take(rows))
+        return Rows(self.gaussians.take(rows), self.moments.take(rows), self.strategy.take(rows))
 
-    def after(self, edit: Edit) -> "Rows":
-        """The rows after an edit of the strategy, on the host."""
-        moments = self.moments.take(edit.rows, edit.fresh)
+    def to_edit(self) -> "Rows":
+        """The same rows as strategies edit them: on the host, but for the moments, which stay where they are."""
+        return Rows(fetch(self.gaussians), self.moments, self.strategy.on(None))
+
+    def after(self, edit: Edit, stages: Stages) -> "Rows":
+        """The rows after an edit of `to_edit`. The moments are where they were, which is where `stages` run."""
+        moments = self.moments.take(np.where(edit.fresh, -1, edit.rows), stages)
         if edit.reset_opacities:
-            moments.first.logit_opacities[:] = 0
-            moments.second.logit_opacities[:] = 0
+            for each in (moments.first, moments.second):
+                each.logit_opacities = stages.take_rows(each.logit_opacities, np.full(len(edit.rows), -1))
         return Rows(edit.gaussians, moments, self.strategy)
 
     def with_degree(self, degree: int) -> "Rows":

@@ -22,7 +22,6 @@ from clsplat.training.corrections import compare, example, learn_pose
 from clsplat.training.densify import Contributions, Edit
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
 from clsplat.training.optimizer import Optimizer, adam_settings
-from clsplat.training.rows import Rows
 from clsplat.training.state import State
 
 if TYPE_CHECKING:
@@ -134,10 +133,12 @@ class Training:
 
         Not a part of `step`, whose arrays of the old size must be freed before those of the new one are allocated.
         """
-        self.state.change_rows(self._edited(cap))
+        edit = self._edit(cap)
+        self.state.change_rows(self.state.rows.after(edit, self.optimizer.stages))
         self.state.move(self.optimizer.home)
 
-    def _edited(self, cap: int) -> Rows:
+    def _edit(self, cap: int) -> Edit:
+        """The strategy's edit. It leaves the rows where they are to be edited."""
         state = self.state
         shown = fetch(state.shown(self.renderer)) if state.filter else None
         surveyed = shown or state.gaussians
@@ -149,11 +150,11 @@ class Training:
             found = contributions(self.renderer, surveyed, chosen, sh_degree)
             return found._replace(share=len(chosen) / len(self._views))
 
-        state.move(None)
+        state.rows = state.rows.to_edit()
         edit = state.strategy.edit(state.iteration, state.gaussians, cap, survey)
         if edit.reset_opacities and shown:
             reset_shown(edit, state.gaussians, shown)
-        return state.rows.after(edit)
+        return edit
 
 
 def step(training: Training, view: View) -> float:
@@ -183,7 +184,7 @@ def step(training: Training, view: View) -> float:
     strategy.perturb(optimizer.stages, state.gaussians, iteration, settings.rates["means"])
     state.intersections = max(state.intersections, run.bins.gauss_ids.shape[0] / run.drawn.depths.shape[0])
     state.iteration = iteration
-    return loss
+    return float(loss)
 
 
 def view_at(iteration: int, views: list[View], seed: int) -> View:

@@ -4,7 +4,8 @@
 ``{config} NAME``: table of a dataclass of clsplat/config.py.
 ``{command} NAME``: output of ``clsplat NAME --help-all``.
 ``{presets}``: table of the settings of each preset.
-``{bench_kernels} FILE [WORKLOAD]``: results of ``clsplat bench kernels -o FILE``, or the stages of one workload.
+``{bench_kernels} FILE [WORKLOAD | model]``: results of ``clsplat bench kernels -o FILE``, the stages of one workload,
+or the model of the time.
 ``{bench_knobs} FILE``: table of ``clsplat bench knobs -o FILE``.
 ``{bench_viewer} FILE``: table of ``clsplat bench viewer -o FILE``.
 ``{bench_stability} FILE``: rows and charts that ``make bench-stability`` wrote to the folder of FILE.
@@ -40,6 +41,7 @@ from clsplat.bench import kernel_report as report
 from clsplat.bench.frame_rates import frames_text
 from clsplat.bench.knob_report import knobs_text
 from clsplat.bench.stability import stability_report as stability
+from clsplat.bench.time_report import model_text
 from clsplat.ranges import rule_of
 from clsplat.training import presets
 
@@ -206,7 +208,7 @@ class Command(SphinxDirective):
 
 
 class BenchKernels(SphinxDirective):
-    """``{bench_kernels} FILE [WORKLOAD]``. The path of the file is relative to the page."""
+    """``{bench_kernels} FILE [WORKLOAD | model]``. The path of the file is relative to the page."""
 
     required_arguments = 1
     optional_arguments = 1
@@ -217,6 +219,8 @@ class BenchKernels(SphinxDirective):
         results = json.loads(Path(path).read_text())
         if len(self.arguments) == 1:
             return self.parse_text_to_nodes(report.summary(results))
+        if self.arguments[1] == "model":
+            return self.parse_text_to_nodes(model_text(results))
         workload = next(w for w in results["workloads"] if w["name"] == self.arguments[1])
         return self.parse_text_to_nodes(report.details(workload))
 

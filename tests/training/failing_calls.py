@@ -57,7 +57,7 @@ def driver(kind: type[Exception], routine: str, code: int) -> Callable[[str], Ex
     return lambda _: kind(cl._cl._ErrorRecord(routine, code, ""))
 
 
-TRANSFERS = ("launch", "upload", "download", "copy", "allocate")
+TRANSFERS = ("launch", "upload", "download", "wait", "copy", "allocate")
 """Kinds of calls that all fail once a device is lost."""
 
 _STATUS = cl.status_code
@@ -84,6 +84,11 @@ FAULTS: dict[str, dict[str, Fault]] = {
     },
     "download": {
         "resources": Fault(driver(cl.RuntimeError, "clEnqueueReadBuffer", _STATUS.OUT_OF_RESOURCES), TRANSFERS)
+    },
+    "wait": {
+        "status": Fault(
+            driver(cl.RuntimeError, "clWaitForEvents", _STATUS.EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST), TRANSFERS
+        )
     },
     "copy": {"resources": Fault(driver(cl.RuntimeError, "clEnqueueCopyBuffer", _STATUS.OUT_OF_RESOURCES))},
     "launch": {"resources": Fault(driver(cl.RuntimeError, "clEnqueueNDRangeKernel", _STATUS.OUT_OF_RESOURCES))},
@@ -273,6 +278,7 @@ class Pool:
 
 def _watch_device(patch: pytest.MonkeyPatch, calls: Calls) -> None:
     allocate, launch, program, copy = Buffers.allocate, Device.launch, Device.program, cl.enqueue_copy
+    wait = cl.Event.wait
 
     def allocate_(self: Buffers, *arguments: Any) -> Any:
         pool, self.pool = self.pool, Pool(self.pool, calls)
@@ -294,6 +300,10 @@ def _watch_device(patch: pytest.MonkeyPatch, calls: Calls) -> None:
         calls.check(kinds.get((hasattr(target, "shape"), hasattr(source, "shape")), "copy"), "buffer")
         return copy(queue, target, source, **named)
 
+    def wait_(self: cl.Event) -> None:
+        calls.check("wait", "event")
+        wait(self)
+
     def counted(kind: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
             calls.check(kind, "device")
@@ -305,6 +315,7 @@ def _watch_device(patch: pytest.MonkeyPatch, calls: Calls) -> None:
     patch.setattr(Device, "launch", launch_)
     patch.setattr(Device, "program", program_)
     patch.setattr(cl, "enqueue_copy", copy_)
+    patch.setattr(cl.Event, "wait", wait_)
     named = vars(cl) | {"Context": counted("context", cl.Context), "CommandQueue": counted("queue", cl.CommandQueue)}
     patch.setattr(
         "clsplat.device.cl", SimpleNamespace(**named)

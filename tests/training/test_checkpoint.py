@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from small_run import CONFIG, same
 
+from clsplat import reference
 from clsplat.device import Device
 from clsplat.errors import InputError
+from clsplat.renderer import Renderer
 from clsplat.run_log import log_file
 from clsplat.scene import Scene
 from clsplat.training.checkpoint import load_state, save_state
@@ -42,12 +44,21 @@ def test_a_checkpoint_holds_everything(scene: Scene, tmp_path: Path) -> None:
         np.testing.assert_array_equal(loaded.strategy.statistics[name], array)
 
 
+@pytest.mark.parametrize("on_device", [False, True], ids=["on the host", "on the device"])
 @pytest.mark.parametrize("reset", [False, True])
-def test_moments_follow_an_edit(scene: Scene, reset: bool) -> None:
+def test_moments_follow_an_edit(scene: Scene, device: Device, reset: bool, on_device: bool) -> None:
     state = random_state(scene)
     before = state.rows
     rows, fresh = np.array([3, 1, 1]), np.array([False, False, True])
-    after = before.after(Edit(state.gaussians.take(rows), rows, fresh, reset_opacities=reset))
+    edit = Edit(state.gaussians.take(rows), rows, fresh, reset_opacities=reset)
+    if on_device:
+        edited = before.on(device).to_edit()
+        assert isinstance(edited.gaussians.means, np.ndarray)
+        after = edited.after(edit, Renderer(device).stages)
+        assert not isinstance(after.moments.first.means, np.ndarray)
+        after = after.on(None)
+    else:
+        after = before.after(edit, reference)
     assert len(after.gaussians) == 3
     pairs = (before.moments.first, after.moments.first), (before.moments.second, after.moments.second)
     for old, new in pairs:

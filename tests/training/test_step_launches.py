@@ -1,7 +1,9 @@
 """What a training step asks of the host: the number of launches and of reads that wait."""
 
 from pathlib import Path
+from typing import Any
 
+import pyopencl as cl
 import pytest
 from test_memory import FIXED_N, make_scene
 
@@ -31,6 +33,43 @@ def test_a_step_takes_few_launches(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert step.count("composite_pack") == 1 and step.count("composite_bwd") == 1
     expected = 2 * (4 + 2) if variants == "gpu" else 2 * 3  # passes of the sorts by depth and by tile
     assert sum(kernel in ("sort_count", "sort_scatter") for kernel in launched[2]) == expected
+
+
+@pytest.mark.parametrize("variants", ["cpu", "gpu"])
+def test_the_device_has_work_while_the_host_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variants: str
+) -> None:
+    """Each read of a step was queued before kernels that follow it, and nothing else waits."""
+    monkeypatch.setenv("CLSPLAT_VARIANTS", variants)
+    events: list[list[str]] = [[]]
+    launch, wait = Device.launch, cl.Event.wait
+
+    def launched(self: Device, stage: str, kernel: str, *arguments: object, **options: object) -> None:
+        events[-1].append(kernel)
+        launch(self, stage, kernel, *arguments, **options)  # type: ignore[arg-type]
+
+    def waited(self: cl.Event) -> None:
+        events[-1].append("wait")
+        wait(self)
+
+    def copied(*arguments: Any, **options: Any) -> cl.Event:
+        blocking = options.get("is_blocking", True)
+        events[-1].append("blocking copy" if blocking else "copy")
+        return copy(*arguments, **options)
+
+    copy = cl.enqueue_copy
+    monkeypatch.setattr(Device, "launch", launched)
+    monkeypatch.setattr(cl.Event, "wait", waited)
+    monkeypatch.setattr(cl, "enqueue_copy", copied)
+    config = TrainConfig(strategy="adc", size="fixed", iterations=STEPS, adc=FIXED_N, eval_every=0)
+    train(make_scene(2000, 288, 256), config, tmp_path, Device(), progress=lambda _: events.append([]))
+    for step in events[4:-2]:  # the first four upload their photos, and after the last the scene is finished
+        assert "blocking copy" not in step
+        assert step.count("copy") == step.count("wait") == 2
+        for _ in range(2):
+            read, until = step.index("copy"), step.index("wait")
+            assert read < until - 1, step
+            step = step[until + 1 :]
 
 
 def test_splats_are_packed_again_where_they_are_others(device: Device) -> None:

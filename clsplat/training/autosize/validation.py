@@ -87,7 +87,7 @@ def _quality(image: NDArray[np.uint8], view: View, renderer: Renderer, fitted: b
     square = float(np.mean((image[counts] / 255 - view.image[counts] / 255) ** 2))
     rgb, photo = renderer.upload("rgb", image / 255), renderer.upload("photo", view.image, np.uint8)
     unlike, _ = renderer.stages.l1_ssim(rgb, photo, 1.0, renderer.upload("mask", counts, np.uint8))
-    return (decibels(square) + decibels(unlike / counts.mean())) / 2
+    return (decibels(square) + decibels(float(unlike) / counts.mean())) / 2
 
 
 def decibels(error: float) -> float:
