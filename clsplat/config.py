@@ -59,9 +59,12 @@ class RenderConfig:
 class SfmConfig:
     """Settings of structure from motion (pycolmap: SIFT, matching, mapping)."""
 
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Pairs of photos that are matched. exhaustive: all. sequential: neighbours by file name. auto: sequential for
-    frames that clsplat extracted from a video, exhaustive otherwise."""
+    matching: Literal["auto", "exhaustive", "sequential", "gps", "vocabulary"] = "auto"
+    """Pairs of photos that are matched. exhaustive: all. sequential: neighbours by file name. gps: neighbours by the
+    positions in the photos' EXIF data. vocabulary: those that look alike. auto: sequential for frames that clsplat
+    extracted from a video, exhaustive otherwise."""
+    vocabulary: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
+    """COLMAP's vocabulary tree for SIFT, for matching by vocabulary."""
     mapper: Literal["incremental", "global"] = "incremental"
     """incremental: photos are added one after the other. global: all poses are found at once, in less time for many
     photos (GLOMAP)."""
@@ -325,7 +328,8 @@ class TrainConfig:
     """Part of the platform's or device's name. Default: PYOPENCL_CTX, or the first GPU, or a CPU."""
     memory_limit: Annotated[str | None, byte_size()] = None
     """Limit of device memory, such as 4GB or 512MiB (default: all memory of the device). The number of Gaussians
-    stops growing where more would exceed it. Photos that do not fit are uploaded each time they are needed."""
+    stops growing where more would exceed it. Photos that do not fit are uploaded each time they are needed. Decoded
+    photos in the machine's memory have the same limit (default: half of it); the others stream from the disk."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     init: InitConfig = field(default_factory=InitConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)

@@ -4,8 +4,9 @@ import json
 import math
 import os
 import re
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -18,7 +19,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, psnr_fitted, ssim, to_uint8
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
-from clsplat.scene import View
+from clsplat.scene import View, in_turn
 from clsplat.show.comparisons import save_difference, save_png
 from clsplat.show.evaluation_page import write_page
 
@@ -27,6 +28,9 @@ Metric = Callable[..., float | None]
 
 METRICS: tuple[Metric, ...] = (psnr, psnr_fitted, ssim, flip)
 """The metrics of every evaluation."""
+
+PENDING = os.cpu_count() or 1
+"""Most comparisons that wait for a thread."""
 
 
 def mean_metrics(
@@ -186,10 +190,16 @@ def compared(
         raise InputError("views: expected at least one view to evaluate, found none")
     for view in views:
         shape = view.camera.height, view.camera.width, 3
-        if view.image.shape != shape:
+        if not view.ahead and view.image.shape != shape:  # photos that stream are decoded to the size of their camera
             raise InputError(f"{view.name}: expected a photo of its camera's size, {shape}, found {view.image.shape}")
+    results: list[Result] = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(compare, range(len(views)), views, images))
+        waiting: deque[Future[Result]] = deque()
+        for index, (view, image) in enumerate(zip(in_turn(views), images, strict=True)):
+            waiting.append(pool.submit(compare, index, view, image))
+            if len(waiting) > PENDING:  # each holds a photo and a render
+                results.append(waiting.popleft().result())
+        return results + [future.result() for future in waiting]
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -1,7 +1,10 @@
 """Scenes: posed photos and sparse points, as `clsplat.dataset` loads them."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import blake2b
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +16,9 @@ Color = tuple[float, float, float]
 
 DISPARITY_MIN = 1e-6
 """Least inverse depth of a map, as a fraction of its largest: far beyond what photos of a scene resolve."""
+
+DIGEST_BYTES = 16
+"""Length of a digest: among 10^12 photos, the chance that two of them share one is 10^-15."""
 
 THUMBNAILS = 8
 """Approximate number of photos that a notebook shows of a scene."""
@@ -93,6 +99,64 @@ class View:
             return self.image
         change = self.clear[:, :, None] * (np.array(background) - np.array(loaded_on))
         return np.rint(np.clip(self.image + change, 0, 255)).astype(np.uint8)
+
+    # What follows differs for a photo that is read when it is needed (`clsplat.streaming.StreamedView`).
+
+    def loaded(self) -> "View":
+        """The view with its arrays in memory."""
+        return self
+
+    def prefetch(self) -> None:
+        """Begin to read the photo, which will be needed soon."""
+
+    @property
+    def ahead(self) -> int:
+        """Number of photos to `prefetch` while one is used; 0 for photos in memory."""
+        return 0
+
+    def with_camera(self, camera: Camera) -> "View":
+        """The photo with another camera."""
+        return replace(self, camera=camera)
+
+    def with_depth(self, depth: DepthMap | None) -> "View":
+        """The photo with a depth map, or with none."""
+        return replace(self, depth=depth)
+
+    def changed(self, change: "Callable[[View], View]", camera: Camera | None = None) -> "View":
+        """The view that `change` makes of this one, now or when it is needed; `camera` is that of the result."""
+        return change(self)
+
+    @property
+    def is_used(self) -> bool:
+        """Whether any pixel counts."""
+        return self.mask is None or bool(self.mask.any())
+
+    @property
+    def digests(self) -> tuple[str, str] | None:
+        """Digests of the pixels and of the mask (empty without one); None as long as the photo has not been read."""
+        pixels = digest(self.image) if self.clear is None else digest(self.image, self.clear)
+        return pixels, "" if self.mask is None else digest(self.mask)
+
+    def expect(self, digests: tuple[str, str]) -> None:
+        """Demand that a photo that has not been read has these digests; otherwise reading it is an InputError."""
+
+
+def digest(*arrays: NDArray[Any]) -> str:
+    """Digest of arrays, their shapes and types."""
+    result = blake2b(digest_size=DIGEST_BYTES)
+    for array in arrays:
+        result.update(f"{array.dtype.str}{array.shape}".encode())
+        result.update(np.ascontiguousarray(array).data)
+    return result.hexdigest()
+
+
+def in_turn(views: Iterable[View]) -> Iterator[View]:
+    """Yield views in their order with their arrays in memory, while the next ones are being read."""
+    views = list(views)
+    for k, view in enumerate(views):
+        for later in views[k : k + 1 + view.ahead]:
+            later.prefetch()
+        yield view.loaded()
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,7 @@ LAYERS = """
     config atomic
     camera gaussians field_stages run_log
     scene stages metrics panorama programs
+    streaming
     buffers
     structs reference device
     ops testing formats surface

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
 from clsplat.blocks.jobs import Job, digest_of, read_job
@@ -21,16 +22,20 @@ from clsplat.pruning.prices import without_invisible
 from clsplat.renderer import Renderer
 from clsplat.run_log import LOG
 from clsplat.scene import Scene, View
+from clsplat.streaming import Files, photo_budget
 from clsplat.training.checkpoint import CHECKPOINT, load_state
 from clsplat.training.inputs import Inputs
 from clsplat.training.loop import complete
-from clsplat.training.preparation import open_device
+from clsplat.training.preparation import open_device, photo_memory
 from clsplat.training.run_folder import held
 from clsplat.training.session import Training
 from clsplat.training.state import initial_state
 
 if TYPE_CHECKING:
     from clsplat.device import Device
+
+SEEN = "photos"
+"""Folder, in that of a block's training, of the photos as the block sees them, where they do not fit the memory."""
 
 Progress = Callable[[dict[str, Any]], None]
 """Called after every iteration, as the argument of `clsplat.training.loop.train`."""
@@ -85,7 +90,9 @@ def train_block(
         return result
     job = read_job(job_file)
     start = _start(job_file, job)
-    views = job.views(load_scene(job.data, job.config.data).train if loaded is None else loaded)
+    views = job.views(
+        load_scene(job.data, job.config.data, memory=photo_memory(job.config)).train if loaded is None else loaded
+    )
     device = device or open_device(job.config)
     with held(work):
         if not result.exists():
@@ -122,6 +129,24 @@ def read_scene(path: Path, config: TrainConfig) -> Gaussians:
     return replace(gaussians, sh=np.pad(gaussians.sh, ((0, 0), (0, max(0, missing)), (0, 0))))
 
 
+def _seen(
+    renderer: Renderer,
+    start: Gaussians,
+    trains: NDArray[np.bool_],
+    views: list[View],
+    config: TrainConfig,
+    folder: Path,
+) -> tuple[list[View], NDArray[np.bool_]]:
+    """The photos as the block should see them; in files of a folder, if the views stream."""
+    budget = photo_budget(photo_memory(config))
+    if budget is None or not any(view.ahead for view in views):
+        return seen_by_block(renderer, start, trains, views)
+    folder.mkdir(parents=True, exist_ok=True)
+    files = Files(folder)
+    _, shown = seen_by_block(renderer, start, trains, views, files.write)
+    return files.views(views, budget), shown
+
+
 def _trained(
     job: Job, start: Gaussians, views: list[View], device: "Device", work: Path, progress: Progress
 ) -> Gaussians:
@@ -129,13 +154,14 @@ def _trained(
     config = job.config
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     trains = job.wide.contains(start.means)
-    seen, shown = seen_by_block(renderer, start, trains, views)
+    seen, shown = _seen(renderer, start, trains, views, job.config, work / SEEN)
     scene = Scene(seen, [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     inputs = Inputs.of(scene, device)
     if (work / CHECKPOINT).exists():
         state = load_state(work / CHECKPOINT, scene.extent, config, inputs)
     else:
         state = replace(initial_state(scene, config, start.take(trains)), inputs=inputs)
+    state.inputs.demand(scene)
     training = Training(scene, config, device, state, start.take(shown & ~trains))
     gaussians = complete(training, work, progress=progress)
     inside = job.box.contains(gaussians.means)

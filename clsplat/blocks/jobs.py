@@ -1,7 +1,7 @@
 """Jobs: files that say how a block is trained, named by the digest of everything that its result depends on."""
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ from clsplat.blocks.plan import Block
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
-from clsplat.scene import View
+from clsplat.scene import DIGEST_BYTES, View
 from clsplat.training.checkpoint import FREE
-from clsplat.training.inputs import DIGEST_BYTES, Photo, named, photos_of
+from clsplat.training.inputs import Photo, named
 from clsplat.training.presets import with_settings
 
 BOXES = ("near", "box", "wide")
@@ -90,16 +90,16 @@ class Job:
         if missing:
             raise InputError(f"{self.data}: expected the photos of a block, missing {named(missing)}")
         chosen = [by_name[name] for name in self.photos]
-        found = photos_of(chosen, np.zeros(3))
-        other = [
-            n for n, photo in self.photos.items() if found[n].pixels != photo.pixels or found[n].mask != photo.mask
-        ]
+        expected = {name: (photo.pixels, photo.mask) for name, photo in self.photos.items()}
+        for view in chosen:  # those that stream are compared when they are read
+            view.expect(expected[view.name])
+        other = [view.name for view in chosen if view.digests != expected[view.name]]
         if other:
             raise InputError(
                 f"{self.data}: expected the photos that the block was planned with, found other pixels or masks "
                 f"({named(other)}); start a new run in another folder"
             )
-        return [replace(view, camera=_camera(self.cameras[view.name])) for view in chosen]
+        return [view.with_camera(_camera(self.cameras[view.name])) for view in chosen]
 
 
 def make_job(

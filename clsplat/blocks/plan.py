@@ -1,7 +1,7 @@
 """The numbers of a training in blocks: the coarse run, how many blocks, their photos, Gaussians and memory."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,9 @@ from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene
 from clsplat.training.autosize.validation import FEWEST_PHOTOS
-from clsplat.training.densify import STRATEGIES
 from clsplat.training.memory import Footprint, bytes_text
 from clsplat.training.outcome import FEWEST_GAUSSIANS
+from clsplat.training.preparation import of_fixed_size
 from clsplat.training.run_length import with_iterations
 
 if TYPE_CHECKING:
@@ -72,7 +72,10 @@ class Plan(NamedTuple):
     def describe(self, config: TrainConfig, scene: Scene, seconds: float) -> str:
         """A sentence on blocks, photos, memory, time and size; seconds: of an iteration with photos of full size."""
         photos = [len(block.photos) for block in self.blocks]
-        bytes_of = [sum(scene.train[i].image.nbytes for i in block.photos) for block in self.blocks]
+        bytes_of = [
+            sum(3 * scene.train[i].camera.width * scene.train[i].camera.height for i in block.photos)
+            for block in self.blocks
+        ]
         steps = sum(block_config(config, scene, block).iterations for block in self.blocks)
         steps += round(REFINING_LENGTH * steps)
         largest = max(block.gaussians for block in self.blocks)
@@ -136,16 +139,8 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
 
 def refining_config(config: TrainConfig, gaussians: int) -> TrainConfig:
     """The configuration of a block's second training, of the Gaussians that it has."""
-    still: dict[str, Any] = {name: replace(getattr(config, name), stop_fraction=0.0) for name in STRATEGIES}
-    return replace(
-        config,
-        **still,
-        size="fixed",
-        max_gaussians=gaussians,
-        iterations=max(1, round(REFINING_LENGTH * config.iterations)),
-        optim=replace(config.optim, means_lr=REFINING_RATE * config.optim.means_lr),
-        coarse=CoarseConfig(),
-    )
+    iterations = max(1, round(REFINING_LENGTH * config.iterations))
+    return replace(of_fixed_size(config, gaussians, REFINING_RATE), iterations=iterations)
 
 
 def expected_total(config: TrainConfig, coarse: int) -> int:

@@ -1,6 +1,6 @@
 """What a scene shows in photos: the weights of its Gaussians, by which blocks choose photos and share pixels."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from clsplat.constants import ALPHA_MIN, SH_C0
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.renderer import Pass, Renderer, download
-from clsplat.scene import View
+from clsplat.scene import View, in_turn
 from clsplat.stages import Image
 
 Array = NDArray[np.float64]
@@ -94,7 +94,11 @@ def chosen_photos(shares: Array, fewest: int) -> NDArray[np.intp]:
 
 
 def seen_by_block(
-    renderer: Renderer, gaussians: Gaussians, trains: NDArray[np.bool_], views: Iterable[View]
+    renderer: Renderer,
+    gaussians: Gaussians,
+    trains: NDArray[np.bool_],
+    views: Iterable[View],
+    keep: Callable[[View], None] | None = None,
 ) -> tuple[list[View], NDArray[np.bool_]]:
     """Make the photos as a block should see them, and find the Gaussians that they show.
 
@@ -110,6 +114,8 @@ def seen_by_block(
     trains : (N,) bool
         The Gaussians that the block trains.
     views : iterable of View
+    keep : callable, optional
+        Called with each view that is made, which is then not in the result: it may not fit the memory.
 
     Returns
     -------
@@ -122,14 +128,15 @@ def seen_by_block(
     black = Renderer(renderer.device or "reference", renderer.config)
     shown = np.zeros(len(gaussians), bool)
     result = []
-    for view in views:
+    for view in in_turn(views):
         run = renderer.forward(placed, view.camera)
         shown |= _weights(renderer, run) > 0
         image = np.clip(download(run.image.rgb), 0, 1, dtype=np.float64)
         marked = black.forward(marks, view.camera, gradients=False).image
         share = download(marked.rgb)[:, :, :1] / np.maximum(download(marked.alpha)[:, :, None], ALPHA_MIN)
         blended = image + np.clip(share, 0, 1) * (view.image / 255 - image)
-        result.append(replace(view, image=to_uint8(blended)))
+        made = replace(view, image=to_uint8(blended))
+        result.append(made) if keep is None else keep(made)
     return result, shown
 
 

@@ -25,14 +25,15 @@ from clsplat.blocks.plan import (
     refining_config,
 )
 from clsplat.config import BACKGROUNDS, TrainConfig
+from clsplat.errors import InputError
 from clsplat.formats import load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
 from clsplat.run_log import LOG
-from clsplat.scene import Scene
+from clsplat.scene import Scene, in_turn
 from clsplat.show.training_curve import read_log
 from clsplat.training.checkpoint import CHECKPOINT, FREE
-from clsplat.training.inputs import photos_of
+from clsplat.training.inputs import Photo, photos_of
 from clsplat.training.loop import train
 
 if TYPE_CHECKING:
@@ -89,8 +90,8 @@ def plan_blocks(
         return [], []
     folder = out / BLOCKS
     folder.mkdir(parents=True, exist_ok=True)
-    photos = photos_of(scene.train, scene.offset)
-    file, seconds = _coarse(scene, config, device, folder, json.dumps(photos), watch)
+    file, seconds = _coarse(scene, config, device, folder, watch)
+    photos = _read_photos(scene)
     coarse = read_scene(file, config)
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     plan = make_plan(coarse, scene, config, renderer)
@@ -143,10 +144,23 @@ def _save(gaussians: Gaussians, folder: Path, config: TrainConfig) -> str:
     return name
 
 
-def _coarse(
-    scene: Scene, config: TrainConfig, device: "Device", folder: Path, photos: str, watch: Watch
-) -> tuple[Path, float]:
-    """Train the coarse scene, unless it exists. Returns its file and the seconds that an iteration took."""
+def _read_photos(scene: Scene) -> dict[str, Photo]:
+    """The training photos with their digests. Those that stream are read, if the coarse run has not read them."""
+    photos = photos_of(scene.train, scene.offset)
+    if all(photo.pixels for photo in photos.values()):
+        return photos
+    for _ in in_turn(view for view in scene.train if not photos[view.name].pixels):
+        pass  # reading a photo makes its digest known
+    return photos_of(scene.train, scene.offset)
+
+
+def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, watch: Watch) -> tuple[Path, float]:
+    """Train the coarse scene, unless it exists. Returns its file and the seconds that an iteration took.
+
+    Photos that stream have not been read before. The run is then named by their names and cameras alone, and the
+    record holds a digest of their pixels.
+    """
+    photos = json.dumps(photos_of(scene.train, scene.offset))
     settings = coarse_config(config, scene, device)
     bound = {name: value for name, value in asdict(settings).items() if name not in FREE}
     digest = digest_of(json.dumps(bound, sort_keys=True).encode(), photos.encode(), scene.points.tobytes())
@@ -157,10 +171,20 @@ def _coarse(
             gaussians = train(scene, settings, work, device, resume=resume, progress=progress)
         seconds = read_log(work / LOG)[-1]["seconds"] / settings.iterations
         with replacing(done) as file:
-            file.write(json.dumps({"scene": _save(gaussians, folder, settings), "seconds": seconds}).encode())
+            record = {"scene": _save(gaussians, folder, settings), "seconds": seconds, "photos": _digest(scene)}
+            file.write(json.dumps(record).encode())
         shutil.rmtree(work, ignore_errors=True)
     record = json.loads(done.read_text())
+    if record.get("photos", _digest(scene)) != _digest(scene):
+        raise InputError(
+            f"{done}: expected the photos of the coarse run, found other pixels or masks; start a new run in another "
+            "folder"
+        )
     return folder / record["scene"], record["seconds"]
+
+
+def _digest(scene: Scene) -> str:
+    return digest_of(json.dumps(_read_photos(scene)).encode())
 
 
 def unfinished(jobs: list[Path]) -> list[Path]:

@@ -62,6 +62,7 @@ class JobsPrinted(Exception):
 
 def _run(jobs: list[Path], scene: "Scene", device: "Device", watch: "Watch", where: ClusterOptions) -> None:
     """Train the blocks that have no result, where the options say."""
+    from clsplat.blocks.local import devices_like, run_on_devices
     from clsplat.blocks.whole import run_here, unfinished
 
     if where.print_jobs and unfinished(jobs):
@@ -72,6 +73,9 @@ def _run(jobs: list[Path], scene: "Scene", device: "Device", watch: "Watch", whe
         from clsplat.blocks.cluster import run_on_cluster
 
         run_on_cluster(where.scheduler, jobs, say)
+    elif len(alike := devices_like(device)) > 1:
+        say(f"blocks: {len(alike)} devices of this name train one each")
+        run_on_devices(jobs, alike, say)
     else:
         run_here(jobs, scene, device, watch)
 

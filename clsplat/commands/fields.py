@@ -53,10 +53,18 @@ def train_and_evaluate(
     from clsplat.fields import METHODS
     from clsplat.fields.field_files import MODEL
     from clsplat.fields.field_training import train_field
+    from clsplat.streaming import photo_budget
+    from clsplat.training.memory import bytes_text
 
     kind = METHODS[method]
     config = replace(config, iterations=config.iterations or kind.iterations)
     scene = load_scene(data, replace(config.data, random_background=True))
+    need = sum(3 * view.camera.width * view.camera.height for view in scene.train + scene.test)
+    if (budget := photo_budget(None)) is not None and need > budget:
+        raise InputError(
+            f"{data}: expected photos that fit {bytes_text(budget)}, half of this machine, as a field trains "
+            f"on all pixels at once, found {bytes_text(need)}; use a higher --downscale"
+        )
     if not resume:
         write_json(out / CONFIG, {DATA_PATH: str(data.resolve()), **asdict(config)})
     every = config.eval_every or config.iterations

@@ -1,6 +1,7 @@
 """The commands `frames`, `sfm` and `export`."""
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,14 +20,15 @@ from clsplat.commands.console import (
     say_cameras,
 )
 from clsplat.commands.options import PageOptions
-from clsplat.commands.run_folders import scene_file, with_run
-from clsplat.config import Mode, SfmConfig
+from clsplat.commands.run_folders import is_run, read_run, scene_file, with_run
+from clsplat.config import Mode, SfmConfig, TrainConfig
 from clsplat.errors import InputError
 from clsplat.formats.spz_container import Axes, Version
 from clsplat.ranges import within
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
+    from clsplat.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -124,20 +126,29 @@ class Export:
         say(f"{out}: {len(gaussians)} Gaussians, {out.stat().st_size / 1e6:.3g} MB")
 
     def _levels(self, out: Path, gaussians: "Gaussians", mode: Mode, offset: Any) -> None:
-        """Write levels of detail."""
+        """Write levels of detail; those of a run with its dataset are refined against its photos."""
+        from clsplat.formats.detail_tree import Node
         from clsplat.formats.streamed_sog import LOD_META, StreamedSogWriter
         from clsplat.formats.tiles_3d import TILESET, TilesWriter
         from clsplat.pruning.levels import detail_tree
+        from clsplat.training.level_refinement import refined
+        from clsplat.training.preparation import open_device
 
         folder = out.parent if out.suffix else out
         new_folder(folder)
+        scene, config = self._photos()
+        if scene is not None:
+            gaussians, offset = moved(gaussians, offset - scene.offset), scene.offset
         writers: list[StreamedSogWriter | TilesWriter] = []
         if out.name != TILESET:
             writers.append(StreamedSogWriter(folder, mode, offset))
         if out.name != LOD_META:
             writers.append(TilesWriter(folder, mode, offset))
         counts: Counter[int] = Counter()
-        for node in detail_tree(gaussians):
+        nodes: Iterable[Node] = detail_tree(gaussians)
+        if scene is not None:
+            nodes = refined(nodes, scene, config, open_device(config), say)
+        for node in nodes:
             counts[node.height] += len(node.gaussians)
             for writer in writers:
                 writer.add(node)
@@ -146,6 +157,20 @@ class Export:
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
         of_levels = ", ".join(str(counts[height]) for height in sorted(counts))
         say(f"{folder}: {len(counts)} levels of {of_levels} Gaussians, {size / 1e6:.3g} MB")
+
+    def _photos(self) -> "tuple[Scene | None, TrainConfig]":
+        """The dataset of the run that is exported, and its settings; None without held-out photos."""
+        from clsplat.dataset import load_scene
+        from clsplat.training.preparation import photo_memory
+
+        if not is_run(self.scene) or self.data is None:
+            return None, TrainConfig()
+        config = read_run(self.scene).config
+        scene = load_scene(self.data, config.data, memory=photo_memory(config))
+        if not scene.test:
+            say("levels: not refined, as no held-out photo can show whether that pays")
+            return None, config
+        return scene, config
 
     def _page(self, out: Path, gaussians: "Gaussians", mode: Mode, offset: Any) -> None:
         from clsplat.dataset import load_scene

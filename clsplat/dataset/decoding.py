@@ -3,7 +3,6 @@
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from math import floor
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,11 +12,13 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, DataConfig
-from clsplat.dataset.lenses import Intrinsics, is_pinhole, project, rendered, undistorted
+from clsplat.dataset.lenses import Intrinsics, is_pinhole, rendered
 from clsplat.dataset.photos import is_transparent, orientation, photo_size, read_mask, read_photo
+from clsplat.dataset.undistortion import lens_positions, resampled, squares_of
 from clsplat.errors import InputError
 from clsplat.panorama import FACES, bordered, face_positions, rotated
 from clsplat.scene import View
+from clsplat.streaming import Files, PhotoStream, Source, photo_budget, physical_memory
 
 SIZE_MAX = 1 << 20
 """Largest width or height of a photo, px. A larger declared size means a damaged file; undistortion would take time
@@ -113,8 +114,8 @@ class Plan:
     invert_mask: bool
 
 
-def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
-    """Decode the photos of a dataset on several threads.
+def load_views(dataset: Dataset, config: DataConfig, memory: int | None = None) -> list[View]:
+    """Decode the photos of a dataset on several threads, now or, if they do not fit the memory, when they are needed.
 
     All cameras and the headers of all files are checked before the first photo is decoded.
 
@@ -123,6 +124,8 @@ def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
     dataset : Dataset
     config : DataConfig
         Background behind transparent photos; whether masks are inverted.
+    memory : int, optional
+        Bytes of decoded photos in memory. Default: `clsplat.streaming.PHOTO_SHARE` of the machine's memory.
 
     Returns
     -------
@@ -133,21 +136,24 @@ def load_views(dataset: Dataset, config: DataConfig) -> list[View]:
     ------
     InputError
         If a pose is not a rigid motion, a photo or mask cannot be decoded, or its shape differs from its camera's;
-        the message names it. If the photos do not fit the machine's memory.
+        the message names it. If the largest photo does not fit the machine's memory.
     """
     from tqdm import tqdm
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         plans = list(pool.map(lambda photo: plan_view(photo, dataset, config.invert_masks), dataset.photos))
         _check_memory(plans, config)
+        budget = photo_budget(memory)
+        if budget is not None and sum(map(_decoded, plans)) > budget:
+            return _stream(plans, dataset.reduce, config, budget).views()
         views = pool.map(lambda plan: _view(plan, dataset.reduce, config), plans)
         return list(tqdm(views, "photos", len(plans), unit="photo", dynamic_ncols=True, leave=False))
 
 
 def _check_memory(plans: list[Plan], config: DataConfig) -> None:
-    """Raise an InputError if the photos, all of which stay in memory, and the largest file do not fit the machine."""
-    need = sum(CHANNELS * plan.camera.width * plan.camera.height for plan in plans)
+    """Raise an InputError if the largest file and what is decoded of it do not fit the machine."""
     largest = max(CHANNELS * plan.size[0] * plan.size[1] for plan in plans)
+    need = max(map(_decoded, plans))
     available = physical_memory()
     if available is None or need + largest <= available:
         return
@@ -155,16 +161,34 @@ def _check_memory(plans: list[Plan], config: DataConfig) -> None:
     remedy = f"--downscale {config.downscale * fitting[0]}" if fitting else "use fewer or smaller photos"
     raise InputError(
         f"{plans[0].photo.path.parent}: expected photos that fit this machine's memory of {available / 1e9:.2f} GB, "
-        f"found {len(plans)} that take {need / 1e9:.2f} GB; {remedy}"
+        f"found one that takes {(need + largest) / 1e9:.2f} GB; {remedy}"
     )
 
 
-def physical_memory() -> int | None:
-    """Memory of the machine in bytes; None where the system does not tell it."""
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError):  # Windows has no sysconf
-        return None
+def _decoded(plan: Plan) -> int:
+    """Bytes of a decoded photo."""
+    return CHANNELS * plan.camera.width * plan.camera.height
+
+
+def _stream(plans: list[Plan], reduce: int, config: DataConfig, memory: int) -> PhotoStream:
+    """The photos, decoded when they are needed. Where that is more than reading the file, copies are kept on disk."""
+
+    def source(plan: Plan) -> Source:
+        layers = ["image"]
+        if plan.photo.mask is not None or plan.camera.model == "fisheye":
+            layers.append("mask")
+        if config.random_background and is_transparent(plan.photo.path):
+            layers.append("clear")
+
+        def used() -> bool:
+            mask = _mask(plan, reduce, _source_positions(plan, reduce)) if "mask" in layers else None
+            return mask is None or bool(mask.any())
+
+        return Source(lambda: _view(plan, reduce, config), plan.camera, tuple(layers), used)
+
+    slow = reduce > 1 or any(plan.photo.face or not is_pinhole(plan.photo.intrinsics) for plan in plans)
+    sources = {plan.photo.name: source(plan) for plan in plans}
+    return PhotoStream(sources, memory, Files.temporary() if slow else None)
 
 
 def load_view(photo: PosedPhoto, dataset: Dataset, config: DataConfig) -> View:
@@ -226,56 +250,67 @@ def fits(size: tuple[int, int], declared: Intrinsics) -> bool:
 
 def _view(plan: Plan, reduce: int, config: DataConfig) -> View:
     photo, camera = plan.photo, plan.camera
-    image, mask = _pixels(plan, reduce, BACKGROUNDS[config.background])
-    clear = None
+    positions = _source_positions(plan, reduce)
+    image = _image(plan, reduce, BACKGROUNDS[config.background], positions)
+    mask, clear = _mask(plan, reduce, positions), None
     if config.random_background and is_transparent(photo.path):
         # The visible share of the background is the difference between the photo on white and on black.
-        white, black = (_pixels(plan, reduce, BACKGROUNDS[name])[0].astype(float) for name in ("white", "black"))
+        white, black = (
+            _image(plan, reduce, BACKGROUNDS[name], positions).astype(float) for name in ("white", "black")
+        )
         clear = np.rint((white - black).mean(axis=2)).astype(np.uint8)
     return View(photo.name, camera, np.ascontiguousarray(image), mask, clear)
 
 
-def _pixels(
-    plan: Plan, reduce: int, background: tuple[float, float, float]
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Decode, undistort and reduce a photo and its mask."""
+def _source_positions(plan: Plan, reduce: int) -> NDArray[np.float32] | None:
+    """Where the pixels of a photo, before its reduction, lie in the file's; None where they are those of the file."""
     photo, camera = plan.photo, plan.camera
-    image = read_photo(photo.path, background, plan.upright)
-    # Inverted before the reduction: a reduced pixel is used only if all its source pixels are.
-    mask = None if photo.mask is None else _fitted_mask(photo.mask, *image.shape[1::-1]) ^ plan.invert_mask
-    positions = None
     if photo.face:
-        positions = face_positions(photo.face, image.shape[1], image.shape[0], camera.width * reduce) + 1
-        image, mask = bordered(image), None if mask is None else bordered(mask)
-    elif camera.model == "pinhole" and not is_pinhole(photo.intrinsics):
-        rows, columns = camera.height * reduce, camera.width * reduce
-        positions = undistorted_positions(photo.intrinsics, plan.size, (rows, columns))
+        return face_positions(photo.face, *plan.size, camera.width * reduce) + 1
+    if camera.model == "pinhole" and not is_pinhole(photo.intrinsics):
+        return lens_positions(photo.intrinsics, plan.size, (camera.height * reduce, camera.width * reduce))
+    return None
+
+
+def _image(
+    plan: Plan, reduce: int, background: tuple[float, float, float], positions: NDArray[np.float32] | None
+) -> NDArray[np.uint8]:
+    """Decode, undistort and reduce a photo."""
+    image = read_photo(plan.photo.path, background, plan.upright)
+    if plan.photo.face:
+        image = bordered(image)
     if positions is not None:
-        image = np.stack([resample(image[..., channel], positions, 1) for channel in range(3)], axis=-1)
-        mask = None if mask is None else resample(mask, positions, 0)
+        image = np.stack([resampled(image[..., channel], positions, 1) for channel in range(3)], axis=-1)
     if reduce > 1:
         # Explicit sums: NumPy's mean over two axes of uint8 is several times slower.
-        squares = _squares(image, camera, reduce)
+        squares = squares_of(image, plan.camera, reduce)
         total = sum(squares[:, i, :, j].astype(np.uint16) for i in range(reduce) for j in range(reduce))
         image = np.rint(total / reduce**2).astype(np.uint8)
-        # A pixel averaged from a masked one is masked as well.
-        mask = None if mask is None else np.asarray(_squares(mask, camera, reduce).all(axis=(1, 3)))
-    if camera.model == "fisheye":
-        seen = _image_circle(camera)
+    return image
+
+
+def _mask(plan: Plan, reduce: int, positions: NDArray[np.float32] | None) -> NDArray[np.bool_] | None:
+    """Decode, undistort and reduce the mask of a photo, if it has one."""
+    mask = None
+    if plan.photo.mask is not None:
+        # Inverted before the reduction: a reduced pixel is used only if all its source pixels are.
+        mask = _fitted_mask(plan.photo.mask, *plan.size) ^ plan.invert_mask
+        if plan.photo.face:
+            mask = bordered(mask)
+        mask = mask if positions is None else resampled(mask, positions, 0)
+        if reduce > 1:  # a pixel averaged from a masked one is masked as well
+            mask = np.asarray(squares_of(mask, plan.camera, reduce).all(axis=(1, 3)))
+    if plan.camera.model == "fisheye":
+        seen = _image_circle(plan.camera)
         if not seen.all():
             mask = seen if mask is None else mask & seen
-    return image, mask
+    return mask
 
 
 def _image_circle(camera: Camera) -> NDArray[np.bool_]:
     """Compute the mask (H, W) of a fisheye's image circle. Outside it, the lens polynomial yields no angle."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return np.asarray(np.isfinite(camera.rays(u, v)[..., 0]))
-
-
-def _squares(pixels: NDArray[Any], camera: Camera, edge: int) -> NDArray[Any]:
-    inside = pixels[: camera.height * edge, : camera.width * edge]
-    return inside.reshape(camera.height, edge, camera.width, edge, *pixels.shape[2:])
 
 
 def _fitted_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
@@ -294,57 +329,3 @@ def nearest(pixels: NDArray[Any], height: int, width: int) -> NDArray[Any]:
     rows = ((np.arange(height) + 0.5) * pixels.shape[0] / height).astype(int)
     columns = ((np.arange(width) + 0.5) * pixels.shape[1] / width).astype(int)
     return pixels[np.ix_(rows, columns)]
-
-
-# Photos of one camera share an entry. The small size bounds the memory if every photo has its own camera.
-@lru_cache(maxsize=2)
-def undistorted_positions(
-    intrinsics: Intrinsics, size: tuple[int, int], shape: tuple[int, int]
-) -> NDArray[np.float32]:
-    """Compute where the pixels of an undistorted image lie in the distorted photo.
-
-    Parameters
-    ----------
-    intrinsics : Intrinsics
-        The distorted camera.
-    size : (int, int)
-        Width and height of the photo, px.
-    shape : (int, int)
-        Height and width of the undistorted image, in the same pixels.
-
-    Returns
-    -------
-    (2, H, W) float32
-        Row and column indices, which count from pixel centres.
-
-    Raises
-    ------
-    InputError
-        If a pixel lies outside the photo.
-    """
-    sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
-    fx, fy, cx, cy = undistorted(intrinsics).params
-    positions = np.empty((2, *shape), dtype=np.float32)
-    with np.errstate(all="ignore"):  # positions that overflow lie outside, which is checked below
-        x = ((np.arange(shape[1]) + 0.5) / sx - cx) / fx
-        y = ((np.arange(shape[0]) + 0.5) / sy - cy) / fy
-        for row in range(shape[0]):
-            rays = np.stack([x, np.full_like(x, y[row]), np.ones_like(x)], axis=-1)
-            positions[1, row], positions[0, row] = (project(intrinsics, rays) * (sx, sy)).T
-    # COLMAP fits the undistorted camera to the photo's border only. Rounding accounts for half a pixel; a whole pixel
-    # outside is an error.
-    inside = (positions > -1) & (positions < np.array(size[::-1]).reshape(2, 1, 1) + 1)
-    if not inside.all():
-        raise InputError(
-            f"camera model {intrinsics.model}: expected a distortion that can be undone over the whole photo, found "
-            f"parameters {intrinsics.params}"
-        )
-    return positions - np.float32(0.5)
-
-
-def resample(channel: NDArray[Any], positions: NDArray[np.float32], order: int) -> NDArray[Any]:
-    """Interpolate pixels (H, W) at row and column indices (2, ...) by splines of an order; 0 takes the nearest."""
-    from scipy.ndimage import map_coordinates
-
-    resampled: NDArray[Any] = map_coordinates(channel, positions, order=order, mode="nearest")
-    return resampled

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.dataset.coverage import projected
-from clsplat.dataset.decoding import Dataset, PosedPhoto, fits, nearest, plan_view, resample, undistorted_positions
+from clsplat.dataset.decoding import Dataset, PosedPhoto, fits, nearest, plan_view
 from clsplat.dataset.lenses import Intrinsics, is_pinhole
 from clsplat.dataset.photos import opened
+from clsplat.dataset.undistortion import lens_positions, resampled
 from clsplat.errors import InputError
 from clsplat.scene import DepthMap, Scene, View
 
@@ -132,10 +133,8 @@ def load_depth_map(path: Path, photo: PosedPhoto, dataset: Dataset) -> DepthMap:
         )
     values, camera = nearest(values, height, width), plan.camera
     if camera.model == "pinhole" and not is_pinhole(photo.intrinsics):
-        positions = undistorted_positions(
-            photo.intrinsics, plan.size, (camera.height * reduce, camera.width * reduce)
-        )
-        values = resample(values, positions, 0)
+        positions = lens_positions(photo.intrinsics, plan.size, (camera.height * reduce, camera.width * reduce))
+        values = resampled(values, positions, 0)
     return DepthMap(nearest(values[: camera.height * reduce, : camera.width * reduce], camera.height, camera.width))
 
 
@@ -269,4 +268,4 @@ def aligned(scene: Scene, tell: Callable[[str], None] = lambda text: None) -> Sc
         f"depth maps: {len(errors)} of {kind}; once scaled, they differ from the points by {np.median(errors):.1%} "
         "of the depth (median)"
     )
-    return replace(scene, train=[replace(view, depth=maps.get(view.name)) for view in scene.train])
+    return replace(scene, train=[view.with_depth(maps.get(view.name)) for view in scene.train])

@@ -29,7 +29,7 @@ moved to the cameras. At this distance float32 resolves 6e-5 extents; a coarser 
 of training."""
 
 
-def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> Scene:
+def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memory: int | None = None) -> Scene:
     """Load a dataset and decode its photos.
 
     Parameters
@@ -45,6 +45,9 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
         Size, background, masks and split of the photos.
     verbose : bool
         Whether to show COLMAP's own messages.
+    memory : int, optional
+        Bytes of decoded photos in memory. If they take more, they are decoded when they are needed
+        (`clsplat.streaming`). Default: half of the machine's memory.
 
     Returns
     -------
@@ -78,7 +81,7 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False) -> S
         )
     if config.panoramas == "faces":
         dataset = replace(dataset, photos=by_faces(dataset.photos))
-    views = sorted(load_views(dataset, config), key=lambda view: view.name)
+    views = sorted(load_views(dataset, config, memory), key=lambda view: view.name)
     train, test = _split(views, dataset, config.test_every)
     if not train:
         raise InputError(
@@ -181,7 +184,7 @@ def with_depth_maps(scene: Scene, path: str | Path, config: DataConfig, tell: Ca
     files = {view.name: find_depth_map(folder, view.name) for view in scene.train}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         maps = pool.map(lambda name: load_depth_map(files[name], photos[name], dataset), files)
-        train = [replace(view, depth=depth) for view, depth in zip(scene.train, maps, strict=True)]
+        train = [view.with_depth(depth) for view, depth in zip(scene.train, maps, strict=True)]
     return aligned(replace(scene, train=train), tell)
 
 
@@ -230,6 +233,6 @@ def _near_origin(scene: Scene) -> Scene:
         return scene
 
     def moved(part: list[View]) -> list[View]:
-        return [replace(view, camera=view.camera.translated(centre)) for view in part]
+        return [view.with_camera(view.camera.translated(centre)) for view in part]
 
     return Scene(moved(scene.train), moved(scene.test), scene.points - centre, scene.colors, centre)

@@ -60,6 +60,6 @@ def with_near_planes(scene: Scene) -> Scene:
 
     def with_near(part: list[View]) -> list[View]:
         nears = [view.camera.near or found[view.name] or fallback for view in part]
-        return [replace(v, camera=replace(v.camera, near=n)) for v, n in zip(part, nears, strict=True)]
+        return [v.with_camera(replace(v.camera, near=n)) for v, n in zip(part, nears, strict=True)]
 
     return replace(scene, train=with_near(scene.train), test=with_near(scene.test))

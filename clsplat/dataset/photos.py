@@ -125,6 +125,31 @@ def orientation(path: Path) -> int:
         return int(tag) if tag in range(1, 9) else 1
 
 
+def gps_position(path: Path) -> tuple[float, float] | None:
+    """Read latitude and longitude, degrees, from the EXIF data; None if they are missing or impossible.
+
+    Cameras without reception write 0, 0.
+
+    Raises
+    ------
+    InputError
+        If the file is not an image.
+    """
+    with opened(path) as image:
+        gps = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
+        try:
+            latitude, longitude = (
+                float(np.dot(np.array(gps[tag], dtype=float), (1, 1 / 60, 1 / 3600)))
+                for tag in (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude)
+            )
+            south, west = gps[ExifTags.GPS.GPSLatitudeRef] == "S", gps[ExifTags.GPS.GPSLongitudeRef] == "W"
+        except (ArithmeticError, KeyError, TypeError, ValueError):
+            return None
+    if not (0 <= latitude <= 90 and 0 <= longitude <= 180) or latitude == longitude == 0:
+        return None
+    return -latitude if south else latitude, -longitude if west else longitude
+
+
 def is_plain(path: Path) -> bool:
     """Whether every program decodes the photo to the same pixels: an upright JPEG or PNG, 8-bit RGB or grey.
 

@@ -21,7 +21,7 @@ from clsplat.pruning.harmonics import curvatures, fitted_degree, with_shared_ban
 from clsplat.pruning.reductions import Reduction, reduce
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
-from clsplat.scene import View
+from clsplat.scene import View, in_turn
 
 Stored = Callable[[Gaussians], tuple[Gaussians, int]]
 """Write Gaussians to a file and read them back; return them with the bytes of the file."""
@@ -71,7 +71,7 @@ class LossMeter:
 
     def _errors(self, gaussians: Gaussians) -> np.ndarray:
         cameras = [view.camera for view in self._views]
-        pairs = zip(renderings(self._renderer, gaussians, cameras), self._views, strict=True)
+        pairs = zip(renderings(self._renderer, gaussians, cameras), in_turn(self._views), strict=True)
         return np.array([10 ** (-psnr(to_uint8(r.rgb), v.image, v.mask) / 10) for r, v in pairs])
 
     def __call__(self, gaussians: Gaussians) -> float:

@@ -19,7 +19,7 @@ from clsplat.constants import ALPHA_MIN
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Pass, Renderer, along_rays, download
-from clsplat.scene import View
+from clsplat.scene import View, in_turn
 from clsplat.stages import Removal
 
 Array = NDArray[np.float64]
@@ -93,7 +93,7 @@ def measure_removals(
         Per view.
     """
     placed = renderer.place(gaussians)
-    for view in views:
+    for view in in_turn(views):
         run = renderer.forward(placed, view.camera, sh_degree)
         rgb = download(run.image.rgb)
         residuals = (np.clip(rgb, 0, 1) if clamped else rgb) - view.image / 255

@@ -34,9 +34,12 @@ def shrunk(view: View, factor: int) -> View:
     def boxes(array: np.ndarray) -> np.ndarray:
         return np.asarray(Image.fromarray(array).resize((width, height), Image.Resampling.BOX))
 
-    mask = None if view.mask is None else boxes(np.where(view.mask, 255, 0).astype(np.uint8)) == 255
-    clear = None if view.clear is None else boxes(view.clear)
+    def reduced(full: View) -> View:
+        mask = None if full.mask is None else boxes(np.where(full.mask, 255, 0).astype(np.uint8)) == 255
+        clear = None if full.clear is None else boxes(full.clear)
+        # Means of depths on both sides of an edge would be depths of neither.
+        depth = full.depth and replace(full.depth, values=nearest(full.depth.values, height, width))
+        return replace(full, camera=camera, image=boxes(full.image), mask=mask, clear=clear, depth=depth)
+
     camera = view.camera.resized(width, height)
-    # Means of depths on both sides of an edge would be depths of neither.
-    depth = view.depth and replace(view.depth, values=nearest(view.depth.values, height, width))
-    return replace(view, camera=camera, image=boxes(view.image), mask=mask, clear=clear, depth=depth)
+    return view.changed(reduced, camera)

@@ -2,7 +2,6 @@
 
 import warnings
 from dataclasses import dataclass, field, replace
-from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
@@ -11,13 +10,10 @@ from numpy.typing import NDArray
 
 from clsplat.camera import CameraModel
 from clsplat.errors import InputError
-from clsplat.scene import Scene, View
+from clsplat.scene import Scene, View, digest
 
 if TYPE_CHECKING:
     from clsplat.device import Device
-
-DIGEST_BYTES = 16
-"""Length of a digest: among 10^12 photos, the chance that two of them share one is 10^-15."""
 
 CAMERA_TOLERANCE = 1e-9
 """Relative difference up to which a camera counts as the same: of each intrinsic number, of each row of the rotation,
@@ -33,7 +29,10 @@ NAMED = 3
 
 class Photo(NamedTuple):
     """A photo of a run: digests of its pixels, of its mask and of its depth map (empty without one), and the numbers
-    of its camera."""
+    of its camera.
+
+    The digest of the pixels is empty as long as the photo, which streams from the disk, has not been read.
+    """
 
     pixels: str
     mask: str
@@ -58,7 +57,7 @@ class Inputs:
     def of(cls, scene: Scene, device: "Device") -> "Inputs":
         """The inputs of a training of a scene on a device."""
         train, test = (photos_of(part, scene.offset) for part in (scene.train, scene.test))
-        points = _digest(scene.points, scene.colors) if len(scene.points) else ""
+        points = digest(scene.points, scene.colors) if len(scene.points) else ""
         return cls(train, test, points, f"{device.label}, driver {device.cl_device.driver_version.strip()}")
 
     @classmethod
@@ -105,17 +104,40 @@ class Inputs:
                 "from those of an uninterrupted run",
                 stacklevel=2,
             )
-        return replace(now, points=now.points or self.points)
+        train, test = (
+            {n: photo if photo.pixels or n not in old else old[n] for n, photo in part.items()}
+            for part, old in ((now.train, self.train), (now.test, self.test))
+        )
+        return replace(now, train=train, test=test, points=now.points or self.points)
+
+    def demand(self, scene: Scene) -> None:
+        """Demand that the photos of a scene that have not been read have these digests, where they are known."""
+        for views, photos in ((scene.train, self.train), (scene.test, self.test)):
+            for view in views:
+                if (photo := photos.get(view.name)) and photo.pixels:
+                    view.expect((photo.pixels, photo.mask))
+
+    def completed(self, scene: Scene) -> "Inputs":
+        """The inputs with the digests of the photos that have been read since they were made."""
+        parts = ((scene.train, self.train), (scene.test, self.test))
+        if all(photo.pixels for _, photos in parts for photo in photos.values()):
+            return self
+        train, test = (
+            photos | {v.name: photos[v.name]._replace(pixels=d[0], mask=d[1]) for v in views if (d := v.digests)}
+            for views, photos in parts
+        )
+        return replace(self, train=train, test=test)
 
     def _differences(self, now: "Inputs") -> list[str]:
         old, new = self.train | self.test, now.train | now.test
         both = sorted(old.keys() & new.keys())
+        read = [name for name in both if old[name].pixels and new[name].pixels]
         differing = {
             "fewer photos": sorted(old.keys() - new.keys()),
             "more photos": sorted(new.keys() - old.keys()),
             "another choice of held-out photos": [name for name in both if (name in self.test) != (name in now.test)],
-            "other pixels": [name for name in both if old[name].pixels != new[name].pixels],
-            "other masks": [name for name in both if old[name].mask != new[name].mask],
+            "other pixels": [name for name in read if old[name].pixels != new[name].pixels],
+            "other masks": [name for name in read if old[name].mask != new[name].mask],
             "other depth maps": [name for name in both if old[name].depth != new[name].depth],
         }
         if self.train.keys() == now.train.keys():  # near planes follow the set of training photos
@@ -142,19 +164,9 @@ def _photo(view: View, offset: NDArray[np.float64]) -> Photo:
         *c.distortion,
         c.near_depth,
     ]
-    pixels = _digest(view.image) if view.clear is None else _digest(view.image, view.clear)
-    mask = "" if view.mask is None else _digest(view.mask)
     pose = (*c.viewmat[:3, :3].flat, *c.viewmat[:3, 3], *offset)
-    depth = "" if view.depth is None else _digest(view.depth.values)
-    return Photo(pixels, mask, [float(x) for x in (*numbers, *pose)], depth)
-
-
-def _digest(*arrays: NDArray[Any]) -> str:
-    result = blake2b(digest_size=DIGEST_BYTES)
-    for array in arrays:
-        result.update(f"{array.dtype.str}{array.shape}".encode())
-        result.update(np.ascontiguousarray(array).data)
-    return result.hexdigest()
+    depth = "" if view.depth is None else digest(view.depth.values)
+    return Photo(*(view.digests or ("", "")), [float(x) for x in (*numbers, *pose)], depth)
 
 
 def _same_camera(a: list[float], b: list[float]) -> bool:

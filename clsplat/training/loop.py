@@ -97,6 +97,7 @@ def train(
             state = load_state(out / CHECKPOINT, scene.extent, config, inputs)
         else:
             state = replace(initial_state(scene, config), inputs=inputs)
+        state.inputs.demand(scene)
         training = Training(scene, config, device, state)
         return complete(training, out, evaluate=evaluate, evaluate_after=evaluate_after, progress=progress)
 
@@ -128,6 +129,11 @@ def _run(training: Training, recorder: Recorder, out: Path) -> None:
             if training.state.search:
                 search_size(training, recorder.after, recorder.after_fork)
             training.run_until(training.config.iterations, recorder.after)
+    except InputError as error:  # a photo that streams
+        raise InputError(
+            f"iteration {training.state.iteration + 1}: {error}; the last checkpoint in {out}, if there is one, is "
+            "intact: --resume continues from it"
+        ) from error
     except DeviceError as error:
         less = "" if isinstance(error, BuildError) else ", and a lower --memory-limit stops growth earlier"
         raise DeviceError(

@@ -186,9 +186,17 @@ class Photos:
             _, dropped = self._kept.popitem()
             self._bytes -= sum(array.nbytes for array in dropped if array is not None)
 
+    def prefetch(self, view: View) -> None:
+        """Begin to read a photo that is needed soon, unless it is on the device."""
+        if view.name not in self._kept:
+            view.prefetch()
+
     def __call__(self, view: View) -> tuple[Any, Any, Any]:
         if view.name in self._kept:
             return self._kept[view.name]
+        # The memory of a CPU is that of the machine, in which photos that stream have a budget of their own.
+        keeps = not (view.ahead and self._device.is_cpu)
+        view = view.loaded()
         photo = self._device.upload("photo", view.image, np.uint8)
         mask = None if view.mask is None else self._device.upload("mask", view.mask, np.uint8)
         depths = None
@@ -196,7 +204,7 @@ class Photos:
             depths = self._device.upload("inverse depths", view.depth.disparities)
         found = photo, mask, depths
         size = sum(array.nbytes for array in found if array is not None)
-        if self._bytes + size <= self._budget:
+        if keeps and self._bytes + size <= self._budget:
             self._kept[view.name] = found
             self._bytes += size
         return found

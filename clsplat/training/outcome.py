@@ -7,7 +7,7 @@ from clsplat.config import AdcConfig
 from clsplat.gaussians import Gaussians
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
-from clsplat.scene import View, evenly_spaced
+from clsplat.scene import View, evenly_spaced, in_turn
 
 FEWEST_GAUSSIANS = AdcConfig.min_gaussians
 """Number of Gaussians below which a training has failed: what pruning leaves at least."""
@@ -46,14 +46,15 @@ def failure(gaussians: Gaussians, views: list[View], renderer: Renderer) -> str 
         return f"training failed: only {len(gaussians)} Gaussians are left; {advice}"
     chosen = evenly_spaced(views, CHECKED)
     errors, variances = [], []
-    for view, rendering in zip(chosen, renderings(renderer, gaussians, [v.camera for v in chosen]), strict=True):
+    pairs = zip(in_turn(chosen), renderings(renderer, gaussians, [v.camera for v in chosen]), strict=True)
+    for view, rendering in pairs:
         counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
         photo = view.image[counts] / 255
         if _varies(photo):
             errors.append(np.mean((np.clip(rendering.rgb[counts], 0, 1) - photo) ** 2))
             variances.append(photo.var(axis=0).mean())
     if not errors:
-        return None if any(map(_shows_something, views)) else f"training failed: {NOTHING_SHOWN}"
+        return None if any(map(_shows_something, in_turn(views))) else f"training failed: {NOTHING_SHOWN}"
     if np.mean(errors) < np.mean(variances):
         return None
     found, constant = (-10 * np.log10(np.mean(values)) for values in (errors, variances))

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from clsplat.config import TrainConfig
+from clsplat.config import CoarseConfig, TrainConfig
 from clsplat.dataset import load_scene, with_depth_maps, with_points
 from clsplat.dataset.finding import mask_folder
 from clsplat.dataset.near_planes import with_near_planes
@@ -14,6 +14,7 @@ from clsplat.errors import InputError
 from clsplat.ranges import check, parse_bytes
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
+from clsplat.training.densify import STRATEGIES
 from clsplat.training.few_views import adapted
 from clsplat.training.initialize import start_count
 from clsplat.training.memory import Footprint
@@ -78,7 +79,7 @@ def prepare(
         maps = str(mask_folder(Path(path), config.data.depth, "--depth").resolve())
         config = replace(config, data=replace(config.data, depth=maps))
     if scene is None:
-        scene = load_scene(path, config.data, verbose)
+        scene = load_scene(path, config.data, verbose, photo_memory(config))
     scene = with_near_planes(scene)
     tell(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
     # The points of few photos limit the number of Gaussians, and depth maps are scaled to points.
@@ -100,6 +101,11 @@ def prepare(
     return scene, few
 
 
+def photo_memory(config: TrainConfig) -> int | None:
+    """Bytes of decoded photos in the machine's memory; None without a limit."""
+    return None if config.memory_limit is None else parse_bytes(config.memory_limit, "--memory-limit")
+
+
 def check_memory(scene: Scene, config: TrainConfig, device: "Device", tell: Callable[[str], None]) -> None:
     """Check that the first Gaussians fit the device, and tell what the training takes."""
     limit = device.memory_limit
@@ -108,6 +114,28 @@ def check_memory(scene: Scene, config: TrainConfig, device: "Device", tell: Call
     need, start = Footprint.of(scene, config, device), start_count(scene, start_config(config), config.max_gaussians)
     need.check(start, limit)
     tell(need.describe(start, config.max_gaussians, limit))
+
+
+def of_fixed_size(config: TrainConfig, gaussians: int, rate: float) -> TrainConfig:
+    """The configuration of a training that goes on with Gaussians that have been trained, and edits none.
+
+    Parameters
+    ----------
+    config : TrainConfig
+    gaussians : int
+        Their number.
+    rate : float
+        Factor on the first learning rate of the means.
+    """
+    still: dict[str, Any] = {name: replace(getattr(config, name), stop_fraction=0.0) for name in STRATEGIES}
+    return replace(
+        config,
+        **still,
+        size="fixed",
+        max_gaussians=gaussians,
+        optim=replace(config.optim, means_lr=rate * config.optim.means_lr, sh_degree_every=1),
+        coarse=CoarseConfig(),
+    )
 
 
 def open_device(config: TrainConfig) -> "Device":

@@ -96,4 +96,5 @@ class Recorder:
     def _save(self) -> None:
         training = self._training
         check_state(training.state, training.renderer.stages, self._out)
+        training.state.inputs = training.state.inputs.completed(training.scene)
         save_state(self._out / CHECKPOINT, training.state, training.config)

@@ -82,12 +82,19 @@ class Training:
         in_use = self.need.total(len(self.state.gaussians), intersections)
         self.photos.keep_within(self.device.memory_limit - in_use)
         self.refresh_filter()
-        loss = step(self, view_at(iteration, self._views, self.config.seed))
+        loss = step(self, self._view(iteration))
         if self.state.strategy.due(iteration):
             self.densify(self._cap())
         if self.state.filter and self.state.filter.due(iteration):
             self._measure_filter()
         return loss
+
+    def _view(self, iteration: int) -> View:
+        """The view of an iteration; those of the next ones are read meanwhile, if they stream."""
+        view = view_at(iteration, self._views, self.config.seed)
+        for later in range(iteration, iteration + view.ahead + 1) if view.ahead else ():
+            self.photos.prefetch(view_at(later, self._views, self.config.seed))
+        return view
 
     def _choose_views(self, iteration: int) -> None:
         """Take the photos of an iteration: at their size then, without those that are held back."""

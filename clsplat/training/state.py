@@ -2,7 +2,10 @@
 
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
 
 from clsplat.config import InitConfig, TrainConfig
 from clsplat.gaussians import Gaussians
@@ -96,11 +99,15 @@ class State:
         """The views with the parameters of the photos applied: neutral colours and refined cameras."""
         if self.exposures:
             learned = self.exposures
-            views = [replace(v, image=photo_exposures.neutral(v.image, learned.of(v.name))) for v in views]
+            views = [view.changed(partial(_neutral, affine=learned.of(view.name).copy())) for view in views]
         if self.poses:
             motions = self.poses
-            views = [replace(v, camera=photo_poses.refined(v.camera, motions.of(v.name))) for v in views]
+            views = [v.with_camera(photo_poses.refined(v.camera, motions.of(v.name))) for v in views]
         return views
+
+
+def _neutral(view: View, affine: NDArray[Any]) -> View:
+    return replace(view, image=photo_exposures.neutral(view.image, affine))
 
 
 def initial_state(scene: Scene, config: TrainConfig, gaussians: Gaussians | None = None) -> State:

@@ -73,3 +73,14 @@ def test_a_folder_of_streamed_scenes_is_a_scene(tmp_path, capsys):
     assert "streamed SOG (PlayCanvas), 2 levels of detail" in capsys.readouterr().out
     run("export", SCRIPTS / "streamed", tmp_path / "a.glb")
     assert len(load_gaussians(tmp_path / "a.glb")[0]) == 40
+
+
+def test_levels_of_a_run_are_refined_against_its_photos(trained, dataset, tmp_path, capsys):
+    run("export", trained, tmp_path / "levels")
+    said = capsys.readouterr()
+    assert "level 1: " in said.out + said.err and "held-out PSNR at half size" in said.out + said.err
+    run("export", trained / "scene.ply", tmp_path / "merged")
+    said = capsys.readouterr()
+    assert "level 1: " not in said.out + said.err, "a file knows no photos"
+    found, merged = (load_gaussians(tmp_path / name)[0] for name in ("levels", "merged"))
+    assert len(found) == len(merged), "the finest level is the scene"

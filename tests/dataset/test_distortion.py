@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_decoding import load, noise, posed, save
 
-from clsplat.dataset.decoding import undistorted_positions
 from clsplat.dataset.lenses import Intrinsics, project, undistorted
+from clsplat.dataset.undistortion import lens_positions
 from clsplat.errors import InputError
 
 DISTORTED = {
@@ -83,7 +83,7 @@ def test_positions_are_the_distortion_of_the_pinholes_rays():
     row, column = 10, 70
     x, y = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
     scale = 100 * (1 + 0.1 * (x * x + y * y))
-    positions = undistorted_positions(intrinsics, (120, 80), (pinhole.height, pinhole.width))
+    positions = lens_positions(intrinsics, (120, 80), (pinhole.height, pinhole.width))
     # float32 positions of up to 120 pixels
     np.testing.assert_allclose(positions[:, row, column], [40 + scale * y - 0.5, 60 + scale * x - 0.5], atol=1e-4)
 

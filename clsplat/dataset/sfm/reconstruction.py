@@ -34,6 +34,7 @@ from clsplat.dataset.photos import (
 )
 from clsplat.dataset.sfm.mapping import map_globally, map_incrementally
 from clsplat.dataset.sfm.matching import extract, is_sliver, match, quiet
+from clsplat.dataset.sfm.pairs import pairs_to_match
 from clsplat.errors import InputError, unwritable
 from clsplat.ranges import check
 
@@ -296,10 +297,7 @@ def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig
         pycolmap.import_images(database, folder, image_names=group, camera_mode=mode, options=reader)
     extract(database, folder, names, config.max_image_size)
     with pycolmap.Database.open(database) as opened:
-        if config.matching == "exhaustive":
-            pairs = pycolmap.ExhaustivePairGenerator(pycolmap.ExhaustivePairingOptions(), opened).all_pairs()
-        else:
-            pairs = pycolmap.SequentialPairGenerator(pycolmap.SequentialPairingOptions(), opened).all_pairs()
+        pairs = pairs_to_match(opened, folder, config)
     match(database, pairs, verbose)
     (work / "models").mkdir()
     mapped = map_globally if config.mapper == "global" else map_incrementally

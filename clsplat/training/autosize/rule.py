@@ -207,7 +207,7 @@ def growth_window(config: TrainConfig) -> int:
 
 def start(scene: Scene, n: int, config: TrainConfig) -> "Search":
     """The search before the first iteration, with n Gaussians."""
-    pixels = max(view.image[:, :, 0].size for view in scene.train)
+    pixels = max(view.camera.width * view.camera.height for view in scene.train)
     windows = max(1, len(growth_bounds(config)))
     return Search(n, max(PACE, pixels / n) ** (1 / windows))
 

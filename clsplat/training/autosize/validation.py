@@ -9,7 +9,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.metrics import colors_fitted, to_uint8
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
-from clsplat.scene import View
+from clsplat.scene import View, in_turn
 
 HELD_SHARE = 1 / 6
 """Fraction of the training photos that is held back. With a smaller fraction decisions are less certain, with a
@@ -40,7 +40,7 @@ def split(views: list[View]) -> tuple[list[View], list[View]]:
     training, held : list of View
         Photos without a pixel that counts are not held back.
     """
-    shown = [i for i, view in enumerate(views) if view.mask is None or view.mask.any()]
+    shown = [i for i, view in enumerate(views) if view.is_used]
     count = min(MOST_HELD, max(FEWEST_HELD, int(HELD_SHARE * len(views))), len(shown))
     held = {shown[k * len(shown) // count] for k in range(count)}
     return [view for i, view in enumerate(views) if i not in held], [views[i] for i in sorted(held)]
@@ -76,7 +76,7 @@ def validate(
         Both parts are at most `PERFECT`.
     """
     cameras, degree = [view.camera for view in views], min(sh_degree, gaussians.sh_degree)
-    pairs = zip(renderings(renderer, gaussians, cameras, degree), views, strict=True)
+    pairs = zip(renderings(renderer, gaussians, cameras, degree), in_turn(views), strict=True)
     return [_quality(to_uint8(rendering.rgb), view, renderer, fitted) for rendering, view in pairs]
 
 

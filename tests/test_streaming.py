@@ -1,0 +1,299 @@
+"""Photos that stream from the disk: the same bytes as from memory, bounded memory, a sentence where one is lost."""
+
+import gc
+import json
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli_runs import SIZE, write_dataset
+from PIL import Image
+from small_files import small_files
+from small_run import CONFIG, same
+
+from clsplat.config import CoarseConfig, DataConfig, InitConfig
+from clsplat.dataset import load_scene
+from clsplat.device import Device
+from clsplat.errors import InputError
+from clsplat.evaluate import evaluate, mean_metrics
+from clsplat.metrics import psnr
+from clsplat.scene import Scene, View, in_turn
+from clsplat.streaming import Files, PhotoStream, Source, StreamedView
+from clsplat.testing import synthetic_scene
+from clsplat.training.contributions import contributions
+from clsplat.training.loop import train
+from clsplat.training.session import view_at
+
+PHOTO = 3 * SIZE[0] * SIZE[1]
+INIT = InitConfig(triangulate=False, random_points=80, sh_degree=1)
+SHORT = replace(CONFIG, strategy="error", max_gaussians=120, iterations=30, checkpoint_every=7, init=INIT)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data") / "scene"
+    write_dataset(folder, 13)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "clsplat"
+
+
+def streamed(path: Path, data: DataConfig | None = None, photos: float = 2) -> Scene:
+    """The scene with as many photos in memory."""
+    scene = load_scene(path, data or DataConfig(), memory=round(photos * PHOTO))
+    assert all(isinstance(view, StreamedView) for view in scene.train + scene.test)
+    return scene
+
+
+def masked(folder: Path) -> str:
+    """Masks beside the photos: a corner of each, and all of one."""
+    (folder / "masks").mkdir(exist_ok=True)
+    for k in range(13):
+        mask = np.full(SIZE[::-1], 255, np.uint8)
+        mask[: 99 if k == 4 else k] = 0
+        Image.fromarray(mask).save(folder / "masks" / f"{k}.png")
+    return str(folder / "masks")
+
+
+RUNS = {
+    "plain": SHORT,
+    "exposures": replace(SHORT, exposure=True),
+    "poses": replace(SHORT, poses=True),
+    "filter": replace(SHORT, filter_3d=True),
+    "search": replace(SHORT, size="auto", iterations=60),
+    "coarse": replace(SHORT, coarse=CoarseConfig(factor=4)),
+    "backgrounds": replace(SHORT, data=DataConfig(random_background=True)),
+    "masks": replace(SHORT, data=DataConfig(masks="masks")),
+    "downscaled": replace(SHORT, data=DataConfig(downscale=2)),
+}
+
+
+@pytest.mark.parametrize("kind", RUNS)
+def test_two_photos_in_memory_make_the_same_bytes_as_all(
+    dataset: Path, device: Device, tmp_path: Path, kind: str
+) -> None:
+    config = RUNS[kind]
+    if config.data.masks:
+        config = replace(config, data=replace(config.data, masks=masked(dataset)))
+    whole, stream = load_scene(dataset, config.data), streamed(dataset, config.data)
+    assert not any(isinstance(view, StreamedView) for view in whole.train)
+    expected, found = (train(s, config, tmp_path / n, device) for s, n in ((whole, "whole"), (stream, "stream")))
+    assert same(found, expected)
+    reports = [evaluate(expected, s.test, tmp_path / n) for s, n in ((whole, "whole"), (stream, "stream"))]
+    assert reports[0] == reports[1]
+
+
+def test_pixels_do_not_depend_on_the_order_in_which_photos_are_read(dataset: Path) -> None:
+    whole, stream = load_scene(dataset, DataConfig()), streamed(dataset)
+    order = np.random.default_rng(3).integers(0, len(whole.train), 60)
+    for found, k in zip(in_turn([stream.train[k] for k in order]), order, strict=True):
+        assert found.name == whole.train[k].name
+        np.testing.assert_array_equal(found.image, whole.train[k].image)
+
+
+def test_views_keep_streaming_through_changes_of_camera_and_pixels(dataset: Path) -> None:
+    view = streamed(dataset).train[0]
+    moved = view.with_camera(view.camera.translated(np.ones(3)))
+    inverted = moved.changed(lambda v: replace(v, image=255 - v.image))
+    assert isinstance(moved, StreamedView) and isinstance(inverted, StreamedView)
+    np.testing.assert_array_equal(inverted.image, 255 - view.image)
+    assert inverted.camera is moved.camera and inverted.loaded().camera is moved.camera
+    assert inverted.digests != view.digests == moved.digests
+    assert type(replace(view, name="other")) is View, "an ordinary view, in memory"
+
+
+def test_no_photo_is_decoded_before_it_is_needed(
+    dataset: Path, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[str] = []
+    decode = PhotoStream._read
+    monkeypatch.setattr(PhotoStream, "_read", lambda self, name: read.append(name) or decode(self, name))
+    scene = streamed(dataset)
+    assert not read
+
+    def stop(record: dict[str, Any]) -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        train(scene, SHORT, tmp_path, device, progress=stop)
+    first = [view_at(k, scene.train, SHORT.seed).name for k in (1, 2)]
+    assert set(read) <= set(first) and first[0] in read
+
+
+# ---- memory
+
+
+def peak(count: int, device: Device, tmp_path: Path) -> int:
+    """Bytes that Python and NumPy take at most in a load, a training, a survey and an evaluation of photos."""
+    width, height = 5 * SIZE[0], 5 * SIZE[1]
+    folder = tmp_path / str(count)
+    write_dataset(folder, count)
+    intrinsics = json.loads((folder / "transforms.json").read_text())
+    larger = {name: 5 * intrinsics[name] for name in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+    (folder / "transforms.json").write_text(json.dumps(intrinsics | larger))
+    for k in range(count):
+        pixels = np.random.default_rng(k).integers(0, 256, (height, width, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{k}.png", compress_level=1)
+    gaussians = synthetic_scene(40, seed=4)[0]
+    gc.collect()
+    tracemalloc.start()
+    scene = load_scene(folder, DataConfig(), memory=4 * 3 * width * height)
+    train(scene, replace(SHORT, iterations=90), folder / "out", device)
+    assert len(contributions(renderer_of(device), gaussians, scene.train).errors) == 40
+    mean_metrics(gaussians, scene.train, renderer_of(device), (psnr,))
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return most
+
+
+def renderer_of(device: Device) -> Any:
+    from clsplat.renderer import Renderer
+
+    return Renderer(device)
+
+
+def test_memory_does_not_grow_with_the_photos(device: Device, tmp_path: Path) -> None:
+    """The 80 photos more would take 7.7 MB; their names, cameras, digests and records take 10 kB each.
+
+    How many photos wait for a thread of the evaluation, with their differences in float64, depends on the threads.
+    """
+    peak(3, device, tmp_path)  # modules are loaded, programs are built
+    few, many = peak(10, device, tmp_path), peak(90, device, tmp_path)
+    assert many - few < 40 * 25 * PHOTO, "half of them"
+
+
+def test_a_stream_keeps_what_fits_and_drops_what_was_used_longest_ago() -> None:
+    decoded: list[str] = []
+    camera = streamed_camera()
+
+    def source(name: str) -> Source:
+        return Source(
+            lambda: decoded.append(name) or View(name, camera, np.zeros((2, 2, 3), np.uint8)), camera, ("image",)
+        )
+
+    stream = PhotoStream({name: source(name) for name in "abcde"}, 4 * 12)
+    kept = 4 - stream.ahead
+    for name in ("abcde"[:kept]) * 2:
+        stream(name)
+    assert decoded == list("abcde"[:kept]), "the second time from memory"
+    stream("e"), stream("abcde"[kept - 1])
+    assert len(decoded) == kept + (2 if kept == 1 else 1)
+    stream("a")
+    assert decoded[-1] == "a"
+
+
+def streamed_camera() -> Any:
+    from clsplat.camera import Camera
+
+    return Camera(np.eye(4), 2.0, 2.0, 1.0, 1.0, 2, 2)
+
+
+# ---- what goes wrong
+
+
+def damaged_at(iteration: int, path: Path, how: str) -> Any:
+    def damage(record: dict[str, Any]) -> None:
+        if record["iteration"] == iteration:
+            if how == "removed":
+                path.unlink()
+            elif how == "damaged":
+                path.write_bytes(path.read_bytes()[:60])
+            else:
+                Image.new("RGB", SIZE, (9, 9, 9)).save(path)
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("removed", r"cannot read .*7\.png.*No such file"),
+        ("damaged", r"cannot read .*7\.png as an image"),
+        ("replaced", r"photo 7\.png: expected the pixels and mask that the run has read before, found others"),
+    ],
+)
+def test_a_lost_photo_ends_in_a_sentence_and_the_run_goes_on_with_it(
+    device: Device, tmp_path: Path, how: str, message: str
+) -> None:
+    write_dataset(tmp_path / "data", 13)
+    photo = tmp_path / "data" / "7.png"
+    saved = photo.read_bytes()
+    expected = train(load_scene(tmp_path / "data", DataConfig()), SHORT, tmp_path / "whole", device)
+    with pytest.raises(InputError, match=rf"^iteration \d+: {message}.*--resume continues from it$"):
+        train(streamed(tmp_path / "data"), SHORT, tmp_path / "out", device, progress=damaged_at(14, photo, how))
+    photo.write_bytes(saved)
+    assert same(train(streamed(tmp_path / "data"), SHORT, tmp_path / "out", device, resume=True), expected)
+
+
+def test_a_run_resumes_with_the_photos_that_it_has_read(device: Device, tmp_path: Path) -> None:
+    """With some photos in memory or all, whichever way it began; each photo is needed again after the resumption."""
+    config = replace(SHORT, iterations=45)
+    write_dataset(tmp_path / "data", 13)
+
+    def interrupt(record: dict[str, Any]) -> None:
+        if record["iteration"] == 15:
+            raise KeyboardInterrupt
+
+    for name, before, after in (("a", 2, 99), ("b", 99, 2)):
+        scenes = [load_scene(tmp_path / "data", DataConfig(), memory=n * PHOTO) for n in (before, after)]
+        with pytest.raises(KeyboardInterrupt):
+            train(scenes[0], config, tmp_path / name, device, progress=interrupt)
+        Image.new("RGB", SIZE, (9, 9, 9)).save(tmp_path / "data" / "7.png")
+        other = load_scene(tmp_path / "data", DataConfig(), memory=after * PHOTO)
+        with pytest.raises(InputError, match=r"found other pixels|has read before, found others"):
+            train(other, config, tmp_path / name, device, resume=True)
+        write_dataset(tmp_path / "data", 13)
+        again = train(
+            load_scene(tmp_path / "data", DataConfig(), memory=after * PHOTO),
+            config,
+            tmp_path / name,
+            device,
+            resume=True,
+        )
+        assert same(again, train(scenes[0], config, tmp_path / f"whole {name}", device))
+
+
+# ---- copies
+
+
+def copies(cache: Path) -> list[Path]:
+    return sorted(cache.glob("photos-*/*.npy"))
+
+
+def test_reduced_photos_are_copied_and_the_copies_go_with_the_scene(dataset: Path, cache: Path) -> None:
+    scene = streamed(dataset, DataConfig(downscale=2), photos=0.5)
+    expected = [view.image for view in in_turn(scene.train)]
+    assert len(copies(cache)) == len(scene.train)
+    for path in copies(cache)[:3]:
+        path.write_bytes(path.read_bytes()[:90])
+    for path in copies(cache)[3:6]:
+        path.write_bytes(path.read_bytes()[:-1] + b"?")
+    assert all(np.array_equal(a.image, b) for a, b in zip(in_turn(scene.train), expected, strict=True))
+    del scene
+    gc.collect()
+    assert not list(cache.iterdir())
+
+
+def test_copies_of_a_process_that_died_are_removed(cache: Path) -> None:
+    dead = cache / "photos-dead"
+    dead.mkdir(parents=True)
+    (dead / "a.image.npy").write_bytes(b"1")
+    living = Files.temporary()
+    other = Files.temporary()
+    assert not dead.exists() and len(list(cache.iterdir())) == 2
+    del living, other
+
+
+def test_a_full_disk_costs_the_copies_only(dataset: Path) -> None:
+    expected = load_scene(dataset, DataConfig(downscale=2)).train
+    scene = streamed(dataset, DataConfig(downscale=2), photos=0.5)
+    with small_files(512), pytest.warns(UserWarning, match="photos are decoded each time that they are used"):
+        found = [view.image for view in in_turn(scene.train)]
+    assert all(np.array_equal(a, b.image) for a, b in zip(found, expected, strict=True))
