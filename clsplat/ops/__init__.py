@@ -52,6 +52,7 @@ class Launches:
     """The functions of all stages with their first argument, the device, filled in."""
 
     def __init__(self, device: Device) -> None:
+        self._add_fields(device)
         self.project_fwd = partial(project_fwd, device)
         self.join_rows = partial(join_rows, device)
         self.project_disparities = partial(project_disparities, device)
@@ -84,6 +85,9 @@ class Launches:
         self.exclusive_scan = partial(exclusive_scan, device)
         self.argsort = partial(argsort, device)
         self.argsort_segments = partial(argsort_segments, device)
+        self.adam_array = partial(adam_array, device)
+
+    def _add_fields(self, device: Device) -> None:
         self.rays_fwd = partial(rays_fwd, device)
         self.rays_bwd = partial(rays_bwd, device)
         self.hashgrid_fwd = partial(hashgrid_fwd, device)
@@ -95,7 +99,6 @@ class Launches:
         self.heads_fwd = partial(heads_fwd, device)
         self.heads_bwd = partial(heads_bwd, device)
         self.heads_join_bwd = partial(heads_join_bwd, device)
-        self.adam_array = partial(adam_array, device)
         self.heads_sh_fwd = partial(heads_sh_fwd, device)
         self.heads_sh_bwd = partial(heads_sh_bwd, device)
         self.voxels_fwd = partial(voxels_fwd, device)
