@@ -26,7 +26,7 @@ FACTOR = 2
 """Divisor of the photos' edges: a level is shown from farther away than the scene."""
 
 LENGTH = 1 / 4
-"""Iterations of a level, as a fraction of those of the scene (measured: docs/howto/large.md)."""
+"""Iterations of a level, as a fraction of those of the scene. A choice; others were not measured."""
 
 RATE = 1 / 10
 """Factor on the first learning rate of the means, as in the second training of a block: the Gaussians have their
