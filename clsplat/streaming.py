@@ -189,23 +189,29 @@ class StreamedView(View):
 
     _stream: PhotoStream
     _load: Callable[[], View] | None  # for a view that has been changed
+    _depth: DepthMap | None  # in memory
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         return View(*args, **kwargs)
 
     @classmethod
     def of(
-        cls, name: str, camera: Camera, stream: PhotoStream, load: Callable[[], View] | None = None
+        cls,
+        name: str,
+        camera: Camera,
+        stream: PhotoStream,
+        load: Callable[[], View] | None = None,
+        depth: DepthMap | None = None,
     ) -> "StreamedView":
-        """A view of a stream's photo; `load` returns it, if it is not as the stream has it."""
+        """A view of a stream's photo. `load` returns it with its depth map, if it is not as the stream has it."""
         view: StreamedView = object.__new__(cls)
-        view.__dict__.update(name=name, camera=camera, _stream=stream, _load=load)
+        view.__dict__.update(name=name, camera=camera, _stream=stream, _load=load, _depth=depth)
         return view
 
     def loaded(self) -> View:
         if self._load:
             return replace(self._load(), camera=self.camera)
-        return replace(self._stream(self.name), camera=self.camera, depth=self.depth)
+        return replace(self._stream(self.name), camera=self.camera, depth=self._depth)
 
     def _layer(self, name: str) -> Any:
         return getattr(self.loaded(), name) if name in self._stream.layers(self.name) else None
@@ -222,18 +228,18 @@ class StreamedView(View):
     def clear(self) -> NDArray[np.uint8] | None:
         return self._layer("clear")
 
+    @property
+    def depth(self) -> DepthMap | None:
+        return self.loaded().depth if self._load else self._depth
+
     def prefetch(self) -> None:
         self._stream.prefetch(self.name)
 
     def with_camera(self, camera: Camera) -> View:
-        result = self.of(self.name, camera, self._stream, self._load)
-        result.__dict__["depth"] = self.depth
-        return result
+        return self.of(self.name, camera, self._stream, self._load, self._depth)
 
     def with_depth(self, depth: DepthMap | None) -> View:
-        result = self.of(self.name, self.camera, self._stream, self._load)
-        result.__dict__["depth"] = depth
-        return result
+        return self.of(self.name, self.camera, self._stream, self._load, depth)
 
     def changed(self, change: Callable[[View], View], camera: Camera | None = None) -> View:
         return self.of(self.name, camera or self.camera, self._stream, lambda: change(self.loaded()))

@@ -20,7 +20,7 @@ from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.evaluate import evaluate, mean_metrics
 from clsplat.metrics import psnr
-from clsplat.scene import Scene, View, in_turn
+from clsplat.scene import DepthMap, Scene, View, in_turn
 from clsplat.streaming import Files, PhotoStream, Source, StreamedView
 from clsplat.testing import synthetic_scene
 from clsplat.training.contributions import contributions
@@ -72,7 +72,15 @@ RUNS = {
     "backgrounds": replace(SHORT, data=DataConfig(random_background=True)),
     "masks": replace(SHORT, data=DataConfig(masks="masks")),
     "downscaled": replace(SHORT, data=DataConfig(downscale=2)),
+    "depths": replace(SHORT, coarse=CoarseConfig(factor=2)),
 }
+
+
+def with_depths(scene: Scene) -> Scene:
+    """The scene with depth maps of noise."""
+    rng = np.random.default_rng(0)
+    maps = [DepthMap(rng.uniform(1, 3, SIZE[::-1]).astype(np.float32)) for _ in scene.train]
+    return replace(scene, train=[view.with_depth(depth) for view, depth in zip(scene.train, maps, strict=True)])
 
 
 @pytest.mark.parametrize("kind", RUNS)
@@ -84,6 +92,9 @@ def test_two_photos_in_memory_make_the_same_bytes_as_all(
         config = replace(config, data=replace(config.data, masks=masked(dataset)))
     whole, stream = load_scene(dataset, config.data), streamed(dataset, config.data)
     assert not any(isinstance(view, StreamedView) for view in whole.train)
+    if kind == "depths":
+        whole, stream = with_depths(whole), with_depths(stream)
+        assert all(isinstance(view, StreamedView) and view.loaded().depth is view.depth for view in stream.train)
     expected, found = (train(s, config, tmp_path / n, device) for s, n in ((whole, "whole"), (stream, "stream")))
     assert same(found, expected)
     reports = [evaluate(expected, s.test, tmp_path / n) for s, n in ((whole, "whole"), (stream, "stream"))]
@@ -106,6 +117,8 @@ def test_views_keep_streaming_through_changes_of_camera_and_pixels(dataset: Path
     np.testing.assert_array_equal(inverted.image, 255 - view.image)
     assert inverted.camera is moved.camera and inverted.loaded().camera is moved.camera
     assert inverted.digests != view.digests == moved.digests
+    deep = view.with_depth(DepthMap(np.ones(SIZE[::-1], np.float32))).with_camera(view.camera)
+    assert isinstance(deep, StreamedView) and deep.loaded().depth is deep.depth is not None
     assert type(replace(view, name="other")) is View, "an ordinary view, in memory"
 
 
