@@ -87,7 +87,8 @@ def example(command: Any) -> Any:
     """A command with its defaults, and some path or text where it has none."""
     hints = get_type_hints(command)
     required = [f.name for f in fields(command) if f.default is MISSING and f.default_factory is MISSING]
-    return command(**{name: ("a",) if get_origin(hints[name]) is tuple else Path("a") for name in required})
+    values = {tuple: ("a",), str: "a"}
+    return command(**{name: values.get(get_origin(hints[name]) or hints[name], Path("a")) for name in required})
 
 
 SETTINGS = [s for root in map(example, COMMANDS + BENCHMARKS) for s in settings_of(root, root)]

@@ -7,8 +7,9 @@ from typing import Annotated
 import tyro
 
 from clsplat.bench.bench_commands import check_files, say, write_results
-from clsplat.config import Count
+from clsplat.config import UINT32_MAX, Count
 from clsplat.errors import InputError
+from clsplat.ranges import within
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Fields:
     """Dataset, with options as for `bench quality`: lego:downscale=4:background=white."""
     methods: tuple[str, ...] = ("nerf-small", "plenoxels", "ingp-base", "mip-nerf360-small")
     """Radiance fields, as for --method of `train`."""
-    iterations: Annotated[int, tyro.conf.arg(metavar="INT")] = 100
+    iterations: Annotated[int, within(least=0, most=UINT32_MAX), tyro.conf.arg(metavar="INT")] = 100
     """Steps before those that are counted. Grids of occupied cells find the empty ones meanwhile."""
     repeats: Count = 5
     """Number of steps that are counted."""

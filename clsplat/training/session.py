@@ -133,6 +133,7 @@ class Training:
 
         Not a part of `step`, whose arrays of the old size must be freed before those of the new one are allocated.
         """
+        self.state.move(self.optimizer.home)
         edit = self._edit(cap)
         self.state.change_rows(self.state.rows.after(edit, self.optimizer.stages))
         self.state.move(self.optimizer.home)
