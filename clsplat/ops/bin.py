@@ -91,8 +91,8 @@ def _list(device: Device, m: int) -> Array:
 def _filled(device: Device, sums: Array, count: int, fill: Callable[[list[Any], list[Array]], None]) -> list[Array]:
     """Make `count` lists of M entries by `fill`, where `sums` of `queue_scan` ends with M.
 
-    The device fills them while the host waits for M: they have room for as many entries as the largest lists of late.
-    If there are more, nothing was written, and `fill` runs again. Its arguments are those of the kernel that tell the
+    The device fills them while the host waits for M: they have room for as many entries as earlier lists had. If
+    there are more, nothing was written, and `fill` runs again. Its arguments are those of the kernel that tell the
     room and M, and the lists.
     """
     reading, last = Reading(sums), sums.shape[0] - 1
