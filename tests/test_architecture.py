@@ -341,12 +341,3 @@ def test_missing_constants_are_a_sentence(device):
     for k in range(len(constants)):
         with pytest.raises(cl.RuntimeError, match=r"the constants of .* must be passed as -D"):
             cl.Program(device.context, source).build(["-DGROUP=1", *constants[:k], *constants[k + 1 :]])
-
-
-def test_kernels_are_formatted():
-    if shutil.which("clang-format") is None:
-        pytest.skip("clang-format is missing: install it to check the kernels' format")
-    files = sorted(kernel_folder().glob("*.cl")) + sorted(kernel_folder().glob("*.h"))
-    command = ["clang-format", "--dry-run", "--Werror", *map(str, files)]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr

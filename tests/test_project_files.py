@@ -2,10 +2,14 @@
 
 import configparser
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
 import yaml
+
+from clsplat.programs import kernel_folder
 
 ROOT = Path(__file__).parents[1]
 SETUP = configparser.ConfigParser()
@@ -40,3 +44,12 @@ def test_the_guide_for_contributors_names_targets_that_exist() -> None:
     targets = set(re.findall(r"\bmake ([a-z][a-z-]*)", text))
     assert len(targets) >= 4
     assert targets <= set(re.findall(r"^([a-z-]+):", makefile, flags=re.M))
+
+
+def test_kernels_are_formatted() -> None:
+    if shutil.which("clang-format") is None:
+        pytest.skip("clang-format is missing: install it to check the kernels' format")
+    files = sorted(kernel_folder().glob("*.cl")) + sorted(kernel_folder().glob("*.h"))
+    command = ["clang-format", "--dry-run", "--Werror", *map(str, files)]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from clsplat.field_stages import encoded_width
-from clsplat.fields.field import Array
+from clsplat.fields.field import Array, Field
 from clsplat.stages import AdamStep, Stages
 
 if TYPE_CHECKING:
@@ -47,6 +47,27 @@ def restore_parameters(parameters: dict[str, Parameters], arrays: dict[str, Arra
         if f"{name}.first" in arrays:
             p.first.set(arrays[f"{name}.first"].astype(real).reshape(p.values.shape))
             p.second.set(arrays[f"{name}.second"].astype(real).reshape(p.values.shape))
+
+
+class NetworkField(Field):
+    """A field all of whose parameters are `parameters`: networks, by name."""
+
+    parameters: dict[str, Parameters]
+
+    def model(self) -> dict[str, Array]:
+        """See `Field`."""
+        return {name: p.values.get() for name, p in self.parameters.items()}
+
+    def optimiser(self) -> dict[str, Array]:
+        """See `Field`."""
+        return moments(self.parameters)
+
+    def restore(self, arrays: dict[str, Array]) -> None:
+        """See `Field`."""
+        restore_parameters(self.parameters, arrays, self.device.real)
+
+    def finish(self) -> None:
+        """Nothing is rounded."""
 
 
 class Asked(NamedTuple):

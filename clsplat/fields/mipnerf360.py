@@ -5,16 +5,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from clsplat.field_stages import CHUNK_WIDTH, frustum_width
-from clsplat.fields.field import Array, Field, Rays
+from clsplat.fields.field import Array, Rays
 from clsplat.fields.layers import (
     VIEW_LEVELS,
     Asked,
+    NetworkField,
     Parameters,
     ViewNetwork,
     descend,
     first_weights,
-    moments,
-    restore_parameters,
 )
 from clsplat.fields.pixels import Batch
 from clsplat.fields.space import Space
@@ -71,7 +70,7 @@ class Seen(NamedTuple):
     image: Any
 
 
-class MipNerf360(Field):
+class MipNerf360(NetworkField):
     """Mip-NeRF 360 with the paper's networks."""
 
     name = "mip-nerf360"
@@ -183,21 +182,6 @@ class MipNerf360(Field):
     def colors(self, rays: Rays, background: Color) -> Any:
         """See `Field`."""
         return self._look(rays, np.full((ROUNDS + 1, len(rays.radii)), 0.5), 1.0, background).image.rgb
-
-    def model(self) -> dict[str, Array]:
-        """See `Field`."""
-        return {name: p.values.get() for name, p in self.parameters.items()}
-
-    def optimiser(self) -> dict[str, Array]:
-        """See `Field`."""
-        return moments(self.parameters)
-
-    def restore(self, arrays: dict[str, Array]) -> None:
-        """See `Field`."""
-        restore_parameters(self.parameters, arrays, self.device.real)
-
-    def finish(self) -> None:
-        """Nothing is rounded."""
 
 
 class MipNerf360Small(MipNerf360):

@@ -5,14 +5,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from clsplat.field_stages import RayColors, encoded_width
-from clsplat.fields.field import Array, Field, Rays
+from clsplat.fields.field import Array, Rays
 from clsplat.fields.layers import (
     VIEW_LEVELS,
     Asked,
+    NetworkField,
     ViewNetwork,
     descend,
-    moments,
-    restore_parameters,
 )
 from clsplat.fields.pixels import Batch
 from clsplat.fields.space import Space
@@ -42,7 +41,7 @@ class Seen(NamedTuple):
     image: RayColors
 
 
-class Nerf(Field):
+class Nerf(NetworkField):
     """NeRF with the paper's networks."""
 
     name = "nerf"
@@ -122,21 +121,6 @@ class Nerf(Field):
         """See `Field`."""
         return self._look(rays, lambda *shape: np.full(shape, 0.5), background)["fine"].image.rgb
 
-    def model(self) -> dict[str, Array]:
-        """See `Field`."""
-        return {name: p.values.get() for name, p in self.parameters.items()}
-
-    def optimiser(self) -> dict[str, Array]:
-        """See `Field`."""
-        return moments(self.parameters)
-
-    def restore(self, arrays: dict[str, Array]) -> None:
-        """See `Field`."""
-        restore_parameters(self.parameters, arrays, self.device.real)
-
-    def finish(self) -> None:
-        """Nothing is rounded."""
-
 
 class NerfSmall(Nerf):
     """NeRF with networks that two cores train within an hour."""
@@ -147,6 +131,5 @@ class NerfSmall(Nerf):
     """Half of the paper's, for images of 100 x 100 pixels."""
     rays = 256
     rate, rate_final = 8e-3, 4e-4
-    """Sixteen times the paper's at the start, for networks with a quarter of the width and few steps: after 120 steps
-    the squared error is two thirds of that with four times the paper's."""
+    """Sixteen times the paper's at the start, for networks with a quarter of the width and few steps."""
     iterations = 3500

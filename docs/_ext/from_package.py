@@ -225,26 +225,28 @@ class BenchKernels(SphinxDirective):
         return self.parse_text_to_nodes(report.details(workload))
 
 
-class BenchKnobs(SphinxDirective):
-    """``{bench_knobs} FILE``. The path of the file is relative to the page."""
+class BenchTable(SphinxDirective):
+    """A table that `text` makes of the results in a file. The path of the file is relative to the page."""
 
     required_arguments = 1
+    text: typing.ClassVar[typing.Callable[[dict[str, Any]], str]]
 
     def run(self) -> list[nodes.Node]:
         relative, path = self.env.relfn2path(self.arguments[0])
         self.env.note_dependency(relative)
-        return self.parse_text_to_nodes(knobs_text(json.loads(Path(path).read_text())))
+        return self.parse_text_to_nodes(type(self).text(json.loads(Path(path).read_text())))
 
 
-class BenchViewer(SphinxDirective):
-    """``{bench_viewer} FILE``. The path of the file is relative to the page."""
+class BenchKnobs(BenchTable):
+    """``{bench_knobs} FILE``."""
 
-    required_arguments = 1
+    text = knobs_text
 
-    def run(self) -> list[nodes.Node]:
-        relative, path = self.env.relfn2path(self.arguments[0])
-        self.env.note_dependency(relative)
-        return self.parse_text_to_nodes(frames_text(json.loads(Path(path).read_text())))
+
+class BenchViewer(BenchTable):
+    """``{bench_viewer} FILE``."""
+
+    text = frames_text
 
 
 class BenchStability(SphinxDirective):
