@@ -237,18 +237,6 @@ class BenchTable(SphinxDirective):
         return self.parse_text_to_nodes(type(self).text(json.loads(Path(path).read_text())))
 
 
-class BenchKnobs(BenchTable):
-    """``{bench_knobs} FILE``."""
-
-    text = knobs_text
-
-
-class BenchViewer(BenchTable):
-    """``{bench_viewer} FILE``."""
-
-    text = frames_text
-
-
 class BenchStability(SphinxDirective):
     """``{bench_stability} FILE``. The path is relative to the page; the charts are in the folder of the file."""
 
@@ -346,8 +334,8 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("presets", Presets)
     app.add_directive("command", Command)
     app.add_directive("bench_kernels", BenchKernels)
-    app.add_directive("bench_knobs", BenchKnobs)
-    app.add_directive("bench_viewer", BenchViewer)
+    app.add_directive("bench_knobs", type("BenchKnobs", (BenchTable,), {"text": knobs_text}))
+    app.add_directive("bench_viewer", type("BenchViewer", (BenchTable,), {"text": frames_text}))
     app.add_directive("bench_stability", BenchStability)
     app.add_directive("bench_quality", BenchQuality)
     app.add_directive("bench_captures", BenchCaptures)
