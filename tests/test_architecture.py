@@ -235,7 +235,7 @@ DEFINES = {
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
     },
     "mlp_cpu": {"WIDTHS": "32,64,16", "WIDEST": 64, "ROWS": 6},
-    "absgrad": {"TILE": 16, "CHANNELS": 3, "RAYS": 0},
+    "absgrad": {"TILE": 16, "CHANNELS": 3, "BATCH": 16, "RAYS": 0, "SUBGROUPS": 0},
     "median": {"TILE": 16, "CHANNELS": 3, "RAYS": 1},
     "project": {
         **{"CHANNELS": 4, "ANTIALIASED": 1, "CAMERA_GRAD": 1, "GROUP": 32},
@@ -251,6 +251,7 @@ DEFINES = {
     },
 }
 FORBIDDEN = [
+    ("absgrad", "BATCH", 0),
     ("absgrad", "RAYS", 1),
     ("bin", "TILE", 0),
     ("bin", "GRADIENTS", 2),
