@@ -9,6 +9,7 @@ from clsplat.bench.stability.small import CONFIG, small_scene, with_train
 from clsplat.evaluate import mean_metrics
 from clsplat.renderer import Renderer
 from clsplat.training import few_views
+from clsplat.training.initialize import start_count
 from clsplat.training.loop import train
 
 
@@ -42,12 +43,16 @@ def test_settings_for_few_photos(scene):
     config = replace(CONFIG, max_gaussians=None)
     few = few_views.adapted(config, scene)
     assert (few.init.sh_degree, few.max_gaussians, few.dropout) == (1, 2 * len(scene.points), 0.2)
+    assert few.init.opacity == 0.1
+    given = replace(config, init=replace(config.init, opacity=0.3))
+    assert few_views.adapted(given, scene).init.opacity == 0.3
     assert few_views.adapted(few, scene) == few, "a resumed run, and one from its config.json, continue"
     assert few_views.adapted(replace(config, max_gaussians=7), scene).max_gaussians == 7
-    sought = few_views.adapted(replace(config, strategy="error", size="auto"), scene)
-    assert sought == few, "there are too few photos to search for the size"
-    # A random start has the cap of the configuration.
-    assert few_views.adapted(config, replace(scene, points=scene.points[:0])).max_gaussians is None
+    assert few_views.adapted(replace(config, size="auto"), scene) == few, "too few photos to search for the size"
+    pointless = replace(scene, points=scene.points[:0])
+    assert few_views.adapted(config, pointless).max_gaussians is None, "a random start has the configuration's cap"
+    sought = few_views.adapted(replace(config, size="auto"), pointless)
+    assert (sought.size, sought.max_gaussians) == ("fixed", 2 * start_count(pointless, sought.init, None))
     assert few_views.adapted(config, replace(scene, train=scene.train * 3)) == config
 
 

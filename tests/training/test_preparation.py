@@ -71,7 +71,7 @@ def test_masks_are_found_in_the_dataset_first(tmp_path: Path, monkeypatch: pytes
 def test_a_start_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     write_dataset(tmp_path, 9)
     config = TrainConfig(memory_limit="1MB", init=InitConfig(triangulate=False))
-    with pytest.raises(InputError, match=r"--memory-limit: expected at least .* for 100000 Gaussians at 40x32"):
+    with pytest.raises(InputError, match=r"--memory-limit: expected at least .* for 10000 Gaussians at 40x32"):
         prepare(tmp_path, config)
 
 

@@ -9,10 +9,11 @@ doubling of the bytes. After that all photos train.
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from math import ceil, log2, sqrt
+from math import ceil, log2, pi, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.config import TrainConfig
 from clsplat.ranges import checked
@@ -37,6 +38,12 @@ SURE = 1.0
 rule of Breiman et al. 1984, "Classification and Regression Trees", section 3.4.3), and by which the loss by
 pruning must be below its price."""
 
+NORMAL_DEVIATIONS = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+NORMAL_MEDIAN = sqrt(pi / 2)
+"""Standard error of the median of many normal values over that of their mean."""
+
 PATIENCE = 2.0
 """Factor by which the number of Gaussians grows without paying before growth ends."""
 
@@ -44,9 +51,12 @@ GROWTH_WINDOW = 0.1
 """Fraction of the iterations in a window of growth. In its first part the number of Gaussians grows, in its second
 half the scene is validated: Gaussians that have just been split are worse before they are better."""
 
-PACE = 4.0
-"""Multiple of the first Gaussians that growth reaches by its end, unless a photo has more pixels than that: then it
-is one Gaussian per pixel. Faster growth ends worse (measured: docs/size.md)."""
+PACE = 3.0
+"""Multiple of the first Gaussians that growth reaches by its end, unless `PER_PIXEL` allows more. Faster growth ends
+worse (measured: docs/size.md)."""
+
+PER_PIXEL = 0.6
+"""Gaussians per pixel of a photo that growth reaches by its end, unless `PACE` allows more (measured: docs/size.md)."""
 
 VALIDATIONS = 3
 """Validations in the second half of a window, which are averaged: quality fluctuates while the learning rates are
@@ -102,15 +112,24 @@ class Trial(NamedTuple):
     larger: Candidate
 
     @property
+    def gains(self) -> NDArray[np.float64]:
+        """Gain of the larger candidate in each photo, dB."""
+        return np.array(self.larger.views) - np.array(self.smaller.views)
+
+    @property
     def gain(self) -> float:
-        """Gain of the larger candidate, dB: the mean over the photos."""
-        return self.larger.quality - self.smaller.quality
+        """Gain of the larger candidate, dB: the median over the photos.
+
+        A single Gaussian in front of one camera, which comes and goes, would decide by the mean (docs/size.md).
+        """
+        return float(np.median(self.gains))
 
     @property
     def margin(self) -> float:
-        """`SURE` standard errors of the gain, dB, from the differences of the photos."""
-        gains = np.array(self.larger.views) - np.array(self.smaller.views)
-        return float(SURE * gains.std(ddof=1) / sqrt(len(gains)))
+        """`SURE` standard errors of the gain, dB, for gains whose spread is estimated by their median deviation."""
+        gains = self.gains
+        spread = NORMAL_DEVIATIONS * float(np.median(np.abs(gains - self.gain)))
+        return SURE * NORMAL_MEDIAN * spread / sqrt(len(gains))
 
     @property
     def price(self) -> float:
@@ -208,8 +227,8 @@ def growth_window(config: TrainConfig) -> int:
 def start(scene: Scene, n: int, config: TrainConfig) -> "Search":
     """The search before the first iteration, with n Gaussians."""
     pixels = max(view.camera.width * view.camera.height for view in scene.train)
-    windows = max(1, len(growth_bounds(config)))
-    return Search(n, max(PACE, pixels / n) ** (1 / windows))
+    growing = max(1, len(growth_bounds(config)) - 1)  # the first window has the first Gaussians
+    return Search(n, max(PACE, PER_PIXEL * pixels / n) ** (1 / growing))
 
 
 def validation_times(config: TrainConfig) -> set[int]:
