@@ -16,6 +16,7 @@ from clsplat.renderer import Renderer, fetch
 from clsplat.scene import Scene, View
 from clsplat.stages import Dropout
 from clsplat.training.autosize.validation import split
+from clsplat.training.camera_room import steepest_slope, viewpoints, with_room
 from clsplat.training.coarse_to_fine import factor_at, shrunk
 from clsplat.training.contributions import contributions
 from clsplat.training.corrections import compare, example, learn_pose
@@ -60,6 +61,16 @@ class Training:
         """Device memory that the training takes."""
         backdrop = self.renderer.backdrop
         return Footprint.of(self.scene, self.config, self.device, 0 if backdrop is None else len(backdrop))
+
+    def with_room(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians on the host, those of them shrunk that reach a viewpoint, if the strategy leaves room."""
+        return with_room(gaussians, *self._room) if self.state.strategy.leaves_room else gaussians
+
+    @cached_property
+    def _room(self) -> tuple[Any, float]:
+        """Viewpoints and slope for `clsplat.training.camera_room`."""
+        cameras = [view.camera for view in self.scene.train]
+        return viewpoints(cameras), steepest_slope(cameras)
 
     def fork(self, state: State) -> "Training":
         """A training of the same scene that goes on from another state."""
@@ -155,7 +166,7 @@ class Training:
         edit = state.strategy.edit(state.iteration, state.gaussians, cap, survey)
         if edit.reset_opacities and shown:
             reset_shown(edit, state.gaussians, shown)
-        return edit
+        return edit._replace(gaussians=self.with_room(edit.gaussians))
 
 
 def step(training: Training, view: View) -> float:

@@ -56,7 +56,7 @@ PACE = 3.0
 worse (measured: docs/size.md)."""
 
 PER_PIXEL = 0.6
-"""Gaussians per pixel of a photo that growth reaches by its end, unless `PACE` allows more (measured: docs/size.md)."""
+"""Gaussians per pixel of a photo that growth reaches by its end, unless `PACE` allows more."""
 
 VALIDATIONS = 3
 """Validations in the second half of a window, which are averaged: quality fluctuates while the learning rates are

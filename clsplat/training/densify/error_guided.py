@@ -52,6 +52,7 @@ class ErrorGuided(Strategy):
     """
 
     start_opacity = 0.5  # as mcmc
+    leaves_room = True
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         super().__init__(config, extent, n)
@@ -64,11 +65,14 @@ class ErrorGuided(Strategy):
 
     def due(self, iteration: int) -> bool:
         """See `clsplat.training.densify.Strategy`."""
-        return self.schedule.due(iteration)
+        # After the last round, too: Gaussians that reach a viewpoint are shrunk until the end.
+        return iteration >= self.schedule.start and iteration % self.schedule.every == 0
 
     def edit(self, iteration: int, gaussians: Gaussians, cap: int, survey: Survey) -> Edit:
         """See `clsplat.training.densify.Strategy`."""
         n = len(gaussians)
+        if not self.schedule.due(iteration):
+            return Edit(gaussians, np.arange(n), np.zeros(n, bool))
         weights, errors, prices, differences, share = survey(self.config.views)
         known = np.maximum(differences, MEMORY * self.statistics["differences"])
         # Of many that are too bright in one place, each alone promises the gain that only the first removal brings.

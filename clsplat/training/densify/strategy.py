@@ -72,6 +72,9 @@ class Strategy:
     start_opacity = 0.1
     """Opacity of the first Gaussians, where the user gives none (original code of Kerbl et al. 2023)."""
 
+    leaves_room = False
+    """Whether Gaussians that reach a viewpoint are shrunk (`clsplat.training.camera_room`)."""
+
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         self.statistics: dict[str, Any] = {}
 
