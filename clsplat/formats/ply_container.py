@@ -5,6 +5,7 @@ read by NumPy, once the size of the file is known to suffice.
 """
 
 import io
+import os
 import re
 import warnings
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError
+from clsplat.formats.validity import read_rows
 
 if TYPE_CHECKING:
     from plyfile import PlyElement
@@ -115,8 +117,8 @@ def read_vertices(path: str | Path, file: BinaryIO, header: PlyHeader) -> Array:
         names = [prop.name for prop in vertex.properties]
         return _read_text(path, file, sum(counts[:before]), counts[before], names)
     skipped = sum(n * e.dtype().itemsize for n, e in zip(counts[:before], header.elements.values(), strict=False))
-    data: Array = np.fromfile(file, vertex.dtype(header.order), counts[before], offset=skipped)
-    return data
+    file.seek(skipped, os.SEEK_CUR)
+    return read_rows(path, file, vertex.dtype(header.order), counts[before])
 
 
 def read_points(path: str | Path, file: BinaryIO) -> Array:

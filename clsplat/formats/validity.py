@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clsplat.constants import QUAT_NORM2_MIN
 from clsplat.errors import InputError
@@ -34,6 +34,23 @@ def reading(path: str | Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def read_rows(path: str | Path, file: BinaryIO, dtype: DTypeLike, count: int) -> Array:
+    """Read an array (count,) from where an open file is. `numpy.fromfile` takes a failing disk for the file's end.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    InputError
+        If it ends earlier; `path` names it.
+    """
+    rows = np.empty(count, dtype)
+    done = file.readinto(rows.view(np.uint8)) if rows.nbytes else 0  # type: ignore[attr-defined]
+    if done != rows.nbytes:
+        raise InputError(f"{path}: expected {rows.nbytes} more bytes, found {done}; the file is truncated")
+    return rows
 
 
 def check_storable(path: str | Path, gaussians: Gaussians) -> None:

@@ -69,13 +69,16 @@ class Command:
     Parameters
     ----------
     name : str
-        One of `COMMANDS`.
+        One of `commands`.
     root : Path
         Folder, with the dataset and the scene that `prepared` makes.
     """
 
+    commands = COMMANDS
+    faults = FAULTS
+
     def __init__(self, name: str, root: Path):
-        self._arguments, self._root, self._out = COMMANDS[name], root, root / "out"
+        self._arguments, self._root, self._out = self.commands[name], root, root / "out"
         self._trains = self._arguments[0] == "train"
         self._resumed: set[frozenset[tuple[str, str]]] = set()
         self._versions: set[tuple[str, str]] = set()
@@ -87,11 +90,11 @@ class Command:
         self._log = (self._out / LOG).read_text().splitlines() if self._trains else []
 
     def cases(self, per_kind: int | None = None) -> list[tuple[Point, str]]:
-        """Calls and their errors: all of them, or at most so many of each kind, evenly spaced."""
+        """Calls and their errors: all of them, or at most so many of each group, evenly spaced."""
         groups: dict[tuple[str, str], list[Point]] = {}
         for point in self.points:
-            for fault in FAULTS[point.kind]:
-                groups.setdefault((point.kind, fault), []).append(point)
+            for fault in self.faults[point.kind]:
+                groups.setdefault((self.group(point), fault), []).append(point)
         return [
             (points[(2 * i + 1) * len(points) // (2 * count)], fault)
             for (_, fault), points in groups.items()
@@ -99,10 +102,14 @@ class Command:
             for i in range(count)
         ]
 
+    def group(self, point: Point) -> str:
+        """The group of a call for `cases`: its kind."""
+        return point.kind
+
     def problems(self, point: Point, fault: str) -> list[str] | None:
         """What is wrong after a call has failed, and after the run that follows; None if the call was not reached."""
         self._clear()
-        calls = Calls(point, FAULTS[point.kind][fault])
+        calls = Calls(point, self.faults[point.kind][fault])
         ended = self._run(calls, fresh=opens_device(point))
         if not calls.failed:
             return None
@@ -110,11 +117,19 @@ class Command:
         whole = ended.status == 0
         if whole and any(not stays(name, point) for name in self._differing()):
             found.append(f"ended well, with other files: {self._differing()}")
-        state = frozenset(self._files().items())
-        if not found and not whole and state not in self._resumed:
+        state = self._state()
+        if not found and not self._done(whole) and state not in self._resumed:
             found += self._wrong_again()
             self._resumed.add(state)
         return found
+
+    def _state(self) -> frozenset[tuple[str, str]]:
+        """What a run leaves that the next one may depend on."""
+        return frozenset(self._files().items())
+
+    def _done(self, whole: bool) -> bool:
+        """Whether no further run is needed to know that a run left nothing wrong; `whole` if it ended well."""
+        return whole
 
     def _wrong_again(self) -> list[str]:
         """What is wrong after the command ran again without a fault."""
@@ -139,15 +154,20 @@ class Command:
             default_device.cache_clear()
 
         def replaced(path: Path) -> None:
-            if not calls.failed and path.resolve().is_relative_to(self._out):
-                files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-                self._versions.update((self._name(file), digest(file)) for file in files)
+            if not calls.failed:
+                self._versions.update(self._versions_of(path))
 
         with outside(self._root) as stray, watched(self._root, calls, replaced):
             printed = io.StringIO()
             with redirect_stderr(printed), redirect_stdout(printed):
                 status = status_of([*self._arguments, *more])
         return Ended(status, printed.getvalue(), stray)
+
+    def _versions_of(self, path: Path) -> Iterator[tuple[str, str]]:
+        """Names and digests of the outputs in a file or folder that has just been put in its place."""
+        if path.resolve().is_relative_to(self._out):
+            files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+            yield from ((self._name(file), digest(file)) for file in files)
 
     def _name(self, path: Path) -> str:
         return str(path.resolve().relative_to(self._out.resolve()))
@@ -229,7 +249,7 @@ def status_of(arguments: list[str]) -> int:
 
 
 @contextmanager
-def outside(root: Path) -> Iterator[list[str]]:
+def outside(root: Path, seconds: float = HANG) -> Iterator[list[str]]:
     """Run the block in a folder as a process of its own would, at a clock that stands still; yields stray exceptions.
 
     Arguments are parsed once, and charts are blank: both take longer than all the rest.
@@ -246,10 +266,9 @@ def outside(root: Path) -> Iterator[list[str]]:
     def hang(*_: object) -> None:
         raise Hung
 
-    def solved(*_: object) -> Any:
-        import pycolmap
-
-        return pycolmap.Reconstruction(root / SOLVED / "sparse" / "0")
+    def solved(work: Path, *_: object) -> int:
+        shutil.copytree(root / SOLVED / "sparse" / "0", work / "sparse" / "0")
+        return len(os.listdir(root / "photos"))
 
     def blank(self: Any, file: Any, **_: Any) -> None:
         file.write(bytes(20000))
@@ -262,12 +281,12 @@ def outside(root: Path) -> Iterator[list[str]]:
         patch.setattr(tyro, "cli", parse_once)
         patch.setattr("matplotlib.figure.Figure.savefig", blank)
         if (root / SOLVED).is_dir():  # pycolmap takes seconds, and threads of its own
-            patch.setattr(reconstruction, "_largest_model", solved)
+            patch.setattr(reconstruction, "_solved", solved)
         patch.setattr(recorder, "time", SimpleNamespace(perf_counter=lambda: 0.0))
         patch.setattr(threading, "excepthook", lambda about: stray.append(f"{about.exc_type}: {about.exc_value}"))
         patch.setattr(sys, "unraisablehook", lambda about: stray.append(f"{about.exc_value!r} {about.object!r}"))
         signal.signal(signal.SIGALRM, hang)
-        signal.setitimer(signal.ITIMER_REAL, HANG)
+        signal.setitimer(signal.ITIMER_REAL, seconds)
         try:
             yield stray
         finally:

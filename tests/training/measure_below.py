@@ -1,0 +1,336 @@
+"""Faults below Python: a command runs again and again, and each time a call of a C library that it uses fails.
+
+``make faults-below``, which sets the path of the test modules. Each run is a process of its own, forked from this one,
+with the library of faults_below.c. The report, below.jsonl, has a line for each point; the program goes on after the
+last one if it is started again. Linux only.
+"""
+
+import atexit
+import ctypes
+import errno
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib.figure  # noqa: F401  (loaded once, before all forks)
+import pytest
+import tyro
+from cli_runs import write_dataset
+from fault_commands import PHOTOS, TRAIN
+from measure_faults import Command, Ended, digest, outside, status_of
+from PIL import Image
+from textured_corner import take_photos
+
+import clsplat.dataset.sfm.reconstruction
+import clsplat.training.loop  # noqa: F401  (loaded once)
+from clsplat.commands.console import Out
+
+SOURCE = Path(__file__).with_name("faults_below.c")
+"""The library that makes calls fail."""
+
+BYTES = 2**16
+"""Smallest allocation that counts, bytes: arrays and buffers, but not each of Python's objects."""
+
+SECONDS = 60.0
+"""Time after which a run counts as hanging, s. On a busy core it takes up to twenty."""
+
+SHORT = (*TRAIN[:5], "6", "--checkpoint-every", "3", "--eval-every", "3", *TRAIN[10:12])
+COMMANDS = {
+    "train": SHORT,
+    "train, cold cache": SHORT,
+    "eval": ("eval", "scene.ply", "data", "-o", "out"),
+    "render": ("render", "scene.ply", "data", "-o", "out", "--depth"),
+    "export": ("export", "scene.ply", "out/scene.sog"),
+    "sfm": ("sfm", "photos", "-o", "out", "--camera-model", "SIMPLE_RADIAL"),
+}
+"""Commands by name. The cache of the driver has all kernels except where the name says that it is cold."""
+
+
+class Fault(NamedTuple):
+    """The error that a call ends with. After a lasting one, nothing can be written any more."""
+
+    number: int
+    lasting: bool = False
+
+
+FULL = {"ENOSPC": Fault(errno.ENOSPC, lasting=True)}
+FAILED = {"EIO": Fault(errno.EIO)}
+REFUSED = {"EACCES": Fault(errno.EACCES)}
+MEMORY = {"ENOMEM": Fault(errno.ENOMEM)}
+FAULTS = {
+    "open": REFUSED,
+    "create": FULL | REFUSED,
+    "read": FAILED,
+    "write": FULL | FAILED,
+    "truncate": FAILED,
+    "fsync": FAILED,
+    "replace": REFUSED,
+    "mkdir": FULL,
+    "unlink": FAILED,
+    "rmdir": FAILED,
+    "load": MEMORY,
+    "map": MEMORY,
+    "allocate": MEMORY,
+}
+"""Errors of each kind of call, by name."""
+
+RANDOM = (
+    (re.compile(r"\.[0-9a-f]{16}\.part"), ".*.part"),
+    (re.compile(r"(tmp|clsplat_triangulate_|clsplat_sfm_|matches_)[a-z0-9_]{8}(?=/|$)"), r"\1*"),
+    (re.compile(r"tempfile_[A-Za-z0-9]{6}"), "tempfile_*"),
+    (re.compile(r"preproc-[0-9a-f]+"), "preproc-*"),
+    (re.compile(r"cache/[A-P]{2}/[A-P]+"), "cache/*"),
+    (re.compile(r"cache/[A-P]{2}$"), "cache/??"),
+    (re.compile(r"\[|\]"), "?"),
+)
+"""Parts of names of files that differ from run to run or by kernel, and the patterns of fnmatch that stand for them."""
+
+
+class Point(NamedTuple):
+    """One call of a run: its kind, the pattern of its name, how many of the same came before it, and whether the
+    program makes it ("main") or a process that it starts ("child")."""
+
+    kind: str
+    about: str
+    index: int
+    process: str
+
+
+def library(folder: Path) -> Path | None:
+    """Build the library that makes calls fail; None where that is not possible."""
+    compiler = shutil.which("cc")
+    if sys.platform != "linux" or compiler is None:
+        return None
+    built = folder / "libbelow.so"
+    subprocess.run([compiler, "-O2", "-shared", "-fPIC", "-o", built, SOURCE, "-ldl"], check=True)
+    return built
+
+
+def environment(root: Path, scratch: Path, point: Any = None, fault: Fault | None = None) -> dict[str, str]:
+    """Variables with which the library records calls, or fails one.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the files that count.
+    scratch : Path
+        Folder for the library's own files.
+    """
+    variables = {
+        "BELOW_ROOT": str(root),
+        "BELOW_BYTES": str(BYTES),
+        "BELOW_LOG": "" if point else str(scratch / "log"),
+        "BELOW_STATE": str(scratch / "state"),
+        "TMPDIR": str(root / "tmp"),
+        "POCL_CACHE_DIR": str(root / "cache"),
+    }
+    if point is not None and fault is not None:
+        which = (point.process, point.kind, point.index, fault.number, int(fault.lasting), point.about)
+        variables["BELOW_POINT"] = " ".join(map(str, which))
+    return variables
+
+
+class Below(Command):
+    """A command of which calls of C libraries fail."""
+
+    commands = COMMANDS
+    faults: Any = FAULTS
+
+    def __init__(self, name: str, root: Path):
+        self._cold, self._scratch = "cold" in name, root.with_name("scratch")
+        self._kernels: frozenset[tuple[str, str]] = frozenset()
+        super().__init__(name, root)
+        self._kernels = self._cache()
+        self.points: Any = list(self._recorded())
+
+    def group(self, point: Any) -> str:
+        """The group of a call for `cases`: its kind, its process and what it is about."""
+        return f"{point.process} {point.kind} {point.about}"
+
+    def _recorded(self) -> Iterator[Point]:
+        counts: dict[tuple[str, str, str], int] = {}
+        for line in (self._scratch / "log").read_text().splitlines():
+            process, kind, about = line.split(" ", 2)
+            for pattern, name in RANDOM:
+                about = pattern.sub(name, about)
+            index = counts.get((process, kind, about), 0)
+            counts[process, kind, about] = index + 1
+            yield Point(kind, about, index, process)
+
+    def _clear(self) -> None:
+        super()._clear()
+        shutil.rmtree(self._root / "cache", ignore_errors=True)
+        if self._cold:
+            (self._root / "cache").mkdir()
+        else:
+            shutil.copytree(self._root / "warm", self._root / "cache")
+
+    def _run(self, calls: Any, more: Iterable[str] = (), fresh: bool = False) -> Ended:
+        shutil.rmtree(self._scratch, ignore_errors=True)
+        self._scratch.mkdir()
+        variables = environment(self._root, self._scratch, calls.point, calls.fault)
+
+        def work() -> int:
+            os.environ.update(variables)
+            ctypes.CDLL(None).below_start()
+            with outside(self._root, SECONDS) as stray, pytest.MonkeyPatch.context() as patch:
+                if not calls.point:
+                    patch.setattr(os, "replace", self._noting(os.replace))
+                status = status_of([*self._arguments, *more])
+            (self._scratch / "stray").write_text(json.dumps(stray))
+            return status
+
+        status, printed, left = apart(work, self._scratch / "printed")
+        calls.failed = (self._scratch / "state").exists()
+        stray = self._scratch / "stray"
+        strays = json.loads(stray.read_text()) if stray.exists() else []
+        versions = self._scratch / "versions"
+        if versions.exists():
+            self._versions.update((name, digest_) for name, digest_ in map(json.loads, versions.open()))
+        return Ended(status, printed, strays + ["a process is left"] * left)
+
+    def _noting(self, replace: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
+        def noting(source: Any, target: Any) -> None:
+            replace(source, target)
+            with (self._scratch / "versions").open("a") as file:
+                file.writelines(json.dumps(version) + "\n" for version in self._versions_of(Path(target)))
+
+        return noting
+
+    def _cache(self) -> frozenset[tuple[str, str]]:
+        """The driver's files, apart from temporary ones; programs contain temporary names."""
+        files = [path for path in (self._root / "cache").rglob("*") if path.is_file()]
+        return frozenset(
+            (str(path), digest(path) if path.suffix == ".so" else str(path.stat().st_size))
+            for path in files
+            if "tempfile_" not in path.name
+        )
+
+    def _state(self) -> frozenset[tuple[str, str]]:
+        return super()._state() | self._cache()
+
+    def _done(self, whole: bool) -> bool:
+        """A run that ended well may have left a file in the driver's cache that breaks the next one."""
+        if whole and self._cache() != self._kernels:
+            shutil.rmtree(self._out)
+            if not self._trains:
+                self._out.mkdir()
+            return False
+        return whole
+
+
+def apart(work: Callable[[], int], printed: Path) -> tuple[int, str, bool]:
+    """Do work in a fork of this process: its status (negative: the signal that ended it), what it printed, and
+    whether a process that it has started is left."""
+    process = os.fork()
+    if process == 0:
+        status = 1
+        with suppress(BaseException):
+            os.setsid()
+            file = os.open(printed, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+            os.dup2(file, 1), os.dup2(file, 2)
+            status = work()
+            threading._shutdown()  # type: ignore[attr-defined]
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+        ctypes.CDLL(None).exit(status)  # with the libraries' own clean-up
+    end, found = time.monotonic() + SECONDS + 10, 0
+    while found == 0 and time.monotonic() < end:
+        found, code = os.waitpid(process, os.WNOHANG)
+        time.sleep(0.01)
+    left = alive(process)
+    with suppress(ProcessLookupError):
+        os.killpg(process, signal.SIGKILL)
+    if not found:
+        _, code = os.waitpid(process, 0)
+    return os.waitstatus_to_exitcode(code), printed.read_text(errors="replace"), left
+
+
+def alive(group: int) -> bool:
+    """Whether processes of a group are left two seconds after the one that started them."""
+    for _ in range(200):
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def prepared(root: Path) -> Path:
+    """Write photos, a dataset, a scene that is trained on it, and a cache with all kernels to a folder."""
+    (root / "tmp").mkdir(parents=True)
+    (root / "photos").mkdir()
+    for k, photo in enumerate(take_photos(0)):
+        Image.fromarray(photo).save(root / "photos" / f"photo {k}.png")
+
+    def work() -> int:
+        os.environ["POCL_CACHE_DIR"] = str(root / "warm")
+        (root / "warm").mkdir()
+        write_dataset(root / "data", PHOTOS)
+        with outside(root, SECONDS):
+            return sum(
+                status_of([*arguments])
+                for arguments in (
+                    (*SHORT[:3], "first", *SHORT[4:]),
+                    ("export", "first", "scene.ply"),
+                    ("eval", "scene.ply", "data", "-o", "evaluated"),
+                    ("render", "scene.ply", "data", "-o", "rendered", "--depth"),
+                )
+            )
+
+    status, printed, _ = apart(work, root / "printed")
+    assert status == 0, printed
+    for name in ("first", "evaluated", "rendered"):
+        shutil.rmtree(root / name)
+    return root
+
+
+def measure(out: Out, commands: tuple[str, ...] = tuple(COMMANDS), per_group: int = 3) -> None:
+    """Fail calls of C libraries in the commands, at most so many of each kind, file and process."""
+    out.mkdir(parents=True, exist_ok=True)
+    built = library(out)
+    if built is None:
+        sys.exit("faults below Python are measured on Linux, with the compiler cc: skipped")
+    if str(built.resolve()) not in os.environ.get("LD_PRELOAD", ""):
+        os.environ["LD_PRELOAD"] = str(built.resolve())
+        os.execv(sys.executable, [sys.executable, *sys.argv])
+    report = out / "below.jsonl"
+    lines = report.read_text().splitlines() if report.exists() else []
+    known = {tuple(map(str, json.loads(line)["point"])) for line in lines}
+    failures = sum(bool(json.loads(line)["found"]) for line in lines)
+    folder = Path(tempfile.mkdtemp()).resolve()  # TemporaryDirectory would remove it where a fork ends, too
+    root = prepared(folder / "root")
+    for name in commands:
+        command = Below(name, root)
+        cases = command.cases(per_group)
+        print(f"{name}: {len(command.points)} calls, {len(cases)} points", flush=True)
+        for point, fault in cases:
+            key = (name, *point, fault)
+            if tuple(map(str, key)) in known:
+                continue
+            started = time.perf_counter()
+            found = command.problems(point, fault)
+            line = {"point": key, "reached": found is not None, "found": found or []}
+            failures += bool(found)
+            with report.open("a") as file:
+                file.write(json.dumps(line | {"seconds": round(time.perf_counter() - started, 1)}) + "\n")
+            if found:
+                print(json.dumps(line), flush=True)
+    shutil.rmtree(folder)
+    sys.exit(failures > 0)
+
+
+if __name__ == "__main__":
+    tyro.cli(measure)
