@@ -97,9 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
         if console.loudness == "verbose":
             traceback.print_exc()
         reason = f" ({error})" if str(error) else ""
-        warn(
-            f"clsplat: this machine has not enough memory{reason}; use smaller photos or fewer Gaussians, or end other programs"
-        )
+        warn(f"clsplat: this machine has not enough memory{reason}; use smaller photos or fewer Gaussians")
         sys.stdout.flush()
         # A driver that met the end of the memory may still hold its locks, and its own clean-up then waits for ever.
         atexit.register(os._exit, 2)

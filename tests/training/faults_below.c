@@ -140,6 +140,8 @@ static int file_error(const char *kind, int folder, const char *path, void *call
         used = 1;
         if (!interpreter || base_of(caller, &library) != interpreter)
             error = counted(kind, whole + root_length + 1, takes_space);
+        else if (point_lasting && takes_space && (reached || syscall(SYS_faccessat, AT_FDCWD, state, F_OK) == 0))
+            error = point_errno; /* a full disk is full for the interpreter too */
     }
     inside = 0;
     errno = error ? error : before;

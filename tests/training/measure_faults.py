@@ -20,6 +20,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from math import inf
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -286,7 +287,8 @@ def outside(root: Path, seconds: float = HANG) -> Iterator[list[str]]:
         patch.setattr(threading, "excepthook", lambda about: stray.append(f"{about.exc_type}: {about.exc_value}"))
         patch.setattr(sys, "unraisablehook", lambda about: stray.append(f"{about.exc_value!r} {about.object!r}"))
         signal.signal(signal.SIGALRM, hang)
-        signal.setitimer(signal.ITIMER_REAL, seconds)
+        if seconds < inf:
+            signal.setitimer(signal.ITIMER_REAL, seconds)
         try:
             yield stray
         finally:
