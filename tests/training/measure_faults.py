@@ -4,56 +4,36 @@
 and kind of call, and what went wrong.
 """
 
-import hashlib
 import io
 import json
 import os
 import re
 import shutil
-import signal
 import sys
 import tempfile
-import threading
 import time
-import traceback
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from math import inf
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-import pytest
 import tyro
 from cli_runs import write_dataset
 from failing_calls import FAULTS, Calls, Point, is_json, watched
 from fault_commands import COMMANDS, PHOTOS, TRAIN, opens_device, stays
 from filelock import FileLock, Timeout
+from lone_commands import SOLVED, digest, outside, status_of
 from PIL import Image
 from textured_corner import CONFIG, take_photos
 
-from clsplat import cli
 from clsplat.atomic import PART
 from clsplat.commands.console import Out
-from clsplat.dataset.sfm import reconstruction
 from clsplat.dataset.sfm.reconstruction import reconstruct
 from clsplat.renderer import default_device
 from clsplat.run_log import LOG
-from clsplat.training import recorder
 from clsplat.training.checkpoint import CHECKPOINT
 from clsplat.training.run_folder import LOCK
-
-SOLVED = "solved"
-"""Folder of the model that structure from motion finds, each time without its seconds of computation."""
-
-HANG = 30.0
-"""Time after which a command counts as hanging, s; it takes less than one."""
-
-
-class Hung(BaseException):
-    """The command did not end."""
 
 
 class Ended(NamedTuple):
@@ -237,81 +217,12 @@ class Command:
         return found
 
 
-def status_of(arguments: list[str]) -> int:
-    """The status that the command line ends with; 1, with a traceback, for an exception that it does not catch."""
-    try:
-        cli.main(arguments)
-    except SystemExit as exit_:
-        return int(exit_.code or 0)
-    except (Exception, Hung):
-        traceback.print_exc()
-        return 1
-    return 0
-
-
-@contextmanager
-def outside(root: Path, seconds: float = HANG) -> Iterator[list[str]]:
-    """Run the block in a folder as a process of its own would, at a clock that stands still; yields stray exceptions.
-
-    Arguments are parsed once, and charts are blank: both take longer than all the rest.
-    """
-    stray: list[str] = []
-    parse = tyro.cli
-
-    def parse_once(*arguments: Any, args: list[str], **named: Any) -> Any:
-        typed = (named["prog"], *args)
-        if typed not in PARSED:
-            PARSED[typed] = parse(*arguments, args=args, **named)
-        return PARSED[typed]
-
-    def hang(*_: object) -> None:
-        raise Hung
-
-    def solved(work: Path, *_: object) -> int:
-        shutil.copytree(root / SOLVED / "sparse" / "0", work / "sparse" / "0")
-        return len(os.listdir(root / "photos"))
-
-    def blank(self: Any, file: Any, **_: Any) -> None:
-        file.write(bytes(20000))
-
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        patch.chdir(root)
-        patch.setattr(tempfile, "tempdir", str(root / "tmp"))
-        patch.setattr(tyro, "cli", parse_once)
-        patch.setattr("matplotlib.figure.Figure.savefig", blank)
-        if (root / SOLVED).is_dir():  # pycolmap takes seconds, and threads of its own
-            patch.setattr(reconstruction, "_solved", solved)
-        patch.setattr(recorder, "time", SimpleNamespace(perf_counter=lambda: 0.0))
-        patch.setattr(threading, "excepthook", lambda about: stray.append(f"{about.exc_type}: {about.exc_value}"))
-        patch.setattr(sys, "unraisablehook", lambda about: stray.append(f"{about.exc_value!r} {about.object!r}"))
-        signal.signal(signal.SIGALRM, hang)
-        if seconds < inf:
-            signal.setitimer(signal.ITIMER_REAL, seconds)
-        try:
-            yield stray
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-
-
-PARSED: dict[tuple[str, ...], Any] = {}
-"""Commands by their arguments."""
-
-
-def digest(path: Path) -> str:
-    """Digest of a file's bytes."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def prepared(root: Path) -> Path:
     """Write a dataset and a scene that is trained on it to a folder."""
     write_dataset(root / "data", PHOTOS)
     (root / "tmp").mkdir()
     with outside(root):
-        cli.main([*TRAIN[:3], "first", TRAIN[4], "10", *TRAIN[10:12]])
+        status_of([*TRAIN[:3], "first", TRAIN[4], "10", *TRAIN[10:12]])
     (root / "first" / "scene.ply").rename(root / "scene.ply")
     shutil.rmtree(root / "first")
     (root / "photos").mkdir()

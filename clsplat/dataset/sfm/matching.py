@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from clsplat.dataset.sfm.processes import child
+from clsplat.dataset.sfm.processes import child, how_it_ended
 from clsplat.errors import ClsplatError, InputError
 
 SEED = 0
@@ -30,6 +30,9 @@ WORKERS_MAX = 8
 
 PAIRS_MIN = 16
 """Smallest number of pairs of photos per process. Matching them takes about as long as starting a process."""
+
+TRACED = (signal.SIGTERM, signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV)
+"""Signals after which COLMAP prints a stack trace."""
 
 COUNT_ROWS = """
 import sqlite3, time
@@ -62,12 +65,13 @@ match_share(sys.argv[2], sys.argv[3], sys.argv[4] == "verbose")
 
 @contextmanager
 def quiet(verbose: bool) -> Iterator[None]:
-    """Suppress COLMAP's messages, unless `verbose`, and the stack trace that it prints when it is terminated."""
+    """Suppress COLMAP's messages, unless `verbose`, and the stack trace that it prints when a signal ends it."""
     from pycolmap import logging
 
     if threading.current_thread() is threading.main_thread():
-        # On import pycolmap has replaced the handler without Python's knowledge.
-        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
+        # On import pycolmap has replaced these handlers without Python's knowledge.
+        for number in TRACED:
+            signal.signal(number, signal.getsignal(number))
     before = logging.minloglevel
     logging.minloglevel = before if verbose else int(logging.ERROR)
     try:
@@ -178,10 +182,7 @@ def match(database: Path, pairs: list[tuple[int, int]], verbose: bool = False) -
             ]
             for worker in workers:
                 if worker.wait() != 0:
-                    raise ClsplatError(
-                        f"cannot match photos: the process of COLMAP ended with status {worker.returncode}; its "
-                        "output is above, and -9 means that there was not enough memory"
-                    )
+                    raise ClsplatError(f"cannot match photos: {how_it_ended(worker.returncode)}")
         with pycolmap.Database.open(database) as found:
             for copy in copies:
                 with pycolmap.Database.open(copy) as part:

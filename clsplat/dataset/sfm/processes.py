@@ -77,7 +77,7 @@ def apart(what: str, function: str, work: Path, **arguments: Any) -> Any:
         assert process.stdout is not None
         said = process.stdout.read()
         status = process.wait()
-    outcome, value = json.loads(said) if status == 0 else ("failed", _ended(status))
+    outcome, value = json.loads(said) if status == 0 else ("failed", how_it_ended(status))
     if outcome == "result":
         return value
     if outcome == "refused":
@@ -89,7 +89,7 @@ def apart(what: str, function: str, work: Path, **arguments: Any) -> Any:
     raise ClsplatError(f"cannot {what}: {value}")
 
 
-def _ended(status: int) -> str:
+def how_it_ended(status: int) -> str:
     """How a process ended that gave no answer."""
     if status >= 0:
         return f"the process of COLMAP ended with status {status}; its output is above"
