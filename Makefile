@@ -1,6 +1,6 @@
 PYTHON = python
 
-.PHONY: test test-slow stability fuzz fuzz-cases faults mutants soak lint docs check-races check-variants \
+.PHONY: test test-slow stability fuzz fuzz-cases faults faults-below mutants soak lint docs check-races check-variants \
   check-runtimes check-builds bench bench-knobs bench-quality bench-captures bench-stability formats foreign works-with \
   foreign-packages
 
@@ -34,6 +34,13 @@ EVERY = 1
 faults:
 	PYTHONPATH=tests/training:tests/commands:tests/dataset:$(PYTHONPATH) $(PYTHON) tests/training/measure_faults.py --every $(EVERY) \
 	  -o build/faults
+
+# Fail calls of the C libraries below Python, at most PER_GROUP of each kind, file and process: build/faults/below.jsonl.
+# Linux, with the compiler cc. It goes on where it was interrupted. COMMANDS selects commands: COMMANDS='sfm render'.
+PER_GROUP = 3
+faults-below:
+	PYTHONPATH=tests/training:tests/commands:tests/dataset:$(PYTHONPATH) $(PYTHON) tests/training/measure_below.py \
+	  --per-group $(PER_GROUP) $(if $(COMMANDS),--commands $(COMMANDS)) -o build/faults
 
 # Change the mathematics in COUNT places, one at a time, and list which changes the tests see: build/mutants.jsonl. It
 # takes hours, and goes on where it was interrupted.

@@ -1,19 +1,20 @@
 /* Calls of C libraries that can be counted and made to fail, one of them at a time; loaded with LD_PRELOAD.
  *
  * It wraps the calls of libc by which pycolmap, PoCL, Pillow and NumPy reach files, and large allocations of all
- * libraries. libfiu was considered: it fails calls by chance or all of a kind, and has no filter for paths, so that
- * "the third write to database.db" cannot be asked for.
+ * libraries. libfiu (1.1 in Debian) was considered: it fails a kind of call always, once, by chance or below a
+ * function. It has no filter for paths, so that "the third write to database.db" cannot be asked for.
  *
  * Files count if they are in the folder BELOW_ROOT, and if the call does not come from the interpreter itself, whose
  * calls failing_calls.py fails. Allocations of at least BELOW_BYTES count as soon as a file of the folder has been
  * used, so that the start of the interpreter cannot fail. With BELOW_LOG, a line for each call is appended to this
- * file: "process kind name", where the process is "main" or "child", and the name is the path in the folder or, for
- * an allocation, the library that asks for it.
+ * file: "process number kind name", where the process is "main" or "child", and the name is the path in the folder
+ * or, for an allocation, the library that asks for it.
  *
- * BELOW_POINT is "process kind number errno lasting pattern": of the calls of this kind whose name matches the
- * pattern of fnmatch, the one of this number fails (from 0). A lasting one fails all later calls for space too. The
- * file BELOW_STATE is made when it fails, and tells the other processes. The variables are read when a process
- * starts, and by below_start, which a forked process calls.
+ * BELOW_POINT is "process kind number errno lasting pattern": of the calls of this kind that a process makes and
+ * whose name matches the pattern of fnmatch, the one of this number fails (from 0), in the first process that gets so
+ * far. A lasting one fails all later calls for space too, those of the interpreter included. The file BELOW_STATE is
+ * made when it fails, and tells the other processes. The variables are read when a process starts, and by below_start,
+ * which a forked process calls.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -96,7 +97,7 @@ static int counted(const char *kind, const char *name, int takes_space) {
     int fails = 0;
     if (*log_path) {
         char line[PATH_MAX + 64];
-        snprintf(line, sizeof line, "%s %s %s\n", is_main ? "main" : "child", kind, name);
+        snprintf(line, sizeof line, "%s %d %s %s\n", is_main ? "main" : "child", getpid(), kind, name);
         append(log_path, line);
     }
     if (!*state)

@@ -15,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from math import inf
@@ -67,21 +68,20 @@ class Below(Command):
         self._kernels: frozenset[tuple[str, str]] = frozenset()
         super().__init__(name, root)
         self._kernels = self._cache()
-        self.points: Any = list(self._recorded())
+        self.points: Any = list(dict.fromkeys(self._recorded()))
 
     def group(self, point: Any) -> str:
         """The group of a call for `cases`: its kind, its process and what it is about."""
         return f"{point.process} {point.kind} {point.about}"
 
     def _recorded(self) -> Iterator[Point]:
-        counts: dict[tuple[str, str, str], int] = {}
+        counts: Counter[tuple[str, ...]] = Counter()
         for line in (self._scratch / "log").read_text().splitlines():
-            process, kind, about = line.split(" ", 2)
+            process, number, kind, about = line.split(" ", 3)
             for pattern, name in RANDOM:
                 about = pattern.sub(name, about)
-            index = counts.get((process, kind, about), 0)
-            counts[process, kind, about] = index + 1
-            yield Point(kind, about, index, process)
+            yield Point(kind, about, counts[number, kind, about], process)
+            counts[number, kind, about] += 1
 
     def _clear(self) -> None:
         super()._clear()
