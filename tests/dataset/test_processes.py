@@ -45,7 +45,7 @@ def test_the_result_comes_back(tmp_path: Path) -> None:
     [
         (refuse, InputError, r"^photo\.png: expected a photo$"),
         (run_out, MemoryError, r"^std::bad_alloc$"),
-        (fail, ClsplatError, r"^cannot find cameras: SQLite error: disk I/O error$"),
+        (fail, ClsplatError, r"^cannot find cameras: COLMAP, .*, reports: SQLite error: disk I/O error$"),
         (
             abort,
             ClsplatError,

@@ -77,7 +77,7 @@ def apart(what: str, function: str, work: Path, **arguments: Any) -> Any:
         assert process.stdout is not None
         said = process.stdout.read()
         status = process.wait()
-    outcome, value = json.loads(said) if status == 0 else ("failed", how_it_ended(status))
+    outcome, value = json.loads(said) if status == 0 else ("ended", how_it_ended(status))
     if outcome == "result":
         return value
     if outcome == "refused":
@@ -86,6 +86,8 @@ def apart(what: str, function: str, work: Path, **arguments: Any) -> Any:
         raise MemoryError(value)
     if problem := unwritable(work):
         value = f"{work.parent} takes no files: {problem}"
+    elif outcome == "failed":
+        value = f"COLMAP, whose files were in {work.parent}, reports: {value}"
     raise ClsplatError(f"cannot {what}: {value}")
 
 
