@@ -58,7 +58,10 @@ MATCH_SHARE = """
 import json
 sys.path[:] = json.loads(sys.argv[1])
 from clsplat.dataset.sfm.matching import match_share
-match_share(sys.argv[2], sys.argv[3], sys.argv[4] == "verbose")
+try:
+    match_share(sys.argv[2], sys.argv[3], sys.argv[4] == "verbose")
+except Exception as error:  # without a traceback: COLMAP's errors are of many kinds
+    sys.exit(f"COLMAP: {error!r}")
 """
 """Program that runs `match_share` with the module search path of the process that started it."""
 

@@ -132,8 +132,8 @@ def solve(work: Path, photos: list[Photo], chosen: list[tuple[int, int]], verbos
     names = list(viewmats)
     with quiet(verbose):
         pycolmap.Database.open(database).close()
-        for name, model, params, _ in photos:
-            reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=",".join(map(repr, params)))
+        for name, lens, params, _ in photos:
+            reader = pycolmap.ImageReaderOptions(camera_model=lens, camera_params=",".join(map(repr, params)))
             mode = pycolmap.CameraMode.PER_IMAGE
             pycolmap.import_images(database, work, image_names=[name], camera_mode=mode, options=reader)
         with pycolmap.Database.open(database) as opened:
