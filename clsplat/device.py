@@ -17,7 +17,16 @@ from clsplat import constants
 from clsplat.buffers import Buffers
 from clsplat.errors import DeviceError, InputError
 from clsplat.processors import name_processor, vector_width
-from clsplat.programs import Subgroups, ask, build, build_options, inline_includes, kernel_folder, probe_subgroups
+from clsplat.programs import (
+    Subgroups,
+    ask,
+    build,
+    build_options,
+    check_space,
+    inline_includes,
+    kernel_folder,
+    probe_subgroups,
+)
 
 POCL_HINT = "install one, for example the embedded CPU driver: pip install 'clsplat[pocl]'"
 
@@ -300,6 +309,7 @@ class Device:
 
         If a build with subgroups fails, a warning says so, and the device uses none. They change no result.
         """
+        check_space(self.cl_device)
         source, values = inline_includes(f"{stage}.cl", kernel_folder()), self.model | defines
         if self._level:  # a key of PoCL's cache, which processors of other levels may share
             values["PROCESSOR"] = self._level

@@ -61,6 +61,8 @@ def ended(root: Path, built: Path, arguments: tuple[str, ...], point: Point, fau
         (Point("write", f"{DATABASE}-wal", 20, "child"), FULL, "cannot recover the cameras: .*No space left"),
         (Point("open", "photos/photo 1.png", 1, "child"), Fault(errno.EACCES), r"photo 1\.png: COLMAP .* 1 of 4"),
         (Point("open", "photos/photo 1.png", 3, "child"), Fault(errno.EACCES), r"photo 1\.png: COLMAP .* 1 of 4"),
+        # A traceback of the process that matches photos.
+        (Point("create", "out/.clsplat_sfm_*/matches_*/?.db-wal", 1, "child"), FULL, "cannot match photos"),
     ],
 )
 def test_structure_from_motion_ends_with_a_sentence(
