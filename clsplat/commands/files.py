@@ -159,6 +159,7 @@ class Export:
     def _write_levels(self, out: Path, nodes: "Iterable[Node]", mode: Mode, offset: Any) -> None:
         from clsplat.formats.streamed_sog import LOD_META, StreamedSogWriter
         from clsplat.formats.tiles_3d import TILESET, TilesWriter
+        from clsplat.pruning.leaf_threads import in_threads
 
         folder = out.parent if out.suffix else out
         writers: list[StreamedSogWriter | TilesWriter] = []
@@ -167,10 +168,14 @@ class Export:
         if out.name != LOD_META:
             writers.append(TilesWriter(folder, mode, offset))
         counts: Counter[int] = Counter()
-        for node in nodes:
-            counts[node.height] += len(node.gaussians)
+
+        def write(node: "Node") -> tuple[int, int]:
             for writer in writers:
                 writer.add(node)
+            return node.height, len(node.gaussians)
+
+        for height, count in in_threads(write, nodes):
+            counts[height] += count
         for writer in writers:
             writer.finish()
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

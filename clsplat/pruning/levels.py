@@ -17,6 +17,7 @@ from clsplat.formats.detail_tree import Node
 from clsplat.formats.ply_parts import PlyParts
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.cutting import cut_on_disk, leaves
+from clsplat.pruning.leaf_threads import in_threads
 from clsplat.pruning.merging import covariances, masses, merged, neighbours
 
 Array = NDArray[np.float64]
@@ -94,16 +95,22 @@ def _depth(count: int, leaf: int) -> int:
 def _tree(parts: Iterable[Gaussians], depth: int) -> Iterator[Node]:
     """The nodes of a tree of leaves."""
     unfinished: list[list[Node]] = [[] for _ in range(depth + 1)]
-    for number, level in enumerate(parts):
-        for height in range(depth + 1):
+    for number, levels in enumerate(in_threads(lambda part: _levels(part, depth), parts)):
+        for height, level in enumerate(levels):
             part = Node(height, number >> height, level, [(number, len(level))])
             waiting = unfinished[height]
             waiting.append(part)
             if len(waiting) == 1 << height:
                 yield _joined(waiting)
                 waiting.clear()
-            if height < depth:
-                level = halved(level)
+
+
+def _levels(leaf: Gaussians, depth: int) -> list[Gaussians]:
+    """The levels of a leaf, the finest first."""
+    levels = [leaf]
+    for _ in range(depth):
+        levels.append(halved(levels[-1]))
+    return levels
 
 
 def _joined(parts: list[Node]) -> Node:

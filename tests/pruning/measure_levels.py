@@ -14,6 +14,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -35,6 +36,8 @@ NOISE = 0.02
 INNER = (0.02, 0.98)
 """Quantiles of the means between which a copy extends; the few beyond overlap its neighbours."""
 
+LOCK = threading.Lock()
+
 
 def tiled(scene: Gaussians, count: int) -> Iterator[Gaussians]:
     """Copies of a scene on a square in the plane of its two longest axes, `count` Gaussians in all."""
@@ -52,14 +55,15 @@ def tiled(scene: Gaussians, count: int) -> Iterator[Gaussians]:
 
 
 def timed(seconds: Counter[str], name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that adds its processor time to a counter."""
+    """A function that adds the processor time of its thread to a counter."""
 
     def wrapped(*args: Any, **settings: Any) -> Any:
-        begin = time.process_time()
+        begin = time.thread_time()
         try:
             return call(*args, **settings)
         finally:
-            seconds[name] += time.process_time() - begin
+            with LOCK:
+                seconds[name] += time.thread_time() - begin
 
     return wrapped
 
@@ -86,7 +90,7 @@ def export(ply: Path, out: Path) -> dict[str, Any]:
 
 def measure(scene: Gaussians, count: int, folder: Path) -> dict[str, Any]:
     """Make a scene of a size, and export it in another process."""
-    ply, out = folder / f"{count}.ply", folder / f"{count}.levels"
+    ply, out = folder / f"{count}.ply", folder / f"levels-{count}"
     save_ply_parts(ply, tiled(scene, count), count, "classic", None)
     try:
         command = [sys.executable, "-P", __file__, str(ply), str(out), "--export"]
