@@ -81,7 +81,7 @@ class _Part(NamedTuple):
 
     leaf: int
     first: int
-    count: int
+    size: int
     low: Any
     high: Any
 
@@ -137,11 +137,11 @@ class StreamedSogWriter:
         corners: dict[int, list[tuple[Any, Any]]] = {}
         for file, (height, number) in enumerate(places):
             for part in self._written[height, number]:
-                counts[height] += part.count
+                counts[height] += part.size
                 lods.setdefault(part.leaf, {})[str(height)] = {
                     "file": file,
                     "offset": part.first,
-                    "count": part.count,
+                    "count": part.size,
                 }
                 corners.setdefault(part.leaf, []).append((part.low, part.high))
         meta = {

@@ -1,4 +1,5 @@
 """3D Tiles 1.1 whose contents are .glb with KHR_gaussian_splatting: levels of detail for CesiumJS and other globes.
+The Gaussians of a tile are compressed as .spz, since CesiumJS draws no others.
 
 ``tileset.json`` has a tree of tiles. A tile is replaced by its children where its geometric error, projected to the
 screen, is too large. Tiles have the axes right, forward, up; the content's axes of glTF are turned to them by the
@@ -18,7 +19,8 @@ from clsplat.atomic import replacing
 from clsplat.config import Mode
 from clsplat.errors import InputError
 from clsplat.formats.detail_tree import Node, bounds
-from clsplat.formats.gltf import EXTENSION, load_glb, save_glb
+from clsplat.formats.gltf import EXTENSION, SPZ_EXTENSION, load_glb
+from clsplat.formats.gltf_spz import save_spz_glb
 from clsplat.formats.validity import reading
 from clsplat.gaussians import Gaussians
 
@@ -56,7 +58,7 @@ class TilesWriter:
         InputError
             If a value is not finite as float32, or a file cannot be written.
         """
-        save_glb(self._folder / _name(node.height, node.number), node.gaussians, self._mode, self._offset)
+        save_spz_glb(self._folder / _name(node.height, node.number), node.gaussians, self._mode, self._offset)
         largest = np.exp(node.gaussians.log_scales.max(axis=1).astype(np.float64))
         error = float(np.quantile(largest, COVERED)) if node.height else 0.0
         self._written[node.height, node.number] = (*bounds(node.gaussians), error)
@@ -85,7 +87,8 @@ class TilesWriter:
             If it cannot be written.
         """
         root = self._tile(*max(self._written))
-        uses = {"extensionsUsed": [EXTENSION], "extensionsRequired": [EXTENSION]}
+        names = [EXTENSION, SPZ_EXTENSION]  # CesiumJS takes a tile for a mesh unless both are required here
+        uses = {"extensionsUsed": names, "extensionsRequired": names}
         content = {
             "asset": {"version": "1.1", "generator": "clsplat"},
             "extensionsUsed": ["3DTILES_content_gltf"],

@@ -2,10 +2,10 @@
 
 Usage: python tests/blocks/measure_town.py FOLDER -o RESULT.json COUNT [COUNT ...]
 
-For each COUNT, ray traces photos of a town that grows with them into FOLDER, and trains it by `clsplat train --blocks
-auto` in a process of its own. The memory limit is the same for all: a third of what the scene of `FIRST` photos needs.
-Each photo has `VISITS` iterations instead of the usual number. Counts that RESULT.json has are not measured again, and
-an interrupted training goes on.
+For each COUNT, ray traces photos of a town that grows with them into FOLDER, and trains it by `clsplat train
+--blocks auto` in a process of its own. The memory limit is the same for all: a third of what the scene of `FIRST`
+photos needs. Each photo has `VISITS` iterations instead of the usual number. Counts that RESULT.json has are not
+measured again, and an interrupted training goes on.
 """
 
 import argparse
@@ -51,7 +51,12 @@ def train(data: Path, out: Path, count: int) -> None:
 
     run_length.VISITS, run_length.FEWEST_ITERATIONS = VISITS, 1
     resume = ["--resume"] if (out / BLOCKS).exists() else []
-    settings = {"blocks": "auto", "size": "fixed", "max-gaussians": count * PER_PHOTO, "memory-limit": limit()}
+    settings = {
+        "blocks": "auto",
+        "size": "fixed",
+        "max-gaussians": count * PER_PHOTO,
+        "memory-limit": f"{limit() / 1e6}MB",
+    }
     flags = [word for name, value in settings.items() for word in (f"--{name}", str(value))]
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     begin = time.process_time()

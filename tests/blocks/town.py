@@ -74,14 +74,14 @@ def town(side: float, seed: int = 0) -> list[Solid]:
                 solids.append(Solid(Cube(), house(half, colour), place, half, texels=8))
             for _ in range(2):
                 radius = rng.uniform(1.2, 2.5)
-                place = middle + [*rng.uniform(-3, 3, 2), radius + 0.5]
+                place = middle + np.array([*rng.uniform(-3, 3, 2), radius + 0.5])
                 solids.append(Solid(Sphere(), tree, place, radius, texels=8))
     bake(solids, sun_rays=2, sky_rays=12)
     return solids
 
 
 def flight(count: int, width: int, height: int, seed: int = 0) -> tuple[list[Camera], float]:
-    """Cameras on a grid, in the order of the flight, one of five looking straight down; and the side of the grid, m."""
+    """Cameras on a grid in the order of the flight, one of five looking down; and the side of the grid, m."""
     rng = np.random.default_rng(seed)
     fx = FOCAL_35MM * np.hypot(width, height) / np.hypot(36, 24)
     side = int(np.ceil(np.sqrt(count)))

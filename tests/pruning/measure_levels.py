@@ -2,10 +2,10 @@
 
 Usage: python tests/pruning/measure_levels.py SCENE FOLDER -o RESULT.json SIZE [SIZE ...]
 
-Copies of SCENE, side by side on a square, make a PLY of SIZE Gaussians in FOLDER, which needs a disk with room for four
-times its bytes. Coefficients of colours differ by 2 % at random from copy to copy, so that palettes find no two alike.
-`clsplat export PLY LEVELS` runs in a process of its own, whose largest resident size is measured beside the time of each
-step. Sizes that RESULT.json has are not measured again. Set OPENBLAS_NUM_THREADS=1 on a busy machine.
+Copies of SCENE, side by side on a square, make a PLY of SIZE Gaussians in FOLDER, which needs a disk with room for
+four times its bytes. Coefficients of colours differ by 2 % at random from copy to copy, so that palettes find no two
+alike. `clsplat export PLY LEVELS` runs in a process of its own, whose largest resident size is measured beside the
+time of each step. Sizes that RESULT.json has are not measured again. Set OPENBLAS_NUM_THREADS=1 on a busy machine.
 """
 
 import argparse
