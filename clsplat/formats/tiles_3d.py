@@ -93,7 +93,8 @@ class TilesWriter:
             "asset": {"version": "1.1", "generator": "clsplat"},
             "extensionsUsed": ["3DTILES_content_gltf"],
             "extensions": {"3DTILES_content_gltf": uses},
-            "geometricError": 2 * root["geometricError"],
+            # The error of drawing nothing: the size of the scene, which disappears where that is too small to matter.
+            "geometricError": max(root["geometricError"], float(np.linalg.norm(np.subtract(*root["corners"])))),
             "root": _without_corners(root),
         }
         with replacing(self._folder / TILESET) as file:

@@ -77,7 +77,7 @@ def test_the_tree_of_a_streamed_sog(scene, written):
             assert (means >= low - slack).all() and (means <= high + slack).all()
 
 
-def test_the_tree_of_tiles(written):
+def test_the_tree_of_tiles(scene, written):
     tileset = json.loads((written / TILESET).read_text())
     seen = []
 
@@ -96,6 +96,8 @@ def test_the_tree_of_tiles(written):
             visit(child, tile["geometricError"])
 
     visit(tileset["root"], tileset["geometricError"])
+    # What is not drawn at all has an error of the scene's size; or else it would disappear from nearby.
+    assert tileset["geometricError"] >= np.ptp(scene.means, axis=0).max()
     assert len(seen) == 15
     content = tileset["extensions"]["3DTILES_content_gltf"]
     needed = [
