@@ -3,8 +3,8 @@
     $ PYTHONPATH=tests/show:tests/formats python tests/formats/make_levels_shown.py SCENE --data DATASET --out FOLDER
 
 The scene is exported in levels of detail. The camera of the dataset's first held-out photo walks away from the scene
-in `STEPS` steps. PlayCanvas may draw `SHARE` of the splats, CesiumJS those whose error is `PIXELS` on the screen. What
-they draw, and PSNRs against our render of the finest level, are in levels.json.
+in `STEPS` steps. PlayCanvas may draw `SHARE` of the splats, CesiumJS those whose error is `PIXELS` on the screen.
+What they draw, and PSNRs against our render of the finest level, are in levels.json.
 """
 
 import json
