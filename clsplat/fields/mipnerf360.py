@@ -124,19 +124,19 @@ class MipNerf360(NetworkField):
 
     def _proposal_gradient(self, seen: Seen) -> Any:
         """Gradient of the proposal network's weights: the sum over the rounds."""
-        stages, upload, weights = self.stages, self.device.upload, self.parameters["proposal"].values
-        found = []
+        stages, empty, weights = self.stages, self.device.empty, self.parameters["proposal"].values
+        v = None
         for round_ in seen.rounds:
             outer = round_.edges, round_.weights
             _, v_weights = stages.histograms_interlevel(seen.edges, seen.weights, *outer, 1 / len(seen.weights))
-            v_sigmas = upload("v_sigmas", np.zeros(round_.sigmas.shape))
+            v_sigmas = empty("v_sigmas", round_.sigmas.shape).fill(0)
             arguments = round_.sigmas, round_.deltas, self.proposals, round_.weights
             stages.weights_bwd(*arguments, v_weights, v_sigmas)
-            v_outputs = upload("v_outputs", np.zeros(round_.outputs.shape))
+            v_outputs = empty("v_outputs", round_.outputs.shape).fill(0)
             stages.heads_soft_bwd(round_.outputs, self.space.density_scale, v_sigmas, v_outputs)
-            _, v = stages.mlp_bwd(round_.encoded, weights, self.proposal_widths, round_.hidden, v_outputs)
-            found.append(v.get())
-        return upload("v_weights", sum(found))
+            network = round_.encoded, weights, self.proposal_widths, round_.hidden
+            v = stages.mlp_bwd(*network, v_outputs, 0, v)[1]
+        return v
 
     def _weights(self) -> dict[str, Any]:
         return {part: self.parameters[f"field.{part}"].values for part in self.network.widths}
