@@ -123,10 +123,10 @@ __kernel void mlp_turn(const __global real *weights, __global real *turned) {
     }
 }
 
-__kernel void mlp_bwd(const uint rows, const uint items, const uint weight_count, const uint hidden_width, const uint columns,
-                      const __global real *inputs, const __global real *turned, const __global real *hidden,
-                      const __global real *v_outputs, __global real *work, __global real *v_inputs,
-                      __global real *parts) {
+__kernel void mlp_bwd(const uint rows, const uint items, const uint weight_count, const uint hidden_width,
+                      const uint columns, const __global real *inputs, const __global real *turned,
+                      const __global real *hidden, const __global real *v_outputs, __global real *work,
+                      __global real *v_inputs, __global real *parts) {
     const size_t item = get_global_id(0);
     __global real *own = parts + item * weight_count;
     for (uint i = 0; i < weight_count; ++i)

@@ -28,7 +28,6 @@ HEADS = ("heads_fwd", "heads_sh_fwd", "heads_soft_fwd")
 """Stages that make densities: each of their rows is an evaluation of a field."""
 
 
-
 class Work:
     """What stages have done: evaluations of the field, operations of networks, bytes, and clocks by stage.
 

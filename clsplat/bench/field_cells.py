@@ -25,7 +25,8 @@ from clsplat.ranges import parse_bytes
 from clsplat.scene import Color, Scene, View, evenly_spaced
 
 SAMPLE_EVERY = 3
-"""One of so many samples of a training of Gaussians is taken of a field, the last among them: its images take seconds."""
+"""One of so many samples of a training of Gaussians is taken of a field, the last among them: its images take
+seconds."""
 
 TIMED_VIEWS = 5
 """Number of held-out views that are rendered for the rate of frames: a field takes seconds for some."""

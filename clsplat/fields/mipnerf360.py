@@ -153,8 +153,8 @@ class MipNerf360(NetworkField):
             Of the weights, from which edges are drawn.
         background : RGB
         """
-        stages, upload, count = self.stages, self.device.upload, places.shape[1]
-        edges, weights = upload("edges", np.tile([0.0, 1.0], (count, 1))), upload("weights", np.ones(count))
+        stages, constant, count = self.stages, self.device.constant, places.shape[1]
+        edges, weights = constant("edges", np.tile([0.0, 1.0], (count, 1))), constant("weights", np.ones(count))
         rounds: list[Proposed] = []
         scale, span = self.space.density_scale, self.space.span
         for place in places[:-1]:
@@ -170,7 +170,7 @@ class MipNerf360(NetworkField):
         views = stages.encode_points(rays.directions, VIEW_LEVELS)
         asked = self.network.ask(stages, self._weights(), encoded, views, scale)
         weights = stages.weights_fwd(asked.sigmas, deltas, self.samples)
-        first = upload("first samples", np.arange(count + 1) * self.samples, np.uint32)
+        first = constant("first samples", np.arange(count + 1) * self.samples, np.uint32)
         image = stages.rays_fwd(asked.sigmas, asked.colors, deltas, first, background)
         return Seen(rounds, edges, asked, deltas, first, weights, image)
 

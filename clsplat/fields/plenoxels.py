@@ -39,7 +39,9 @@ BETA2, EPS = 0.95, 1e-8
 
 TV_DENSITY, TV_HARMONICS = 1e-5, 1e-3
 """Weights of the total variation of densities, in inverse halves of an edge, and of harmonics, for synthetic scenes
-(Fridovich-Keil et al. 2022, section 4 of the supplement)."""
+(Fridovich-Keil et al. 2022, section 4 of the supplement). The paper's code ends this penalty with the first
+refinement. With few photos' pixels for each cell, trainings then overfit: so it stays, as in that code's settings for
+captures of one's own."""
 
 TV_SHARE = 100
 """One of so many corners has the total variation in its gradient, others in each step (section 3.4)."""
@@ -51,8 +53,8 @@ EVENTS = ((0.1, "prune"), (0.2, "refine"), (0.35, "prune"), (0.5, "refine"), (0.
 """Progress at which cells are pruned, or pruned and divided by two along each axis."""
 
 CELL_PIXELS = 1.5
-"""Smallest edge of a cell, in widths of a pixel at the distance of the middle of the scene. The paper's are 1.6 of them:
-512 cells for photos of 800 x 800 pixels."""
+"""Smallest edge of a cell, in widths of a pixel at the distance of the middle of the scene. The paper's are 1.6 of
+them: 512 cells for photos of 800 x 800 pixels."""
 
 OCCUPIED_DEPTH = 0.02
 """Optical depth of a step at one of its corners from which a cell is kept when others are pruned. For 128 cells it is
