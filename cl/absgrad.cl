@@ -4,76 +4,85 @@
 // with v_sigma per pixel as in composite.h. Terms of opposite signs, as on the two sides of an edge, do not cancel.
 // See docs/stages/absgrad.md; clsplat/reference/absgrad.py is the twin.
 //
-// Mapping: absgrad_tiles has one work-item per tile, which walks the tile's list from front to back and keeps the state
-// of all of its pixels; absgrad_sum has one per splat, in depth order, which adds up its records in the order of their
-// slots.
+// Mapping: absgrad_tiles has one work-group of BATCH work-items per tile, one work-item per splat of a batch. The pixels
+// of the tile pass from work-item to work-item, in the diagonal scheme of composite_gpu.cl; with a BATCH of 1, for CPUs,
+// one work-item walks the list and the pixels. absgrad_sum has one work-item per splat, in depth order, which adds up
+// its records in the order of their slots.
 //
 // Buffers: N splats packed as in composite_splats.h; gauss_ids[M], tile_ranges[T,2], slots[M], order[N],
 //   first_slots[N+1] as in bin.cl; C channels
 //   in   image[H,W,C], alpha[H,W] as composited; v_image[H,W,C], v_alpha[H,W]
 //   out  records[M,2], sums of a splat and a tile; sums[N,2], px^-1
-// -DTILE      edge of a tile, px
-// -DCHANNELS  number of colour channels
-// -DRAYS=0    no evaluation along rays
+// Local memory, in reals: TILE^2 (2 + CHANNELS).
+// -DTILE=8|16   edge of a tile, px
+// -DCHANNELS    number of colour channels
+// -DBATCH       number of splats per batch, 1 or more; the work-group has BATCH work-items
+// -DSUBGROUPS=0|1   1: the device has the functions of subgroups, by cl_khr_subgroups or OpenCL 2.1 and later
+// -DRAYS=0      no evaluation along rays
 #include "common.h"
 
-#if !defined(TILE) || TILE < 1
-#error "-DTILE must give the edge of a tile in pixels, 1 or more"
-#endif
 #if RAYS
 #error "-DRAYS must be 0: the gradients along rays have other terms"
 #endif
-#include "composite_pixels.h"
+#include "composite_tiles.h"
 
-__kernel void absgrad_tiles(const uint tiles, const int width, const int height, const __global Splat *splats,
-                            const __global uint *gauss_ids, const __global uint *tile_ranges,
-                            const __global uint *slots, const __global real *image, const __global real *alpha,
-                            const __global real *v_image, const __global real *v_alpha, __global real *records) {
-    const size_t tile = get_global_id(0);
-    if (tile >= tiles)
-        return;
+__kernel __attribute__((reqd_work_group_size(BATCH, 1, 1))) void
+absgrad_tiles(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
+              const __global uint *tile_ranges, const __global uint *slots, const __global real *image,
+              const __global real *alpha, const __global real *v_image, const __global real *v_alpha,
+              __global real *records) {
+    __local real transmittance[PIXELS], behind[PIXELS], v_pixels[CHANNELS][PIXELS];
+    const uint tile = get_group_id(0), lane = get_local_id(0);
     const int tiles_x = (width + TILE - 1) / TILE;
-    const int left = (int)(tile % tiles_x) * TILE, top = (int)(tile / tiles_x) * TILE;
-    const int columns = min(TILE, width - left), rows = min(TILE, height - top);
-    real transmittance[TILE * TILE], behind[TILE * TILE]; // transmittance 0: compositing has stopped
-    for (int k = 0; k < columns * rows; ++k) {
-        const size_t p = (size_t)(top + k / columns) * width + left + k % columns;
-        real sum = -(1 - alpha[p]) * v_alpha[p];
-        for (int c = 0; c < CHANNELS; ++c)
-            sum += image[CHANNELS * p + c] * v_image[CHANNELS * p + c];
-        transmittance[k] = 1;
-        behind[k] = sum;
-    }
-    for (uint i = tile_ranges[2 * tile]; i < tile_ranges[2 * tile + 1]; ++i) {
-        const Splat s = splats[gauss_ids[i]];
-        real2 total = 0;
-        for (int k = 0; k < columns * rows; ++k) {
-            const real before = transmittance[k];
-            if (!(before > 0))
-                continue;
-            const int2 pixel = (int2)(left + k % columns, top + k / columns);
-            const Offset offset = offset_of(pixel, (real3)0, &s);
-            Bend bend;
-            const real t = splat_exponent(&s, &offset, &bend);
-            if (!splat_seen(&s, t))
-                continue;
-            const real opacity = exp2(t), clamped = LESSER(opacity, (real)ALPHA_MAX);
-            const real after = before * (1 - clamped);
-            transmittance[k] = after > (real)TRANSMITTANCE_MIN ? after : 0;
-            if (!(after > (real)TRANSMITTANCE_MIN))
-                continue;
-            const size_t p = (size_t)pixel.y * width + pixel.x;
-            real u = 0;
-            for (int c = 0; c < CHANNELS; ++c)
-                u += s.color[c] * v_image[CHANNELS * p + c];
-            behind[k] -= clamped * before * u;
-            const real v_opacity = before * u - behind[k] / (1 - clamped);
-            const real v_sigma = opacity < (real)ALPHA_MAX ? -opacity * v_opacity : 0;
-            // t has the exponent in units of ln 2, with the sign of -sigma.
-            total.x += ABSOLUTE(v_sigma * (2 * s.a * offset.dx + s.b * offset.dy));
-            total.y += ABSOLUTE(v_sigma * (s.b * offset.dx + 2 * s.c * offset.dy));
+    const int x0 = tile % tiles_x * TILE, y0 = tile / tiles_x * TILE;
+
+    for (uint p = lane; p < PIXELS; p += BATCH) {
+        const int2 pixel = pixel_of(x0, y0, p);
+        const int inside = pixel.x < width && pixel.y < height;
+        transmittance[p] = inside ? 1 : -1;
+        if (!inside)
+            continue;
+        const size_t i = (size_t)pixel.y * width + pixel.x;
+        real sum = -(1 - alpha[i]) * v_alpha[i];
+        for (int k = 0; k < CHANNELS; ++k) {
+            v_pixels[k][p] = v_image[CHANNELS * i + k];
+            sum += image[CHANNELS * i + k] * v_pixels[k][p];
         }
-        store2(records, slots[i], total / (real)LOG2_E);
+        behind[p] = sum;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+
+    const uint begin = tile_ranges[2 * tile], length = tile_ranges[2 * tile + 1] - begin;
+    for (uint first = 0; first < length; first += BATCH) {
+        const uint count = min((uint)BATCH, length - first), i = begin + first + lane;
+        Splat s;
+        real2 total = 0;
+        if (lane < count)
+            s = splats[gauss_ids[i]];
+        for (uint step = 0; step < PIXELS + count - 1; ++step) {
+            const uint p = step - lane; // wraps to a value beyond PIXELS while no pixel has reached this work-item
+            if (lane < count && p < PIXELS && transmittance[p] > 0) {
+                const Offset offset = offset_of(pixel_of(x0, y0, p), (real3)0, &s);
+                Bend bend;
+                const real t = splat_exponent(&s, &offset, &bend);
+                if (splat_seen(&s, t)) {
+                    real opacity = exp2(t), after = transmittance[p], part = behind[p], u = 0;
+                    int live;
+                    const real weight = splat_over(1, TRANSMITTANCE_MIN, &opacity, &live, &after);
+                    for (int k = 0; k < CHANNELS; ++k)
+                        u += s.color[k] * v_pixels[k][p];
+                    const real v_sigma = splat_over_vjp(opacity, live, weight, u, &part);
+                    transmittance[p] = after;
+                    behind[p] = part;
+                    // t has the exponent in units of ln 2, with the sign of -sigma.
+                    total.x += ABSOLUTE(v_sigma * (2 * s.a * offset.dx + s.b * offset.dy));
+                    total.y += ABSOLUTE(v_sigma * (s.b * offset.dx + 2 * s.c * offset.dy));
+                }
+            }
+            hand_on();
+        }
+        if (lane < count)
+            store2(records, slots[i], total / (real)LOG2_E);
     }
 }
 

@@ -8,8 +8,15 @@
 // composites them onto its pixels. A work-item whose pixels are finished or outside the image continues to load. The
 // group stops when live_pixels, the number of unfinished pixels, is 0.
 //
-// Backward mapping: one work-group of BATCH work-items per tile, one work-item per splat of a batch. The pixels of
-// the tile pass from work-item to work-item.
+// Backward mapping: one work-group of BATCH work-items per segment of SEGMENT splats of a tile's list, one work-item per
+// splat of a batch. The pixels of the tile pass from work-item to work-item. So long lists are shared by many groups:
+// the forward pass saves the state of the pixels where a segment begins, their transmittance and the colour so far
+// (Mallick et al. 2024, "Taming 3DGS", section 4.2, keep it every 32 splats).
+//
+// Segments have numbers without a count of each tile's: segment k of tile t is the number begin / SEGMENT + t + k, where
+// begin is the first entry of the tile's list. A list of n entries has at most (begin + n) / SEGMENT - begin / SEGMENT + 1
+// segments, so that no number is used twice; some are not used. States are saved for k > 0 only, at the number
+// begin / SEGMENT + k - 1, of which there are fewer than M / SEGMENT.
 //
 // Diagonal scheme of the backward pass: the state of a pixel (transmittance, part behind, gradient of the colour) is
 // in local memory. At step s of a batch, work-item t composites its splat over pixel s - t:
@@ -26,7 +33,8 @@
 // which is almost free on a GPU, and the number of steps in which some work-items have no pixel is smallest. The
 // computation, and therefore each bit of the result, is the same.
 //
-// Buffers: as in composite_cpu.cl.
+// Buffers: as in composite_cpu.cl; states[M/SEGMENT,1+CHANNELS,TILE^2], the transmittance (0 or less: finished) and the
+// colours of the pixels where segments begin; reached[T], the number of entries of the tile's list that pixels met.
 // Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (11 + CHANNELS), with RAYS (26 + CHANNELS),
 // backward TILE^2 (2 + CHANNELS). With TILE 16, BATCH 64 and CHANNELS 4 this is 4 KiB (RAYS 7.5 KiB) and 6 KiB (double:
 // twice as much) of the 32 KiB that OpenCL 1.2 guarantees.
@@ -34,6 +42,7 @@
 // -DCHANNELS    number of colour channels, 1 or more
 // -DITEMS       number of work-items of the forward work-group, a divisor of TILE*TILE
 // -DBATCH       number of splats per batch, 1 or more; the backward work-group has BATCH work-items
+// -DSEGMENT     number of splats per segment
 // -DRAYS=0|1|2  as in composite_cpu.cl
 // -DSUBGROUPS=0|1   1: the device has the functions of subgroups, by cl_khr_subgroups or OpenCL 2.1 and later
 #include "common.h"
@@ -43,12 +52,34 @@
 #endif
 #include "composite_tiles.h"
 
+#if !defined(SEGMENT) || SEGMENT < 1
+#error "-DSEGMENT must give the number of splats per segment, 1 or more"
+#endif
+
 #define OWNED (PIXELS / ITEMS) // pixels of a work-item of the forward pass
+#define STATE (1 + CHANNELS)   // numbers of a pixel's state
+
+// Number of splats in the batch at `first` of a list. Batches end where segments end.
+static inline uint batch_at(uint first, uint length) {
+    return min(min((uint)BATCH, length - first), SEGMENT - first % SEGMENT);
+}
+
+// Tile of a segment by its number: the last one whose first segment has at most this number.
+static inline uint tile_of(uint number, uint tiles, const __global uint *tile_ranges) {
+    uint tile = 0, count = tiles;
+    while (count > 1) {
+        const uint half_count = count / 2, middle = tile + half_count;
+        const int before = tile_ranges[2 * middle] / SEGMENT + middle <= number;
+        tile = before ? middle : tile;
+        count = before ? count - half_count : half_count;
+    }
+    return tile;
+}
 
 __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void
 composite_fwd(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
               const __global uint *tile_ranges, const __global real *background, __global real *image,
-              __global real *alpha_image DIRECTIONS) {
+              __global real *alpha_image, const int saves, __global real *states, __global uint *reached DIRECTIONS) {
     __local Splat staged[BATCH];
     __local int live_pixels;
     const uint tile = get_group_id(0), lane = get_local_id(0);
@@ -66,11 +97,20 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
     }
 
     const uint begin = tile_ranges[2 * tile], length = tile_ranges[2 * tile + 1] - begin;
-    for (uint first = 0; first < length; first += BATCH) {
+    uint first = 0;
+    for (uint count; first < length; first += count) {
         barrier(CLK_LOCAL_MEM_FENCE); // live_pixels is written, and the last batch is no longer read
         if (live_pixels == 0)
             break;
-        const uint count = min((uint)BATCH, length - first);
+        count = batch_at(first, length);
+        if (saves && first > 0 && first % SEGMENT == 0) {
+            __global real *state = states + (size_t)(begin / SEGMENT + first / SEGMENT - 1) * STATE * PIXELS;
+            for (int o = 0; o < OWNED; ++o) {
+                state[lane + o * ITEMS] = transmittance[o];
+                for (int k = 0; k < CHANNELS; ++k)
+                    state[(1 + k) * PIXELS + lane + o * ITEMS] = sums[o][k];
+            }
+        }
         for (uint j = lane; j < count; j += ITEMS)
             staged[j] = splats[gauss_ids[begin + first + j]];
         barrier(CLK_LOCAL_MEM_FENCE);
@@ -83,10 +123,11 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
                 const Offset offset = offset_of(pixel, ray, &s);
                 Bend bend;
                 const real t = splat_exponent(&s, &offset, &bend);
+                if (!splat_seen(&s, t)) // in most cases, for all work-items in lockstep
+                    continue;
                 real alpha = exp2(t);
                 int live;
-                const real weight =
-                    splat_over(splat_seen(&s, t), TRANSMITTANCE_MIN, &alpha, &live, &transmittance[o]);
+                const real weight = splat_over(1, TRANSMITTANCE_MIN, &alpha, &live, &transmittance[o]);
                 for (int k = 0; k < CHANNELS; ++k)
                     sums[o][k] += weight * s.color[k];
             }
@@ -95,6 +136,8 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
         }
     }
 
+    if (lane == 0)
+        reached[tile] = first;
     for (int o = 0; o < OWNED; ++o) {
         const int2 pixel = pixel_of(x0, y0, lane + o * ITEMS);
         if (pixel.x >= width || pixel.y >= height)
@@ -110,14 +153,23 @@ __kernel __attribute__((reqd_work_group_size(BATCH, 1, 1))) void
 composite_bwd(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
               const __global uint *tile_ranges, const __global uint *slots, const __global real *image,
               const __global real *alpha_image, const __global real *v_image, const __global real *v_alpha_image,
-              __global real *records DIRECTIONS) {
+              const __global real *states, const __global uint *reached, __global real *records DIRECTIONS) {
     __local real transmittance[PIXELS], behind[PIXELS], v_pixels[CHANNELS][PIXELS];
     __local int unfinished;
-    const uint tile = get_group_id(0), lane = get_local_id(0);
-    const int tiles_x = (width + TILE - 1) / TILE;
+    const uint lane = get_local_id(0);
+    const int tiles_x = (width + TILE - 1) / TILE, tiles = tiles_x * ((height + TILE - 1) / TILE);
+    const uint tile = tile_of(get_group_id(0), tiles, tile_ranges);
     const int x0 = tile % tiles_x * TILE, y0 = tile / tiles_x * TILE;
+    const uint begin = tile_ranges[2 * tile], length = tile_ranges[2 * tile + 1] - begin;
+    const uint segment = get_group_id(0) - begin / SEGMENT - tile;
+    uint first = segment * SEGMENT;
+    if (first >= length)
+        return;
+    const uint end = min(first + SEGMENT, length);
+    // `segment` is 0 where it is not read.
+    const __global real *state = states + (size_t)(begin / SEGMENT + segment - (segment > 0)) * STATE * PIXELS;
 
-    for (uint p = lane; p < PIXELS; p += BATCH) {
+    for (uint p = lane; p < PIXELS && first < reached[tile]; p += BATCH) {
         const int2 pixel = pixel_of(x0, y0, p);
         const int inside = pixel.x < width && pixel.y < height;
         transmittance[p] = inside ? 1 : -1;
@@ -130,16 +182,19 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
             sum += image[CHANNELS * i + k] * v;
             v_pixels[k][p] = v;
         }
+        if (segment > 0) {
+            transmittance[p] = state[p];
+            for (int k = 0; k < CHANNELS; ++k)
+                sum -= state[(1 + k) * PIXELS + p] * v_pixels[k][p];
+        }
         behind[p] = sum;
     }
     if (lane == 0)
-        unfinished = 1;
+        unfinished = first < reached[tile];
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    const uint begin = tile_ranges[2 * tile], length = tile_ranges[2 * tile + 1] - begin;
-    uint first = 0;
-    for (; first < length && unfinished; first += BATCH) {
-        const uint count = min((uint)BATCH, length - first);
+    for (uint count; first < end && unfinished; first += count) {
+        count = batch_at(first, end);
         const uint i = begin + first + lane;
         Splat s;
         Moments sums = NO_MOMENTS;
@@ -157,12 +212,14 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
                 const Offset offset = offset_of(pixel, DIRECTIONS_OF((size_t)pixel.y * width + pixel.x), &s);
                 Bend bend;
                 const real t = splat_exponent(&s, &offset, &bend);
-                real alpha = exp2(t), after = transmittance[p];
-                int live;
-                const real weight = splat_over(splat_seen(&s, t), TRANSMITTANCE_MIN, &alpha, &live, &after);
-                any_live |= live;
-                transmittance[p] = after;
-                if (weight > 0) {
+                const int seen = splat_seen(&s, t);
+                any_live |= !seen;
+                if (seen) {
+                    real alpha = exp2(t), after = transmittance[p];
+                    int live;
+                    const real weight = splat_over(1, TRANSMITTANCE_MIN, &alpha, &live, &after);
+                    any_live |= live;
+                    transmittance[p] = after;
                     real u = 0;
                     for (int k = 0; k < CHANNELS; ++k) {
                         u += s.color[k] * v_pixels[k][p];
@@ -188,7 +245,7 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
             unfinished = any_live;
         barrier(CLK_LOCAL_MEM_FENCE);
     }
-    for (uint j = first + lane; j < length; j += BATCH) {
+    for (uint j = first + lane; j < end; j += BATCH) {
         for (int k = 0; k < RECORD; ++k)
             records[(size_t)RECORD * slots[begin + j] + k] = 0;
     }

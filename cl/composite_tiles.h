@@ -23,9 +23,11 @@
 
 #define PIXELS (TILE * TILE)
 
-// Position of pixel p of the tile with origin (x0, y0).
+// Position of pixel p of the tile with origin (x0, y0). Pixels are numbered by blocks of 8x4, and these by columns:
+// 32 or 64 work-items in lockstep have pixels that lie together, so that more often none of them meets a splat.
 static inline int2 pixel_of(int x0, int y0, uint p) {
-    return (int2)(x0 + p % TILE, y0 + p / TILE);
+    const uint block = p / 32, blocks_y = TILE / 4;
+    return (int2)(x0 + block / blocks_y * 8 + p % 8, y0 + block % blocks_y * 4 + p / 8 % 4);
 }
 
 // Ends a step of the diagonal scheme.

@@ -303,8 +303,22 @@ def focus_point(cameras: list[Camera]) -> NDArray[np.float64]:
         focus = centre + np.linalg.solve(normal, moments)
         if np.mean(np.einsum("vi,vi->v", directions, focus - positions)) > 0:
             return focus
-    spread = float(np.linalg.norm(positions - centre, axis=1).max())
-    return centre + directions.mean(axis=0) * (spread if spread > 0 else 1.0)
+    return centre + directions.mean(axis=0) * (spread_of_positions(cameras) or 1.0)
+
+
+POSITION_ROUNDING = 1e-12
+"""Distance of cameras from their mean, as a fraction of their largest coordinate, up to which they have one position:
+a position is computed from a pose with a few roundings of 1e-16 each."""
+
+
+def spread_of_positions(cameras: list[Camera]) -> float:
+    """Compute the largest distance of a camera from the cameras' mean position, in world units; 0 if it is rounding.
+
+    The faces of a panorama have one position, apart from rounding.
+    """
+    positions = np.array([camera.position for camera in cameras])
+    spread = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
+    return spread if spread > POSITION_ROUNDING * np.abs(positions).max() else 0.0
 
 
 def default_near(means: NDArray[np.floating]) -> float:

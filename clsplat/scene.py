@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat import display
-from clsplat.camera import Camera
+from clsplat.camera import Camera, spread_of_positions
 
 Color = tuple[float, float, float]
 
@@ -188,10 +188,7 @@ class Scene:
 
         This is `cameras_extent` of the original implementation; 1 if all cameras have the same position.
         """
-        centres = np.array([view.camera.position for view in self.train])
-        radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-        # The faces of a panorama have one position, apart from rounding.
-        return 1.1 * radius if radius > 1e-12 * np.abs(centres).max() else 1.0
+        return 1.1 * spread_of_positions([view.camera for view in self.train]) or 1.0
 
     def _repr_html_(self) -> str:
         views = [*self.train, *self.test]

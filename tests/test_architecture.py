@@ -218,7 +218,7 @@ DEFINES = {
     "noise": {"GATE_SLOPE": 100.0, "GATE_OPACITY": 0.005},
     "bin": {"TILE": 16, "GRADIENTS": 1},
     "composite_cpu": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "RAYS": 2},
-    "composite_gpu": {"TILE": 8, "CHANNELS": 1, "ITEMS": 32, "BATCH": 16, "RAYS": 1, "SUBGROUPS": 0},
+    "composite_gpu": {"TILE": 8, "CHANNELS": 1, "ITEMS": 32, "BATCH": 16, "SEGMENT": 64, "RAYS": 1, "SUBGROUPS": 0},
     "composite_sorted": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "WINDOW": 2},
     "count": {"TILE": 16},
     "exposure": {"RESPONSE": 1},
@@ -235,7 +235,7 @@ DEFINES = {
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
     },
     "mlp_cpu": {"WIDTHS": "32,64,16", "WIDEST": 64, "ROWS": 6},
-    "absgrad": {"TILE": 16, "CHANNELS": 3, "RAYS": 0},
+    "absgrad": {"TILE": 16, "CHANNELS": 3, "BATCH": 16, "RAYS": 0, "SUBGROUPS": 0},
     "median": {"TILE": 16, "CHANNELS": 3, "RAYS": 1},
     "project": {
         **{"CHANNELS": 4, "ANTIALIASED": 1, "CAMERA_GRAD": 1, "GROUP": 32},
@@ -251,6 +251,7 @@ DEFINES = {
     },
 }
 FORBIDDEN = [
+    ("absgrad", "BATCH", 0),
     ("absgrad", "RAYS", 1),
     ("bin", "TILE", 0),
     ("bin", "GRADIENTS", 2),
@@ -262,6 +263,7 @@ FORBIDDEN = [
     ("composite_gpu", "CHANNELS", 0),
     ("composite_gpu", "ITEMS", 48),
     ("composite_gpu", "BATCH", 0),
+    ("composite_gpu", "SEGMENT", 0),
     ("composite_gpu", "SUBGROUPS", 2),
     ("composite_sorted", "TILE", 12),
     ("composite_sorted", "CHANNELS", 0),

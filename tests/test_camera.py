@@ -97,6 +97,11 @@ class TestFocusPoint:
         camera = Camera.look_at((1, 2, 3), (1, 2, 9), (0, 1, 0), 50, 64, 48)
         np.testing.assert_allclose(focus_point([camera]), (1, 2, 4))
 
+    def test_cameras_at_one_position_apart_from_rounding(self):
+        eyes = np.array([1.0, 2, 3]) + 1e-15 * np.random.default_rng(0).normal(size=(4, 3))
+        cameras = [Camera.look_at(eye, eye + np.array([0, 0, 6]), (0, 1, 0), 50, 64, 48) for eye in eyes]
+        np.testing.assert_allclose(focus_point(cameras), (1, 2, 4))
+
     def test_parallel_axes(self):
         cameras = [Camera.look_at((x, 0, 0), (x, 0, 1), (0, 1, 0), 50, 64, 48) for x in (-2, 0, 2)]
         np.testing.assert_allclose(focus_point(cameras), (0, 0, 2), atol=1e-12)

@@ -65,8 +65,8 @@ def background_and_gradient(splats, bins):
     return rng.uniform(0, 1, channels), Image(rng.normal(size=(*shape, channels)), rng.normal(size=shape))
 
 
-def composite_gpu(device, splats, bins):
-    """Image, alpha and the four gradients by the GPU variant, by name."""
+def composite_gpu(device, splats, bins, between=lambda: None):
+    """Image, alpha and the four gradients by the GPU variant, by name. `between` is called between both passes."""
     background, v_image = background_and_gradient(splats, bins)
     # Freed at once, this memory comes back as that of the records: a record left unwritten becomes a NaN.
     device.empty("records", (len(bins.gauss_ids), 6 + len(background))).fill(np.nan)
@@ -76,6 +76,7 @@ def composite_gpu(device, splats, bins):
     )
     image = ops.composite_fwd(device, splats, bins, background, compositor="gpu")
     v_image = Image(*(device.upload("v_image", a) for a in v_image))
+    between()
     v = ops.composite_bwd(device, splats, bins, image, v_image, compositor="gpu")
     return {k: a.get() for k, a in by_name(image, v).items()}
 
@@ -104,9 +105,9 @@ def test_lists_of_special_lengths(device64, tile_size, channels):
 
 
 @TILE_SIZES
-@pytest.mark.parametrize("n", [1, BATCH, BATCH + 1])
+@pytest.mark.parametrize("n", [1, BATCH, BATCH + 1, 3 * composite.SEGMENT])
 def test_every_splat_meets_every_pixel(device64, tile_size, n):
-    """The corners too, which the first and the last step of a batch reach."""
+    """The corners too, which the first and the last step of a batch reach; and pixels that stop in later segments."""
     splats, bins = wide_scene(tile_size, n, 0.03)
     found, expected = composite_gpu(device64, splats, bins), composite_twin(splats, bins)
     for name in expected:
@@ -135,6 +136,15 @@ def test_a_work_item_may_have_several_pixels(largest):
     found, expected = composite_gpu(device, splats, bins), composite_twin(splats, bins)
     for name in expected:
         assert_matches(name, found[name], expected[name], DOUBLE)
+
+
+def test_another_image_between_both_passes(device64):
+    """Its states replace those of the first image, which are then computed again."""
+    (splats, bins), (others, other_bins) = wide_scene(8, 2 * composite.SEGMENT + 1, 0.03), wide_scene(8, 300, 0.03)
+    expected = composite_gpu(device64, splats, bins)
+    found = composite_gpu(device64, splats, bins, between=lambda: composite_gpu(device64, others, other_bins))
+    for name in expected:
+        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
 
 
 @pytest.mark.parametrize("batch", [1, 48, 128])

@@ -82,9 +82,11 @@ DOUBLE = {
 }
 
 ALONG_RAYS = DOUBLE | {
-    "v_log_scales": Tolerance(1e-10, 1e-11, "float64: close to the camera's plane, vectors of up to 1e4 px cancel"),
-    "v_quats": Tolerance(1e-10, 1e-11, "float64: as for v_log_scales"),
-    "v_means": Tolerance(1e-10, 1e-11, "float64: as for v_log_scales"),
+    "v_log_scales": Tolerance(
+        1e-10, 5e-11, "float64: close to the camera's plane, vectors of up to 1e4 px cancel; processors differ"
+    ),
+    "v_quats": Tolerance(1e-10, 5e-11, "float64: as for v_log_scales"),
+    "v_means": Tolerance(1e-10, 5e-11, "float64: as for v_log_scales"),
 }
 
 _NEEDLE = "float32: the gradient by a needle's covariance cancels along its axis"

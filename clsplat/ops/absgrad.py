@@ -4,7 +4,7 @@ from typing import Any
 
 from clsplat.device import Device
 from clsplat.errors import InputError
-from clsplat.ops.composite import packed, variant
+from clsplat.ops.composite import gpu_batch, packed, variant
 from clsplat.stages import AnySplats, Bins, Image, Splats
 
 
@@ -37,12 +37,14 @@ def absgrad(device: Device, splats: AnySplats, bins: Bins, image: Image, v_image
             "splats, bins: expected those of the affine projection, and lists made with gradients=True, found others"
         )
     (n, channels), tiles, m = splats.colors.shape, bins.tile_ranges.shape[0], bins.gauss_ids.shape[0]
-    defines = {"TILE": bins.tile_size, "CHANNELS": channels, "RAYS": 0}
+    group = 1 if device.is_cpu else gpu_batch(device)
+    subgroups = int(device.subgroup_size > 0 and not device.is_cpu)
+    defines = {"TILE": bins.tile_size, "CHANNELS": channels, "RAYS": 0, "BATCH": group, "SUBGROUPS": subgroups}
     records = device.empty("absolute gradients per intersection", (max(m, 1), 2))
     pack = packed(device, splats, bins, variant(device))
     lists = [bins.gauss_ids, bins.tile_ranges, bins.slots]
-    arguments = [tiles, bins.width, bins.height, pack, *lists, *image, *v_image, records]
-    device.launch("absgrad", "absgrad_tiles", (tiles,), arguments, defines=defines)
+    arguments = [bins.width, bins.height, pack, *lists, *image, *v_image, records]
+    device.launch("absgrad", "absgrad_tiles", (tiles * group,), arguments, defines=defines, group=(group,))
     sums = device.empty("absgrad", (n, 2))
     arguments = [n, bins.order, bins.first_slots, records, sums]
     device.launch("absgrad", "absgrad_sum", (n,), arguments, defines=defines)

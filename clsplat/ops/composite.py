@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.stages import AnyGrads, AnySplats, Bins, Image, RayGrads, RaySplats, SplatGrads
@@ -9,6 +11,10 @@ from clsplat.stages import AnyGrads, AnySplats, Bins, Image, RayGrads, RaySplats
 # Number of splats per batch of the GPU variant without subgroups. Each is a work-item of the backward kernel. Known
 # GPUs run 16 or 32 work-items in lockstep.
 GPU_BATCH = 64
+
+SEGMENT = 256
+"""Splats of a tile's list that a work-group of the GPU variant's backward pass composites. Lists that are longer are
+shared by several groups, for each of which the forward pass saves 4 (1 + C) bytes per pixel of the tile."""
 
 # Number of splats that a pixel composites in one round if pixels are sorted. It changes the speed, not the image.
 WINDOW = 32
@@ -61,6 +67,7 @@ def _defines(device: Device, bins: Bins, channels: int, stage: str, rays: int = 
         "composite_gpu": {
             "ITEMS": device.group(bins.tile_size**2),
             "BATCH": gpu_batch(device),
+            "SEGMENT": SEGMENT,
             "SUBGROUPS": int(device.subgroup_size > 0),
         },
         "composite_sorted": {"LANES": device.vector_width, "WINDOW": WINDOW},
@@ -94,16 +101,34 @@ def _launch(
     bins: Bins,
     splats: AnySplats,
     arguments: list[Any],
+    groups: int = 0,
     **changes: Any,
 ) -> None:
-    tiles = bins.tile_ranges.shape[0]
+    """Queue a kernel, on GPUs over `groups` work-groups; by default over one, or one work-item, per tile."""
+    groups = groups or bins.tile_ranges.shape[0]
     group = 1
     if stage == "composite_gpu":
         group = device.group(bins.tile_size**2) if kernel == "composite_fwd" else gpu_batch(device)
     arguments = [bins.width, bins.height, arguments[0], bins.gauss_ids, bins.tile_ranges, *arguments[1:]]
     arguments += directions_of(splats)
     defines = _defines(device, bins, splats.colors.shape[1], stage, ray_charts(splats)) | changes
-    device.launch(stage, kernel, (tiles * group,), arguments, defines=defines, group=(group,))
+    device.launch(stage, kernel, (groups * group,), arguments, defines=defines, group=(group,))
+
+
+STATES = ("states", "reached")
+"""Names of what the GPU variant's forward pass saves for its backward pass (cl/composite_gpu.cl)."""
+
+
+def _saved(device: Device, splats: AnySplats, bins: Bins) -> list[Any]:
+    """Last arguments of the GPU variant's forward pass: whether it saves, and the arrays that it saves to."""
+    tiles, saves = bins.tile_ranges.shape[0], bins.slots is not None
+    states = bins.gauss_ids.shape[0] // SEGMENT if saves else 0
+    shape = (max(1, states), 1 + splats.colors.shape[1], bins.tile_size**2 if states else 1)
+    arrays = [device.empty(STATES[0], shape), device.empty(STATES[1], tiles, np.uint32)]
+    for name, array in zip(STATES, arrays, strict=True):
+        if saves:
+            device.keep(name, splats, array)
+    return [int(saves), *arrays]
 
 
 def composite_until(device: Device, splats: AnySplats, pack: Any, bins: Bins, background: Any, stop: float) -> Any:
@@ -111,7 +136,7 @@ def composite_until(device: Device, splats: AnySplats, pack: Any, bins: Bins, ba
     channels = len(background)
     result = device.empty("image", (bins.height, bins.width, channels))
     alpha = device.empty("alpha", (bins.height, bins.width))
-    arguments = [pack, device.constant("background", background), result, alpha]
+    arguments = [pack, device.constant("background", background), result, alpha, *_saved(device, splats, bins)]
     _launch(device, "composite_gpu", "composite_fwd", bins, splats, arguments, TRANSMITTANCE_MIN=stop)
     return result
 
@@ -148,6 +173,8 @@ def composite_fwd(
         check_private(device, bins.tile_size, channels)
     arguments = [packed(device, splats, bins, stage), device.constant("background", background), *result]
     arguments += [] if disparities is None else [disparities]
+    if stage == "composite_gpu":
+        arguments += _saved(device, splats, bins)
     _launch(device, stage, "composite_fwd", bins, splats, arguments)
     return result
 
@@ -190,9 +217,14 @@ def composite_bwd(
     pack = device.kept("packed splats", splats)
     if pack is None:
         pack = packed(device, splats, bins, stage)
-    arguments = [pack, bins.slots, *image, *v_image, records]
-    arguments += [] if disparities is None else [disparities]
-    _launch(device, stage, "composite_bwd", bins, splats, arguments)
+    arguments, groups = [pack, bins.slots, *image, *v_image], bins.tile_ranges.shape[0]
+    if stage == "composite_gpu":
+        if device.kept(STATES[0], splats) is None:  # another camera's image has been composited since
+            composite_fwd(device, splats, bins, np.zeros(channels), compositor="gpu")
+        arguments += [device.kept(name, splats) for name in STATES]
+        groups += m // SEGMENT
+    arguments += [records] if disparities is None else [records, disparities]
+    _launch(device, stage, "composite_bwd", bins, splats, arguments, groups=groups)
     geometry = device.empty("v_means2d", (n, 2)), device.empty("v_conics", (n, 3))
     rest = device.empty("v_opacities", n), device.empty("v_colors", (n, channels))
     v: AnyGrads = SplatGrads(*geometry, *rest)

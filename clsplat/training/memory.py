@@ -37,7 +37,7 @@ PER_INTERSECTION = {
     "composite": 9,  # gradients per intersection
 }
 PER_INTERSECTION_RAYS = 4  # gradients per intersection
-PER_INTERSECTION_GPU = 5  # bin: intersections once more, sort keys and sort order twice
+PER_INTERSECTION_GPU = 5 + 4  # bin: intersections once more, sort keys and sort order twice; states of 256 pixels
 PER_INTERSECTION_PER_TILE = 4  # bin: list keys; of the sorts, what is not shared with the sort by depth
 PER_PIXEL = {
     "composite": 4,  # image 3, alpha
