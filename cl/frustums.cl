@@ -18,6 +18,9 @@
 //   edges[R,N+1] ascending, axes[A,3] of length 1; out encoded[R N,E], deltas[R N] (t_1 - t_0).
 // -DCONTRACTED=0|1   as above
 // -DLANES=1|8        8 on CPUs (lanes.h)
+#ifndef LANES
+#error "-DLANES, the number of axes that a work-item takes at once, must be given"
+#endif
 #include "spans.h"
 
 #include "lanes.h"
