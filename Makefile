@@ -1,8 +1,8 @@
 PYTHON = python
 
 .PHONY: test test-slow stability fuzz fuzz-cases faults faults-below mutants soak lint docs check-races check-variants \
-  check-runtimes check-builds bench bench-knobs bench-quality bench-captures bench-stability formats foreign works-with \
-  foreign-packages
+  check-runtimes check-builds bench bench-knobs bench-quality bench-fields bench-captures bench-stability formats \
+  foreign works-with foreign-packages
 
 # Run the default tests: a few minutes on two cores.
 test:
@@ -103,6 +103,19 @@ bench-quality:
 	  $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/quality
 	cp build/quality/results.jsonl docs/results/quality.jsonl
 	cp build/quality/time-psnr.svg docs/results/quality.svg
+
+# Measure the charts of docs/howto/fields.md: make bench-fields DATA=folder of real scenes. The lengths of trainings of
+# fields are chosen for one to three minutes of two cores each. Finished trainings are not repeated.
+FIELD_SCENES = lego:downscale=4:background=white fern:downscale=8 fox_pinhole:downscale=8 castle_p30:downscale=8
+FIELD_LENGTHS = plenoxels=800 ingp-base=400 nerf-small=1000 mip-nerf360-small=500
+bench-fields:
+	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-fields DATA=..."; exit 2; }
+	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(FIELD_SCENES)) --methods auto paper-7k -o build/fields
+	for length in $(FIELD_LENGTHS); do \
+	  $(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(FIELD_SCENES)) --methods $${length%=*} \
+	    --iterations $${length#*=} -o build/fields || exit; \
+	done
+	cp build/fields/results.jsonl docs/results/fields.jsonl
 
 # Measure the tables of docs/benchmarks.md on variants of scenes: make bench-captures DATA=folder of real scenes
 # DOWNSCALE=4. Finished trainings are not repeated. CAPTURE_SCENES selects scenes, METHODS methods, SEEDS seeds. The

@@ -247,11 +247,12 @@ class Device:
         result.set(host)
         return result
 
-    def constant(self, what: str, values: Any) -> cl.array.Array:
-        """Reals named `what` on the device, uploaded only when they change: an upload waits for the queue."""
-        host = np.ascontiguousarray(values, dtype=self.real)
+    def constant(self, what: str, values: Any, dtype: DTypeLike | None = None) -> cl.array.Array:
+        """Numbers named `what` on the device (default: reals), uploaded only when they change: uploads wait for the
+        queue."""
+        host = np.ascontiguousarray(values, dtype=self.real if dtype is None else dtype)
         if what not in self._constants or self._constants[what][0] != host.tobytes():
-            self._constants[what] = host.tobytes(), self.upload(what, host)
+            self._constants[what] = host.tobytes(), self.upload(what, host, host.dtype)
         return self._constants[what][1]
 
     def keep(self, what: str, owner: tuple[cl.array.Array, ...], result: cl.array.Array) -> None:
