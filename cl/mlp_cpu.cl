@@ -13,7 +13,7 @@
 // Buffers, S rows, widths w_0 ... w_L, P weights: in inputs[S,w_0], weights[P]: the matrices [w_l,w_{l+1}], one after
 //   the other; out hidden[S (w_1 + ... + w_{L-1})]: the matrices [S,w_l], outputs[S,w_L]. Backward: in
 //   v_outputs[S,w_L], turned[P]: each matrix transposed, from mlp_turn; between work[items,2,CHUNK,widest]; out
-//   v_inputs[S,w_0], parts[items,P], v_weights[P].
+//   v_inputs[S,columns], parts[items,P], v_weights[P].
 // -DWIDTHS   w_0 to w_L, multiples of 16, separated by commas
 // -DWIDEST   the largest of them, at most 2048
 // -DROWS     rows of a block: 6 for registers of 8 values, 12 for those of 16
@@ -37,9 +37,10 @@
 __constant uint WIDTH[] = {WIDTHS};
 #define LAYERS (sizeof(WIDTH) / sizeof(uint) - 1)
 
-// y = x W for `rows` rows of x [.,from], and y [.,to]. Rows of the last block beyond the end repeat the last row.
-// With `gate`, a value of y is 0 where gate is not positive; with `rectify`, where y is negative.
-static inline void product(const uint rows, const uint from, const uint to, const __global real *x,
+// y = x W for `rows` rows of x [.,from], and y [.,to], of the first `to` columns of W, which has `all`. Rows of the last
+// block beyond the end repeat the last row. With `gate`, a value of y is 0 where gate is not positive; with `rectify`,
+// where y is negative.
+static inline void product(const uint rows, const uint from, const uint to, const uint all, const __global real *x,
                            const __global real *w, __global real *y, const __global real *gate, const int rectify) {
     for (uint begin = 0; begin < rows; begin += ROWS) {
         size_t row[ROWS];
@@ -52,7 +53,7 @@ static inline void product(const uint rows, const uint from, const uint to, cons
             for (uint r = 0; r < ROWS; ++r)
                 sum[r] = 0;
             for (uint i = 0; i < from; ++i) {
-                const real16 weights = load16(w + i * to + column);
+                const real16 weights = load16(w + i * all + column);
 #pragma unroll
                 for (uint r = 0; r < ROWS; ++r)
                     sum[r] += x[row[r] * from + i] * weights;
@@ -102,7 +103,7 @@ __kernel void mlp_fwd(const uint rows, const uint band, const __global real *inp
         for (uint l = 0; l < LAYERS; ++l) {
             const int is_last = l + 1 == LAYERS;
             __global real *y = (is_last ? outputs : layer) + begin * WIDTH[l + 1];
-            product(count, WIDTH[l], WIDTH[l + 1], x, w, y, 0, !is_last);
+            product(count, WIDTH[l], WIDTH[l + 1], WIDTH[l + 1], x, w, y, 0, !is_last);
             x = y;
             layer += (size_t)rows * WIDTH[l + 1];
             w += WIDTH[l] * WIDTH[l + 1];
@@ -123,9 +124,9 @@ __kernel void mlp_turn(const __global real *weights, __global real *turned) {
 }
 
 __kernel void mlp_bwd(const uint rows, const uint items, const uint weight_count, const uint hidden_width,
-                      const __global real *inputs, const __global real *turned, const __global real *hidden,
-                      const __global real *v_outputs, __global real *work, __global real *v_inputs,
-                      __global real *parts) {
+                      const uint columns, const __global real *inputs, const __global real *turned,
+                      const __global real *hidden, const __global real *v_outputs, __global real *work,
+                      __global real *v_inputs, __global real *parts) {
     const size_t item = get_global_id(0);
     __global real *own = parts + item * weight_count;
     for (uint i = 0; i < weight_count; ++i)
@@ -140,8 +141,9 @@ __kernel void mlp_bwd(const uint rows, const uint items, const uint weight_count
             width_end -= l > 0 ? from : 0;
             const __global real *x = l > 0 ? hidden + (size_t)rows * width_end + begin * from : inputs + begin * from;
             product_of_columns(count, from, to, x, v_y, own + place);
-            __global real *v_x = l > 0 ? spare + (l & 1) * CHUNK * WIDEST : v_inputs + begin * from;
-            product(count, to, from, v_y, turned + place, v_x, l > 0 ? x : 0, 0);
+            const uint needed = l > 0 ? from : columns;
+            __global real *v_x = l > 0 ? spare + (l & 1) * CHUNK * WIDEST : v_inputs + begin * columns;
+            product(count, to, needed, from, v_y, turned + place, v_x, l > 0 ? x : 0, 0);
             v_y = v_x;
             end = place;
         }

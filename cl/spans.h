@@ -2,7 +2,8 @@
 //
 //   A ray is divided at edges s in [0, 1].
 //   CONTRACTED=0: t = t_near (1 - s) + t_far s, from where the ray enters the unit cube to where it leaves it
-//   CONTRACTED=1: 1/t = (1 - s)/near + s/far (Barron et al. 2022, section 3)
+//   CONTRACTED=1: g(t) = (1 - s) g(near) + s g(far) with g(t) = t up to 1, and 2 - 1/t beyond: equal in the contracted
+//   distance, as points are (Tancik et al. 2023, section 4.3)
 //
 // The file that includes this documents -DCONTRACTED=0|1.
 #ifndef CLSPLAT_SPANS_H
@@ -31,9 +32,16 @@ static inline real2 ends_of(real3 origin, real3 direction, real near, real far) 
     return (real2)(near, far);
 }
 
+#if CONTRACTED
+static inline real contracted_distance(real t) {
+    return t > 1 ? 2 - 1 / t : t;
+}
+#endif
+
 static inline real distance_at(real s, real2 ends) {
 #if CONTRACTED
-    return 1 / ((1 - s) / ends.x + s / ends.y);
+    const real g = contracted_distance(ends.x) * (1 - s) + contracted_distance(ends.y) * s;
+    return g > 1 ? 1 / (2 - g) : g;
 #else
     return ends.x * (1 - s) + ends.y * s;
 #endif

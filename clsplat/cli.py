@@ -1,5 +1,6 @@
 """The command line: choose a command of `clsplat.commands`, run it, print errors as one sentence."""
 
+import atexit
 import os
 import signal
 import sys
@@ -91,6 +92,15 @@ def main(arguments: list[str] | None = None) -> None:
             warn(f"clsplat: {error}")
         else:  # an OSError that no function has translated, such as a full disk while a log is written
             warn(f"clsplat: cannot read or write {error.filename or 'a file'}: {error.strerror or error}")
+        sys.exit(2)
+    except MemoryError as error:
+        if console.loudness == "verbose":
+            traceback.print_exc()
+        reason = f" ({error})" if str(error) else ""
+        warn(f"clsplat: this machine has not enough memory{reason}; use smaller photos or fewer Gaussians")
+        sys.stdout.flush()
+        # A driver that met the end of the memory may still hold its locks, and its own clean-up then waits for ever.
+        atexit.register(os._exit, 2)
         sys.exit(2)
     except KeyboardInterrupt:
         warn("clsplat: interrupted")

@@ -17,7 +17,16 @@ from clsplat import constants
 from clsplat.buffers import Buffers
 from clsplat.errors import DeviceError, InputError
 from clsplat.processors import name_processor, vector_width
-from clsplat.programs import Subgroups, ask, build, build_options, inline_includes, kernel_folder, probe_subgroups
+from clsplat.programs import (
+    Subgroups,
+    ask,
+    build,
+    build_options,
+    check_space,
+    inline_includes,
+    kernel_folder,
+    probe_subgroups,
+)
 
 POCL_HINT = "install one, for example the embedded CPU driver: pip install 'clsplat[pocl]'"
 
@@ -238,11 +247,12 @@ class Device:
         result.set(host)
         return result
 
-    def constant(self, what: str, values: Any) -> cl.array.Array:
-        """Reals named `what` on the device, uploaded only when they change: an upload waits for the queue."""
-        host = np.ascontiguousarray(values, dtype=self.real)
+    def constant(self, what: str, values: Any, dtype: DTypeLike | None = None) -> cl.array.Array:
+        """Numbers named `what` on the device (default: reals), uploaded only when they change: uploads wait for the
+        queue."""
+        host = np.ascontiguousarray(values, dtype=self.real if dtype is None else dtype)
         if what not in self._constants or self._constants[what][0] != host.tobytes():
-            self._constants[what] = host.tobytes(), self.upload(what, host)
+            self._constants[what] = host.tobytes(), self.upload(what, host, host.dtype)
         return self._constants[what][1]
 
     def keep(self, what: str, owner: tuple[cl.array.Array, ...], result: cl.array.Array) -> None:
@@ -300,6 +310,7 @@ class Device:
 
         If a build with subgroups fails, a warning says so, and the device uses none. They change no result.
         """
+        check_space(self.cl_device)
         source, values = inline_includes(f"{stage}.cl", kernel_folder()), self.model | defines
         if self._level:  # a key of PoCL's cache, which processors of other levels may share
             values["PROCESSOR"] = self._level

@@ -12,7 +12,8 @@ from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
 
 PROBE = 2**22
-"""Bytes that `unwritable` writes: more than a file of a driver's compiler or an empty database of COLMAP has."""
+"""Bytes that `unwritable` writes, and that must be free to build a kernel: more than a file of a driver's compiler or
+an empty database of COLMAP has."""
 
 
 class ClsplatError(Exception):

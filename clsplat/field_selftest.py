@@ -67,8 +67,8 @@ def test_mlp(b: Any) -> Found:
     outputs, hidden = b.stages.mlp_fwd(*on_device, widths)
     expected, expected_hidden = reference.mlp_fwd(inputs, weights, widths)
     yield outputs, expected
-    found = b.stages.mlp_bwd(*on_device, widths, hidden, b.up(v))
-    yield from zip(found, reference.mlp_bwd(inputs, weights, widths, expected_hidden, v), strict=True)
+    found = b.stages.mlp_bwd(*on_device, widths, hidden, b.up(v), 32)
+    yield from zip(found, reference.mlp_bwd(inputs, weights, widths, expected_hidden, v, 32), strict=True)
 
 
 def test_voxels(b: Any) -> Found:

@@ -91,7 +91,7 @@ class Span(NamedTuple):
     """Where rays have intervals: lengths in the field's coordinates, as for `Marching`.
 
     Without `contracted`, rays begin and end at the unit cube, and intervals are equal in their lengths; with it, from
-    `near` to `far`, and equal in their inverse distances.
+    `near` to `far`, and equal in their contracted distances.
     """
 
     near: float
@@ -144,7 +144,14 @@ class FieldStages(Protocol):
     def hashgrid_bwd(self, positions: Array, v_features: Array, levels: HashLevels) -> Array: ...
     def mlp_fwd(self, inputs: Array, weights: Array, widths: tuple[int, ...]) -> tuple[Array, Array]: ...
     def mlp_bwd(
-        self, inputs: Array, weights: Array, widths: tuple[int, ...], hidden: Array, v_outputs: Array
+        self,
+        inputs: Array,
+        weights: Array,
+        widths: tuple[int, ...],
+        hidden: Array,
+        v_outputs: Array,
+        columns: int,
+        v_weights: Array | None = None,
     ) -> tuple[Array, Array]: ...
     def voxels_fwd(self, positions: Array, index: Array, table: Array) -> Array: ...
     def voxels_bwd(self, positions: Array, index: Array, rows: int, v_features: Array) -> Array: ...

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -10,7 +11,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike
 
-from clsplat.errors import DeviceError
+from clsplat.errors import PROBE, BuildError, DeviceError
 
 Answer = TypeVar("Answer")
 
@@ -24,6 +25,9 @@ BASE_LANGUAGE = "-cl-std=CL1.2"
 # from which a driver has to know each. In OpenCL C 3.0 they are a feature, in 2.0 the extension cl_khr_subgroups.
 # OpenCL C 1.2 has them nowhere: Clang, from which most drivers come, does not declare them there.
 SUBGROUP_LANGUAGES = (("-cl-std=CL3.0", (3, 0)), ("-cl-std=CL2.0", (2, 0)))
+
+# Name of PoCL's platform.
+POCL = "Portable Computing Language"
 
 # A kernel that calls the functions which kernels with -DSUBGROUPS=1 call.
 SUBGROUP_PROBE = """
@@ -84,6 +88,23 @@ def build_options(real: DTypeLike, defines: dict[str, Any], language: str = BASE
     return options + [
         f"-D{name}={value!r}" if isinstance(value, float) else f"-D{name}={value}" for name, value in defines.items()
     ]
+
+
+def check_space(device: cl.Device) -> None:
+    """Raise a BuildError if PoCL has no space for kernels: it ends the process when it cannot write one."""
+    if device.platform.name != POCL:
+        return
+    variables = (os.environ.get(name) for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME"))
+    folder = next((Path(value) for value in variables if value), Path.home() / ".cache")
+    for place in (folder, *folder.parents):  # PoCL makes what is missing
+        if place.is_dir():
+            free = shutil.disk_usage(place).free
+            if free < PROBE:
+                raise BuildError(
+                    f"cannot build the kernels: the driver's compiler writes to {folder}, whose disk has {free} "
+                    "bytes left; make room, or set POCL_CACHE_DIR to a folder on another disk"
+                )
+            return
 
 
 def build(context: cl.Context, source: str, options: list[str]) -> cl.Program:

@@ -242,7 +242,7 @@ def networks(device):
     x, v = (device.upload("rows", rng.normal(size=(70, width))) for width in (32, 16))
     weights = device.upload("weights", rng.normal(size=32 * 48 + 48 * 16))
     _, hidden = ops.mlp_fwd(device, x, weights, widths)
-    ops.mlp_bwd(device, x, weights, widths, hidden, v)[1].get()
+    ops.mlp_bwd(device, x, weights, widths, hidden, v, widths[0])[1].get()
 
 
 CASES = {

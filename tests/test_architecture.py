@@ -227,7 +227,7 @@ DEFINES = {
     "voxels": {"FEATURES": 28, "TV_EPS": 1e-9},
     "heads": {"EXPONENT_MAX": 15.0, "DENSITY_SHIFT": 1.0},
     "intervals": {"CONTRACTED": 1},
-    "frustums": {"CONTRACTED": 1},
+    "frustums": {"CONTRACTED": 1, "LANES": 8},
     "histograms": {"INTERLEVEL_EPS": 1e-7},
     "march": {"CONTRACTED": 1},
     "loss": {
@@ -280,6 +280,7 @@ FORBIDDEN = [
     ("median", "RAYS", 3),
     ("intervals", "CONTRACTED", 2),
     ("frustums", "CONTRACTED", 2),
+    ("frustums", "LANES", 4),
     ("march", "CONTRACTED", 2),
     ("voxels", "FEATURES", 0),
     ("mlp_cpu", "WIDEST", 2064),

@@ -78,10 +78,26 @@ def test_small_frustums_have_the_sines_of_their_place(any_device):
 @pytest.mark.parametrize("span", [CUBE, SPACE], ids=["cube", "space"])
 @pytest.mark.parametrize("levels", [4, 12])
 def test_matches_twin(any_device, span, levels):
+    check(any_device, span, levels)
+
+
+@pytest.mark.parametrize("span", [CUBE, SPACE], ids=["cube", "space"])
+def test_matches_twin_as_cpu_and_gpu(configured_device, span):
+    check(configured_device, span, 5)
+
+
+def test_encodings_repeat_to_the_bit(configured_device):
+    given = *rays(SPACE), SPACE, 8
+    first = by_kernel(configured_device, *given)
+    for before, again in zip(first, by_kernel(configured_device, *given), strict=True):
+        np.testing.assert_array_equal(again, before)
+
+
+def check(device, span, levels):
     given = rays(span)
     encoded, deltas = reference.frustums_encode(*given, span, levels)
     assert span.contracted or not deltas[7:14].any()  # beside the cube
-    found = by_kernel(any_device, *given, span, levels)
-    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    found = by_kernel(device, *given, span, levels)
+    tolerances = DOUBLE if device.real == np.float64 else FLOAT
     assert_matches("integrated encoding", found[0], encoded, tolerances)
     assert_matches("lengths", found[1], deltas, tolerances)

@@ -27,13 +27,13 @@ def inputs(rows, widths):
 def by_kernel(device, widths, x, weights, v):
     x, w = device.upload("x", x), device.upload("weights", weights)
     outputs, hidden = ops.mlp_fwd(device, x, w, widths)
-    v_x, v_w = ops.mlp_bwd(device, x, w, widths, hidden, device.upload("v", v))
+    v_x, v_w = ops.mlp_bwd(device, x, w, widths, hidden, device.upload("v", v), widths[0])
     return outputs.get(), v_x.get(), v_w.get()
 
 
 def by_twin(widths, x, weights, v):
     outputs, hidden = reference.mlp_fwd(x, weights, widths)
-    return outputs, *reference.mlp_bwd(x, weights, widths, hidden, v)
+    return outputs, *reference.mlp_bwd(x, weights, widths, hidden, v, widths[0])
 
 
 def test_in_numbers(any_device):
@@ -88,6 +88,26 @@ def test_gradients_by_central_differences(device64):
         {"x": x, "weights": weights},
         {"x": v_x, "weights": v_w},
     )
+
+
+@pytest.mark.parametrize("columns", [0, 16, 48])
+def test_some_inputs_alone_and_a_sum_of_gradients(configured_device, columns):
+    """The first columns of the inputs' gradient are the same bits; that of the weights is added to another one."""
+    device, widths = configured_device, WIDTHS[3]
+    x, weights, v = inputs(101, widths)
+    _, whole, v_weights = by_kernel(device, widths, x, weights, v)
+    on_device = device.upload("x", x), device.upload("weights", weights), widths
+    hidden, before = ops.mlp_fwd(*(device, *on_device))[1], np.arange(weights.size) % 7.0
+    given = *on_device, hidden, device.upload("v", v), columns, device.upload("before", before)
+    v_x, total = (array.get() for array in ops.mlp_bwd(device, *given))
+    assert columns == 0 or v_x.shape == (101, columns)
+    np.testing.assert_array_equal(v_x.reshape(-1)[: 101 * columns], whole[:, :columns].ravel())
+    # The sum begins with the other gradient, so that its rounding differs.
+    np.testing.assert_allclose(total, before + v_weights, rtol=1e-5, atol=1e-4)
+    hidden = reference.mlp_fwd(x, weights, widths)[1]
+    v_x, again = reference.mlp_bwd(x, weights, widths, hidden, v, columns, before.copy())
+    assert v_x.shape == (101, columns)
+    np.testing.assert_allclose(total, again, rtol=1e-4, atol=1e-3)
 
 
 def test_gradients_repeat_to_the_bit(configured_device):

@@ -10,12 +10,14 @@ import pytest
 import clsplat.device
 import clsplat.programs
 from clsplat.device import Device
-from clsplat.errors import DeviceError
+from clsplat.errors import BuildError, DeviceError
 from clsplat.programs import (
     BASE_LANGUAGE,
+    POCL,
     Subgroups,
     build,
     build_options,
+    check_space,
     inline_includes,
     kernel_folder,
     probe_subgroups,
@@ -165,3 +167,16 @@ class TestSubgroups:
             Subgroups(0, BASE_LANGUAGE),
             [],
         )
+
+
+def test_a_full_disk_is_named_before_pocl_ends_the_process(tmp_path, monkeypatch):
+    """PoCL aborts where it cannot write a kernel that it has compiled."""
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "absent" / "cache"))
+    pocl, other = (SimpleNamespace(platform=SimpleNamespace(name=name)) for name in (POCL, "Other"))
+    check_space(pocl)
+    asked = []
+    monkeypatch.setattr("shutil.disk_usage", lambda path: asked.append(path) or SimpleNamespace(free=4095))
+    check_space(other)
+    with pytest.raises(BuildError, match=r"cannot build the kernels: .*cache, whose disk has 4095 bytes left"):
+        check_space(pocl)
+    assert asked == [tmp_path]

@@ -27,9 +27,6 @@ CORNERS = 8
 HEADS = ("heads_fwd", "heads_sh_fwd", "heads_soft_fwd")
 """Stages that make densities: each of their rows is an evaluation of a field."""
 
-NETWORKS = {"mlp_fwd": 2, "mlp_bwd": 4}
-"""Operations per row and weight of the stages that are networks."""
-
 
 class Work:
     """What stages have done: evaluations of the field, operations of networks, bytes, and clocks by stage.
@@ -46,8 +43,12 @@ class Work:
         self.bytes += sum(array.nbytes for array in {id(a): a for a in _arrays((args, result))}.values())
         if name in HEADS:
             self.evaluations += args[0].shape[0]
-        if name in NETWORKS:
-            self.operations += NETWORKS[name] * args[0].shape[0] * args[1].size
+        if name == "mlp_fwd":
+            self.operations += 2 * args[0].shape[0] * args[1].size
+        if name == "mlp_bwd":
+            inputs, weights, widths, _, _, columns, *_ = args
+            needed = 2 * weights.size - (widths[0] - columns) * widths[1]
+            self.operations += 2 * inputs.shape[0] * needed
         if name == "hashgrid_fwd":
             self.bytes += CORNERS * result.nbytes - args[1].nbytes
         if name == "voxels_fwd":

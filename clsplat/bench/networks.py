@@ -52,6 +52,6 @@ def _bench(device: Device, widths: tuple[int, ...], repeats: int) -> dict[str, A
         return min(seconds[1:])
 
     forward = fastest(lambda: ops.mlp_fwd(device, inputs, weights, widths))
-    backward = fastest(lambda: ops.mlp_bwd(device, inputs, weights, widths, hidden, v_outputs))
+    backward = fastest(lambda: ops.mlp_bwd(device, inputs, weights, widths, hidden, v_outputs, widths[0]))
     rates = {"forward_gflops": 2e-9 * rows * count / forward, "backward_gflops": 4e-9 * rows * count / backward}
     return {"widths": list(widths), "rows": rows, **rates}

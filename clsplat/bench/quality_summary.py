@@ -238,7 +238,9 @@ def verdict(finished: list[Run], cost: str, metric: str) -> list[str]:
         if not best:
             continue
         names = ", ".join(run.setting for run in best)
-        beaten = [run.setting for run in of_panel if run not in best]
+        # What was not measured, such as the Gaussians of a radiance field, is not compared.
+        placed = [run for run in of_panel if coordinates(run.last, cost, metric) is not None]
+        beaten = [run.setting for run in placed if run not in best]
         where = "Mean over scenes" if panel == MEAN else title(panel)
         others = f"; dominated: {', '.join(beaten)}" if beaten else "; none is dominated"
         sentences.append(f"{where}, on the Pareto front of {quantity.name} and {goal}: {names}{others}.")

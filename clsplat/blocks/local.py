@@ -12,7 +12,7 @@ from typing import IO, TYPE_CHECKING, NamedTuple
 
 from clsplat.blocks.block import result_of, train_block
 from clsplat.blocks.jobs import read_job
-from clsplat.dataset.sfm.matching import EXIT_WITH_PARENT
+from clsplat.dataset.sfm.processes import EXIT_WITH_PARENT
 from clsplat.errors import ClsplatError
 
 if TYPE_CHECKING:

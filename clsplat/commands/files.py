@@ -27,6 +27,7 @@ from clsplat.formats.spz_container import Axes, Version
 from clsplat.ranges import within
 
 if TYPE_CHECKING:
+    from clsplat.formats.detail_tree import Node
     from clsplat.gaussians import Gaussians
     from clsplat.scene import Scene
 
@@ -97,8 +98,8 @@ class Export:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.formats import load_gaussians, save_gaussians, suffix_of
-        from clsplat.formats.spz import load_spz, save_spz
+        from clsplat.formats import save_gaussians, suffix_of
+        from clsplat.formats.spz import save_spz
 
         if (self.to is None) == (self.out is None):
             raise InputError("export: expected one file to write, as in: clsplat export scene.ply scene.spz")
@@ -109,13 +110,10 @@ class Export:
         to_spz, from_spz = (suffix_of(path) == ".spz" for path in (out, scene))
         if self.spz_axes is not None and not (to_spz or from_spz):
             raise InputError(f"--spz-axes: expected an .spz to read or to write, found {scene} and {out}")
-        if from_spz and not to_spz:
-            gaussians, mode, offset = load_spz(scene, self.spz_axes)
-        else:
-            gaussians, mode, offset = load_gaussians(scene)
         if levels:
-            self._levels(out, gaussians, mode, offset)
+            self._levels(scene, out)
             return
+        gaussians, mode, offset = self._load(scene, from_spz and not to_spz)
         if out.suffix.lower() == ".html":
             self._page(out, gaussians, mode, offset)
         elif to_spz:
@@ -125,33 +123,59 @@ class Export:
             save_gaussians(out, gaussians, mode, offset)
         say(f"{out}: {len(gaussians)} Gaussians, {out.stat().st_size / 1e6:.3g} MB")
 
-    def _levels(self, out: Path, gaussians: "Gaussians", mode: Mode, offset: Any) -> None:
-        """Write levels of detail; those of a run with its dataset are refined against its photos."""
-        from clsplat.formats.detail_tree import Node
-        from clsplat.formats.streamed_sog import LOD_META, StreamedSogWriter
-        from clsplat.formats.tiles_3d import TILESET, TilesWriter
-        from clsplat.pruning.levels import detail_tree
+    def _load(self, scene: Path, turn: bool) -> "tuple[Gaussians, Mode, Any]":
+        """Read the scene; with the axes that were asked for, if an .spz is to `turn`."""
+        from clsplat.formats import load_gaussians
+        from clsplat.formats.spz import load_spz
+
+        return load_spz(scene, self.spz_axes) if turn else load_gaussians(scene)
+
+    def _levels(self, file: Path, out: Path) -> None:
+        """Write levels of detail; those of a run with its dataset are refined against its photos. A PLY without
+        photos is read in parts, and need not fit the memory."""
+        from clsplat.formats import suffix_of
+        from clsplat.formats.ply_parts import PlyParts
+        from clsplat.pruning.levels import detail_tree, detail_tree_of_file
         from clsplat.training.level_refinement import refined
         from clsplat.training.preparation import open_device
 
         folder = out.parent if out.suffix else out
-        new_folder(folder)
         scene, config = self._photos()
+        nodes: Iterable[Node]
+        rows = PlyParts(file) if scene is None and suffix_of(file) == ".ply" else None
+        if rows is not None and rows.binary:
+            mode, offset = rows.mode, rows.offset
+            nodes = detail_tree_of_file(rows, folder)
+        else:
+            gaussians, mode, offset = self._load(file, suffix_of(file) == ".spz")
+            if scene is not None:
+                gaussians, offset = moved(gaussians, offset - scene.offset), scene.offset
+            nodes = detail_tree(gaussians)
+        new_folder(folder)
         if scene is not None:
-            gaussians, offset = moved(gaussians, offset - scene.offset), scene.offset
+            nodes = refined(nodes, scene, config, open_device(config), say)
+        self._write_levels(out, nodes, mode, offset)
+
+    def _write_levels(self, out: Path, nodes: "Iterable[Node]", mode: Mode, offset: Any) -> None:
+        from clsplat.formats.streamed_sog import LOD_META, StreamedSogWriter
+        from clsplat.formats.tiles_3d import TILESET, TilesWriter
+        from clsplat.pruning.leaf_threads import in_threads
+
+        folder = out.parent if out.suffix else out
         writers: list[StreamedSogWriter | TilesWriter] = []
         if out.name != TILESET:
             writers.append(StreamedSogWriter(folder, mode, offset))
         if out.name != LOD_META:
             writers.append(TilesWriter(folder, mode, offset))
         counts: Counter[int] = Counter()
-        nodes: Iterable[Node] = detail_tree(gaussians)
-        if scene is not None:
-            nodes = refined(nodes, scene, config, open_device(config), say)
-        for node in nodes:
-            counts[node.height] += len(node.gaussians)
+
+        def write(node: "Node") -> tuple[int, int]:
             for writer in writers:
                 writer.add(node)
+            return node.height, len(node.gaussians)
+
+        for height, count in in_threads(write, nodes):
+            counts[height] += count
         for writer in writers:
             writer.finish()
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

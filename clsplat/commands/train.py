@@ -116,7 +116,7 @@ class Train:
         except BaseException as error:
             if viewer:
                 viewer.close()
-            if isinstance(error, KeyboardInterrupt) and began(out):
+            if isinstance(error, (KeyboardInterrupt, MemoryError)) and began(out):
                 again = sys.argv[1:] + ([] if self.resume else ["--resume"])
                 warn(f"to continue: {shlex.join(['clsplat', *again])}")
             raise

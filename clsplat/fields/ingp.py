@@ -127,9 +127,13 @@ class IngpBase(Field):
         stages, parameters = self.stages, self.parameters
         v_outputs = stages.heads_bwd(run.colors, v_colors)
         color, density = parameters["color"].values, parameters["density"].values
-        v_inputs, v_color = stages.mlp_bwd(run.inputs, color, COLOR_WIDTHS, run.color_hidden, v_outputs)
+        v_inputs, v_color = stages.mlp_bwd(
+            run.inputs, color, COLOR_WIDTHS, run.color_hidden, v_outputs, COLOR_WIDTHS[0]
+        )
         v_features = stages.heads_join_bwd(v_inputs, run.features, run.sigmas, v_sigmas)
-        v_encoded, v_density = stages.mlp_bwd(run.encoded, density, DENSITY_WIDTHS, run.density_hidden, v_features)
+        v_encoded, v_density = stages.mlp_bwd(
+            run.encoded, density, DENSITY_WIDTHS, run.density_hidden, v_features, DENSITY_WIDTHS[0]
+        )
         v_table = stages.hashgrid_bwd(samples.positions, v_encoded, self.levels)
         rate = RATE * (RATE_FINAL / RATE) ** progress
         step = AdamStep(self.iteration, {}, BETA1, BETA2, EPS, 0)

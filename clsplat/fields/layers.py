@@ -151,14 +151,18 @@ class ViewNetwork:
         """Gradients of all weights, by the name of the part."""
         widths = self.widths
         v_outputs = stages.heads_bwd(asked.colors, v_colors)
-        v_seen, v_color = stages.mlp_bwd(asked.seen, weights["color"], widths["color"], asked.color_hidden, v_outputs)
+        features, width = asked.features.shape[1], asked.early.shape[1]
+        # Of the joined inputs, only the features have a gradient that is needed: they come first.
+        v_seen, v_color = stages.mlp_bwd(
+            asked.seen, weights["color"], widths["color"], asked.color_hidden, v_outputs, features
+        )
         v_features = stages.encode_join_bwd(v_seen, asked.features, False)
         stages.heads_soft_bwd(asked.features, density_scale, v_sigmas, v_features)
         v_joined, v_late = stages.mlp_bwd(
-            asked.joined, weights["late"], widths["late"], asked.late_hidden, v_features
+            asked.joined, weights["late"], widths["late"], asked.late_hidden, v_features, width
         )
         v_early = stages.encode_join_bwd(v_joined, asked.early, True)
-        last = stages.mlp_bwd(asked.encoded, weights["early"], widths["early"], asked.early_hidden, v_early)
+        last = stages.mlp_bwd(asked.encoded, weights["early"], widths["early"], asked.early_hidden, v_early, 0)
         return {"early": last[1], "late": v_late, "color": v_color}
 
 

@@ -124,19 +124,19 @@ class MipNerf360(NetworkField):
 
     def _proposal_gradient(self, seen: Seen) -> Any:
         """Gradient of the proposal network's weights: the sum over the rounds."""
-        stages, upload, weights = self.stages, self.device.upload, self.parameters["proposal"].values
-        found = []
+        stages, empty, weights = self.stages, self.device.empty, self.parameters["proposal"].values
+        v = None
         for round_ in seen.rounds:
             outer = round_.edges, round_.weights
             _, v_weights = stages.histograms_interlevel(seen.edges, seen.weights, *outer, 1 / len(seen.weights))
-            v_sigmas = upload("v_sigmas", np.zeros(round_.sigmas.shape))
+            v_sigmas = empty("v_sigmas", round_.sigmas.shape).fill(0)
             arguments = round_.sigmas, round_.deltas, self.proposals, round_.weights
             stages.weights_bwd(*arguments, v_weights, v_sigmas)
-            v_outputs = upload("v_outputs", np.zeros(round_.outputs.shape))
+            v_outputs = empty("v_outputs", round_.outputs.shape).fill(0)
             stages.heads_soft_bwd(round_.outputs, self.space.density_scale, v_sigmas, v_outputs)
-            _, v = stages.mlp_bwd(round_.encoded, weights, self.proposal_widths, round_.hidden, v_outputs)
-            found.append(v.get())
-        return upload("v_weights", sum(found))
+            network = round_.encoded, weights, self.proposal_widths, round_.hidden
+            v = stages.mlp_bwd(*network, v_outputs, 0, v)[1]
+        return v
 
     def _weights(self) -> dict[str, Any]:
         return {part: self.parameters[f"field.{part}"].values for part in self.network.widths}
@@ -153,8 +153,8 @@ class MipNerf360(NetworkField):
             Of the weights, from which edges are drawn.
         background : RGB
         """
-        stages, upload, count = self.stages, self.device.upload, places.shape[1]
-        edges, weights = upload("edges", np.tile([0.0, 1.0], (count, 1))), upload("weights", np.ones(count))
+        stages, constant, count = self.stages, self.device.constant, places.shape[1]
+        edges, weights = constant("edges", np.tile([0.0, 1.0], (count, 1))), constant("weights", np.ones(count))
         rounds: list[Proposed] = []
         scale, span = self.space.density_scale, self.space.span
         for place in places[:-1]:
@@ -170,7 +170,7 @@ class MipNerf360(NetworkField):
         views = stages.encode_points(rays.directions, VIEW_LEVELS)
         asked = self.network.ask(stages, self._weights(), encoded, views, scale)
         weights = stages.weights_fwd(asked.sigmas, deltas, self.samples)
-        first = upload("first samples", np.arange(count + 1) * self.samples, np.uint32)
+        first = constant("first samples", np.arange(count + 1) * self.samples, np.uint32)
         image = stages.rays_fwd(asked.sigmas, asked.colors, deltas, first, background)
         return Seen(rounds, edges, asked, deltas, first, weights, image)
 

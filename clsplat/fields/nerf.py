@@ -93,7 +93,7 @@ class Nerf(NetworkField):
     def _look(self, rays: Rays, draw: Any, background: Color) -> dict[str, Seen]:
         """Both passes along rays. `draw(*shape)` has places of samples in their intervals, in [0, 1)."""
         upload, stages, count = self.device.upload, self.stages, len(rays.radii)
-        edges = upload("edges", np.tile(np.linspace(0, 1, self.coarse + 1), (count, 1)))
+        edges = self.device.constant("edges", np.tile(np.linspace(0, 1, self.coarse + 1), (count, 1)))
         views = stages.encode_points(rays.directions, VIEW_LEVELS)
         along = rays.origins, rays.directions, views
         coarse = self._pass("coarse", along, edges, draw(count, self.coarse), background)
@@ -113,7 +113,7 @@ class Nerf(NetworkField):
         points, deltas = stages.intervals_along(origins, directions, edges, places, self.space.span)
         encoded = stages.encode_points(points, POINT_LEVELS)
         asked = self.network.ask(stages, self._weights(name), encoded, views, self.space.density_scale)
-        first = self.device.upload("first samples", np.arange(0, count * per + 1, per), np.uint32)
+        first = self.device.constant(f"first samples, {name}", np.arange(0, count * per + 1, per), np.uint32)
         image = stages.rays_fwd(asked.sigmas, asked.colors, deltas, first, background)
         return Seen(asked, deltas, first, image)
 

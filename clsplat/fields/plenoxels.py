@@ -39,7 +39,9 @@ BETA2, EPS = 0.95, 1e-8
 
 TV_DENSITY, TV_HARMONICS = 1e-5, 1e-3
 """Weights of the total variation of densities, in inverse halves of an edge, and of harmonics, for synthetic scenes
-(Fridovich-Keil et al. 2022, section 4 of the supplement)."""
+(Fridovich-Keil et al. 2022, section 4 of the supplement). The paper's code ends this penalty with the first
+refinement. With few photos' pixels for each cell, trainings then overfit: so it stays, as in that code's settings for
+captures of one's own."""
 
 TV_SHARE = 100
 """One of so many corners has the total variation in its gradient, others in each step (section 3.4)."""
@@ -47,12 +49,12 @@ TV_SHARE = 100
 TV_CELLS = 256
 """Cells along an edge for which differences are not scaled (equation 3)."""
 
-EVENTS = ((0.1, "prune"), (0.2, "refine"), (0.35, "prune"), (0.5, "refine"), (0.65, "prune"))
+EVENTS = ((0.1, "prune"), (0.2, "refine"), (0.35, "prune"), (0.5, "refine"), (0.7, "prune"))
 """Progress at which cells are pruned, or pruned and divided by two along each axis."""
 
-TV_EVENTS = 2
-"""Number of events after which there is no penalty of the total variation: it ends with the first refinement, as in
-the paper's code."""
+CELL_PIXELS = 1.5
+"""Smallest edge of a cell, in widths of a pixel at the distance of the middle of the scene. The paper's are 1.6 of
+them: 512 cells for photos of 800 x 800 pixels."""
 
 OCCUPIED_DEPTH = 0.02
 """Optical depth of a step at one of its corners from which a cell is kept when others are pruned. For 128 cells it is
@@ -110,7 +112,7 @@ class Plenoxels(Field):
         """See `Field`."""
         while self._events < len(EVENTS) and progress >= EVENTS[self._events][0]:
             self._prune()
-            if EVENTS[self._events][1] == "refine":
+            if EVENTS[self._events][1] == "refine" and self._resolved(batch):
                 self._refine()
             self._events += 1
         self.iteration += 1
@@ -135,16 +137,22 @@ class Plenoxels(Field):
     def _descend(self, samples: Samples, v_features: Any, progress: float) -> None:
         rows = self.table.shape[0]
         gradient = self.stages.voxels_bwd(samples.positions, self._index, rows, v_features)
-        if self._events < TV_EVENTS:
-            count = -(-rows // TV_SHARE)
-            scale = len(self.occupied) / TV_CELLS / count
-            weights = TV_DENSITY * scale * DENSITY_SCALE / 2, TV_HARMONICS * scale
-            variation = self._index, self._corners, self.table, gradient
-            self.stages.voxels_tv(*variation, weights, self.iteration * count % rows, count)
+        count = -(-rows // TV_SHARE)
+        scale = len(self.occupied) / TV_CELLS / count
+        weights = TV_DENSITY * scale * DENSITY_SCALE / 2, TV_HARMONICS * scale
+        variation = self._index, self._corners, self.table, gradient
+        self.stages.voxels_tv(*variation, weights, self.iteration * count % rows, count)
         rate = RATE * (RATE_FINAL / RATE) ** progress
         step = AdamStep(self.iteration, {}, 0.0, BETA2, EPS, 0)
         # With beta1 = 0 the mean of the gradients is the gradient, which is where it is already.
         self.stages.adam_array(self.table, gradient, gradient, self._squares, rate, step, sparse=True)
+
+    def _resolved(self, batch: Batch) -> bool:
+        """Whether the pixels of a batch are small enough for cells of half the edge."""
+        centre, edge = (0.0, 4.0) if self.space.contracted else (0.5, 1.0)
+        spacings = batch.radii * 12**0.5 / 2  # of pixels, at a distance of 1
+        widths = spacings * np.linalg.norm(batch.origins - centre, axis=1)
+        return bool(edge / (2 * len(self.occupied)) >= CELL_PIXELS * np.median(widths))
 
     def _prune(self) -> None:
         """Keep the cells with a dense corner, and those around them."""

@@ -136,7 +136,11 @@ def glb_anatomy(path: Path) -> Anatomy:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the file was read before
         primitives = [primitive for primitive, _ in document.primitives()]
-    for attributes in (primitive["attributes"] for primitive in primitives):
+    for primitive in primitives:
+        packed, attributes = gltf.spz_view(primitive), primitive["attributes"]
+        if packed is not None:
+            parts["all values, as .spz"] += len(document.view(packed))
+            continue
         for name in gltf.attribute_names(attributes):
             accessor = document.json["accessors"][attributes[name]]
             row = WIDTHS[accessor["type"]] * DTYPES[accessor["componentType"]].itemsize

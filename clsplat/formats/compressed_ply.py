@@ -34,7 +34,7 @@ from clsplat.formats.quantisation import (
     rounded,
     smallest_three,
 )
-from clsplat.formats.validity import check_finite, reading
+from clsplat.formats.validity import check_finite, read_rows, reading
 from clsplat.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -207,7 +207,7 @@ def _read_tables(path: str | Path, file: BinaryIO, header: PlyHeader) -> dict[st
     needed = header.length + sum(rows[name] * dtype.itemsize for name, dtype in dtypes.items())
     check_length(path, needed, n, header.file_size)
     file.seek(header.length)
-    return {name: np.fromfile(file, dtype, rows[name]) for name, dtype in dtypes.items()}
+    return {name: read_rows(path, file, dtype, rows[name]) for name, dtype in dtypes.items()}
 
 
 def _to_chunks(x: Array) -> tuple[Array, Array, Array]:

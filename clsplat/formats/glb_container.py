@@ -99,6 +99,16 @@ class GlbDocument:
                 yield nodes[index]["mesh"], matrix
             waiting += [(child, matrix) for child in reversed(nodes[index].get("children", []))]
 
+    def view(self, index: int) -> bytes:
+        """The bytes of a buffer view, which must be in the file itself."""
+        view = self.json["bufferViews"][index]
+        if view["buffer"] != 0 or "uri" in self.json["buffers"][0]:
+            raise InputError(f"{self.path}: expected all data in the file itself, found some in another one")
+        first, count = view.get("byteOffset", 0), view["byteLength"]
+        if not (first >= 0 and 0 <= count <= len(self.binary) - first):
+            raise InputError(f"{self.path}: expected {count} bytes of data, found {len(self.binary) - first}")
+        return self.binary[first : first + count]
+
     def rows(self, name: str, index: int, expected: int) -> Array:
         """Read the rows of an attribute, (N, expected) float32; normalised integers become fractions."""
         accessor = self.json["accessors"][index]

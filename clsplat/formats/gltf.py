@@ -15,6 +15,7 @@ rendering mode and the offset of a geo-referenced world: clsplat keeps them in t
 Source: the specification, https://github.com/KhronosGroup/glTF (extensions/2.0/Khronos/KHR_gaussian_splatting).
 """
 
+import io
 import json
 import warnings
 from collections.abc import Container, Iterator
@@ -32,14 +33,17 @@ from clsplat.errors import InputError
 from clsplat.formats.axes import LEFT_UP_FORWARD, rotated, turned
 from clsplat.formats.glb_container import ARRAY_BUFFER, CHUNK, DTYPES, HEADER, SIZE_MAX, WIDTHS, GlbDocument
 from clsplat.formats.quantisation import check_expansion, checked, logs_of
+from clsplat.formats.spz import decode
+from clsplat.formats.spz_container import unpack
 from clsplat.formats.validity import LOGIT_MAX, check_finite, checked_offset, reading
 from clsplat.gaussians import Gaussians, logit, sigmoid
 
 Array = NDArray[Any]
 
 EXTENSION = "KHR_gaussian_splatting"
-READABLE = {EXTENSION, "KHR_mesh_quantization"}
-"""Extensions that a file may require: the second one only allows integers as positions."""
+SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
+READABLE = {EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization"}
+"""Extensions that a file may require: the last one only allows integers as positions."""
 
 DISPLAY_SRGB = "srgb_rec709_display"
 """Colour space of scenes trained from photos; the other one of the specification is linear."""
@@ -104,9 +108,9 @@ def save_glb(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
         f"{EXTENSION}:ROTATION": np.roll(g.quats, -1, axis=1),
         f"{EXTENSION}:SCALE": scales,
         f"{EXTENSION}:OPACITY": opacities.astype(np.float32),
-        **{name: g.sh[:, k] for k, name in enumerate(_coefficients(g.sh_degree))},
+        **{name: g.sh[:, k] for k, name in enumerate(coefficients(g.sh_degree))},
     }
-    text = json.dumps(_describe(columns, mode, checked_offset(offset)), separators=(",", ":")).encode()
+    text = json.dumps(_describe(columns, own_extras(mode, offset)), separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     numbers = sum(column.nbytes for column in columns.values())
     total = HEADER.size + 2 * CHUNK.size + len(text) + numbers
@@ -119,7 +123,7 @@ def save_glb(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
             out.write(np.ascontiguousarray(column).tobytes())
 
 
-def _coefficients(degree: int) -> list[str]:
+def coefficients(degree: int) -> list[str]:
     """Names of the attributes of the spherical harmonics up to a degree, in our order."""
     return [f"{EXTENSION}:SH_DEGREE_{band}_COEF_{n}" for band in range(degree + 1) for n in range(2 * band + 1)]
 
@@ -129,10 +133,19 @@ def attribute_names(attributes: Container[str]) -> list[str]:
     bands = range(1, SH_DEGREE_MAX + 1)
     degree = max((band for band in bands if f"{EXTENSION}:SH_DEGREE_{band}_COEF_0" in attributes), default=0)
     shape = [f"{EXTENSION}:{name}" for name in ("SCALE", "ROTATION", "OPACITY")]
-    return ["POSITION", *shape, *_coefficients(degree)]
+    return ["POSITION", *shape, *coefficients(degree)]
 
 
-def _describe(columns: dict[str, Array], mode: Mode, offset: Array) -> dict[str, Any]:
+def own_extras(mode: Mode, offset: ArrayLike | None) -> dict[str, Any]:
+    """Make the part of the asset that holds a rendering mode and an offset; empty if both are the default."""
+    own: dict[str, Any] = {"mode": mode} if mode != "classic" else {}
+    shift = checked_offset(offset)
+    if shift.any():
+        own["offset"] = shift.tolist()
+    return {"extras": {"clsplat": own}} if own else {}
+
+
+def _describe(columns: dict[str, Array], own: dict[str, Any]) -> dict[str, Any]:
     """Make the JSON for arrays that follow each other in the chunk of numbers."""
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
@@ -146,16 +159,13 @@ def _describe(columns: dict[str, Array], mode: Mode, offset: Array) -> dict[str,
         at += column.nbytes
     means = columns["POSITION"]
     accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
-    own: dict[str, Any] = {"mode": mode} if mode != "classic" else {}
-    if offset.any():
-        own["offset"] = offset.tolist()
     primitive = {
         "attributes": {name: k for k, name in enumerate(columns)},
         "mode": 0,
         "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": DISPLAY_SRGB}},
     }
     return {
-        "asset": {"version": "2.0", "generator": "clsplat"} | ({"extras": {"clsplat": own}} if own else {}),
+        "asset": {"version": "2.0", "generator": "clsplat"} | own,
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -165,6 +175,12 @@ def _describe(columns: dict[str, Array], mode: Mode, offset: Array) -> dict[str,
         "bufferViews": views,
         "accessors": accessors,
     }
+
+
+def spz_view(primitive: dict[str, Any]) -> int | None:
+    """Index of the buffer view with the .spz of a primitive; None if it is not compressed."""
+    spz = primitive["extensions"][EXTENSION].get("extensions", {}).get(SPZ_EXTENSION)
+    return None if spz is None else spz["bufferView"]
 
 
 class SplatDocument(GlbDocument):
@@ -214,6 +230,11 @@ class SplatDocument(GlbDocument):
 
     def gaussians(self, primitive: dict[str, Any], matrix: Array) -> Gaussians:
         """Read a primitive and place it."""
+        packed = spz_view(primitive)
+        if packed is not None:
+            data = self.view(packed)
+            whole = decode(self.path, *unpack(self.path, io.BytesIO(data), len(data)))
+            return self.placed(checked(self.path, whole.astype(np.float32)), matrix)
         attributes = primitive["attributes"]
         names = attribute_names(attributes)
         missing = [name for name in names if name not in attributes]

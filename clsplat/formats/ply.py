@@ -73,8 +73,8 @@ def load_ply(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
     """
     with reading(path), open(path, "rb") as file:
         header = read_header(path, file)
-        wanted = _properties(path, header)
-        return _to_gaussians(path, read_vertices(path, file, header), wanted), *read_comments(header.comments)
+        wanted = properties(path, header)
+        return to_gaussians(path, read_vertices(path, file, header), wanted), *read_comments(header.comments)
 
 
 def save_ply(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", offset: ArrayLike | None = None) -> None:
@@ -132,7 +132,7 @@ def table_of(path: str | Path, gaussians: Gaussians) -> tuple[tuple[str, ...], A
     return names, table
 
 
-def _properties(path: str | Path, header: PlyHeader) -> list[str]:
+def properties(path: str | Path, header: PlyHeader) -> list[str]:
     """Return the properties to read, REQUIRED and the ``f_rest_*``.
 
     Raises
@@ -173,8 +173,24 @@ def _properties(path: str | Path, header: PlyHeader) -> list[str]:
     return wanted
 
 
-def _to_gaussians(path: str | Path, data: Array, names: list[str]) -> Gaussians:
-    """Convert a structured array (N,) to Gaussians, float32; `names` are REQUIRED and the ``f_rest_*``."""
+def to_gaussians(path: str | Path, data: Array, names: list[str], first: int = 0) -> Gaussians:
+    """Convert rows of a PLY to Gaussians, float32.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, for errors.
+    data : (N,) structured array
+    names : list of str
+        As `properties` returns them.
+    first : int
+        Number of the first row in the file.
+
+    Raises
+    ------
+    InputError
+        If a value is not finite.
+    """
     from numpy.lib.recfunctions import structured_to_unstructured
 
     with np.errstate(over="ignore"):  # values that overflow float32 are rejected below
@@ -183,7 +199,7 @@ def _to_gaussians(path: str | Path, data: Array, names: list[str]) -> Gaussians:
     np.copyto(opacity, np.copysign(np.float32(LOGIT_MAX), opacity), where=np.isinf(opacity))
     log_scales[np.isneginf(log_scales)] = LOG_SCALE_MIN
     if not np.isfinite(table).all():
-        raise not_finite(path, dict(zip(names, table.T, strict=True)))
+        raise not_finite(path, dict(zip(names, table.T, strict=True)), first)
     n = len(table)
     sh = np.concatenate([sh0[:, None], rest.reshape(n, 3, -1).transpose(0, 2, 1)], axis=1)
     gaussians = Gaussians(means, log_scales, normalised(quats), opacity[:, 0], sh)

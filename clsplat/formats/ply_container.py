@@ -5,6 +5,7 @@ read by NumPy, once the size of the file is known to suffice.
 """
 
 import io
+import os
 import re
 import warnings
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError
+from clsplat.formats.validity import read_rows
 
 if TYPE_CHECKING:
     from plyfile import PlyElement
@@ -107,16 +109,22 @@ def read_vertices(path: str | Path, file: BinaryIO, header: PlyHeader) -> Array:
     InputError
         If the file is shorter than declared, has list properties before the last vertex, or has malformed rows.
     """
-    _check_size(path, header)
+    check_size(path, header)
     file.seek(header.length)
     before, vertex = list(header.elements).index("vertex"), header.elements["vertex"]
     counts = list(header.rows.values())
     if header.order == "=":
         names = [prop.name for prop in vertex.properties]
         return _read_text(path, file, sum(counts[:before]), counts[before], names)
-    skipped = sum(n * e.dtype().itemsize for n, e in zip(counts[:before], header.elements.values(), strict=False))
-    data: Array = np.fromfile(file, vertex.dtype(header.order), counts[before], offset=skipped)
-    return data
+    file.seek(bytes_before(header), os.SEEK_CUR)
+    return read_rows(path, file, vertex.dtype(header.order), counts[before])
+
+
+def bytes_before(header: PlyHeader) -> int:
+    """Bytes between the header of a binary file and its first vertex."""
+    names = list(header.elements)
+    before = names[: names.index("vertex")]
+    return sum(header.rows[name] * header.elements[name].dtype().itemsize for name in before)
 
 
 def read_points(path: str | Path, file: BinaryIO) -> Array:
@@ -144,7 +152,7 @@ def read_points(path: str | Path, file: BinaryIO) -> Array:
     return typed
 
 
-def _check_size(path: str | Path, header: PlyHeader) -> None:
+def check_size(path: str | Path, header: PlyHeader) -> None:
     """Check that the file has the bytes that its header declares, up to the last vertex."""
     from plyfile import PlyListProperty
 

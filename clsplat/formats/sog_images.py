@@ -12,6 +12,9 @@ Array = NDArray[Any]
 METHOD = 4
 """Effort of the WebP encoder, 0 to 6. Measurement: docs/formats.md."""
 
+OUT_OF_MEMORY = "encoding error 1"
+"""Message of Pillow's ValueError where the WebP encoder finds no memory: VP8_ENC_ERROR_OUT_OF_MEMORY of libwebp."""
+
 
 class Images:
     """Images to write, (H, W, 4) by name, with a pixel per Gaussian in almost square images."""
@@ -37,5 +40,10 @@ def webp(pixels: Array) -> bytes:
 
     file = io.BytesIO()
     # Without exact, the encoder drops colours where alpha is 0; here alpha is data like the other channels.
-    Image.fromarray(pixels).save(file, format="WEBP", lossless=True, exact=True, method=METHOD)
+    try:
+        Image.fromarray(pixels).save(file, format="WEBP", lossless=True, exact=True, method=METHOD)
+    except ValueError as error:
+        if str(error) == OUT_OF_MEMORY:
+            raise MemoryError("an image cannot be compressed") from error
+        raise
     return file.getvalue()

@@ -16,7 +16,7 @@ from clsplat.config import Mode
 from clsplat.constants import SH_C0
 from clsplat.errors import InputError
 from clsplat.formats.quantisation import checked, file_size, logits_of, logs_of, opacity_bytes, rounded, warn_lost
-from clsplat.formats.validity import check_finite, normalised, reading
+from clsplat.formats.validity import check_finite, normalised, read_rows, reading
 from clsplat.gaussians import Gaussians
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgb", "u1", 3), ("opacity", "u1"), ("quats", "u1", 4)])
@@ -37,14 +37,14 @@ def load_splat(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
         If the file cannot be read, its size is not a multiple of a row, or it holds no Gaussian or values that are
         not finite.
     """
-    with reading(path):
+    with reading(path), open(path, "rb") as file:
         size = file_size(path)
         if size == 0 or size % ROW.itemsize:
             raise InputError(
                 f"{path}: expected a .splat file, a multiple of {ROW.itemsize} bytes, found {size}; "
                 "it is truncated or of another format"
             )
-        rows = np.fromfile(path, ROW)
+        rows = read_rows(path, file, ROW, size // ROW.itemsize)
     sh0 = (rows["rgb"] / np.float32(255) - np.float32(0.5)) / np.float32(SH_C0)
     gaussians = Gaussians(
         rows["means"],

@@ -18,7 +18,7 @@ Source: the description next to the implementation, https://github.com/nianticla
 import math
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,7 +102,7 @@ def load_spz(path: str | Path, axes: Axes | None = None) -> tuple[Gaussians, Mod
         that clsplat does not know, or declares more than a file of its size can hold.
     """
     header, planes = read_container(path)
-    gaussians = _decode(path, header, planes)
+    gaussians = decode(path, header, planes)
     signs = AXES[header.axes or 0] if axes is None else AXES[RDF] if axes == "rdf" else RIGHT_UP_BACK
     mode: Mode = "antialiased" if header.flags & ANTIALIASED else "classic"
     return turned(gaussians, signs).astype(np.float32), mode, np.zeros(3)
@@ -143,11 +143,19 @@ def save_spz(
         cannot be written.
     """
     g = turned(checked(path, gaussians), AXES[RDF] if axes == "rdf" else RIGHT_UP_BACK)
+    warn_lost(path, offset=offset)
+    with replacing(path) as out:
+        write_spz(path, out, g, mode, version=version, axes=axes)
+
+
+def write_spz(
+    path: str | Path, out: BinaryIO, g: Gaussians, mode: Mode, *, version: Version, axes: Axes = "rub"
+) -> None:
+    """Write checked Gaussians, in the axes of the file, to an open file; `path` is for errors and warnings."""
     g = g.take(morton_order(g.means))
     shared = shared_rows(g.sh[:, 1:].reshape(len(g), -1), len(g) // PALETTE_SHARE) if g.sh_degree else None
     if shared is not None:  # equal bands next to each other
         g = g.take(np.argsort(shared[1], kind="stable"))
-    warn_lost(path, offset=offset)
     n = len(g)
     bits = fractional_bits(path, g)
     fixed = np.rint(g.means.astype(np.float64) * 2.0**bits).astype("<i4")
@@ -161,8 +169,7 @@ def save_spz(
     ]
     flags = ANTIALIASED if mode == "antialiased" else 0
     header = Header(version, n, g.sh_degree, bits, flags, RDF if axes == "rdf" else None)
-    with replacing(path) as out:
-        write_container(out, header, [np.ascontiguousarray(plane).tobytes() for plane in planes])
+    write_container(out, header, [np.ascontiguousarray(plane).tobytes() for plane in planes])
 
 
 def fractional_bits(path: str | Path, gaussians: Gaussians) -> int:
@@ -210,7 +217,7 @@ def guessed_axes(gaussians: Gaussians) -> Axes | None:
     return None if abs(shift) < SHIFT_MIN * heights.std() else "rub" if shift < 0 else "rdf"
 
 
-def _decode(path: str | Path, header: Header, planes: list[bytes]) -> Gaussians:
+def decode(path: str | Path, header: Header, planes: list[bytes]) -> Gaussians:
     """Convert planes to Gaussians in the axes of the file."""
     n, degree = header.n, header.degree
     positions, opacities, colors, scales, quats, rest = (

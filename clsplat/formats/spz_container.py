@@ -92,15 +92,20 @@ def read_container(path: str | Path) -> tuple[Header, list[bytes]]:
         that clsplat does not know, or declares more than a file of its size can hold.
     """
     with reading(path), open(path, "rb") as file:
-        head = file.read(4)
-        file.seek(0)
-        try:
-            if head[:2] == b"\x1f\x8b":
-                return _read_gzip(path, file)
-            if head == struct.pack("<I", MAGIC):
-                return _read_zstd(path, file)
-        except (EOFError, zlib.error) as error:
-            raise InputError(f"cannot read {path}: {error}; is the file truncated?") from error
+        return unpack(path, file, file_size(path))
+
+
+def unpack(path: str | Path, file: BinaryIO, size: int) -> tuple[Header, list[bytes]]:
+    """Read the header and the planes of an .spz of `size` bytes from an open file, as `read_container` does."""
+    head = file.read(4)
+    file.seek(0)
+    try:
+        if head[:2] == b"\x1f\x8b":
+            return _read_gzip(path, file, size)
+        if head == struct.pack("<I", MAGIC):
+            return _read_zstd(path, file)
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise InputError(f"cannot read {path}: {error}; is the file truncated?") from error
     raise InputError(f"{path}: expected an .spz file, which begins as gzip or with NGSP, found {head!r}")
 
 
@@ -125,8 +130,7 @@ def write_container(out: BinaryIO, header: Header, planes: list[bytes]) -> None:
     out.write(b"".join([(head + start).ljust(HEADER_SIZE, b"\0"), record, *table, *streams]))
 
 
-def _read_gzip(path: str | Path, file: BinaryIO) -> tuple[Header, list[bytes]]:
-    size = file_size(path)
+def _read_gzip(path: str | Path, file: BinaryIO, size: int) -> tuple[Header, list[bytes]]:
     with gzip.GzipFile(fileobj=file) as packed:
         header, _ = _parse_header(path, packed.read(HEADER.size), (2, 3))
         sizes = plane_sizes(header.n, header.degree, header.version)

@@ -11,7 +11,7 @@ splat-transform, https://github.com/playcanvas/splat-transform.
 import json
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,6 +76,16 @@ def load_streamed_sog(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.flo
     return Gaussians.concatenate(parts), "antialiased" if "antialiased" in modes else "classic", offsets[0]
 
 
+class _Part(NamedTuple):
+    """A leaf in the file of a node: its number, its first Gaussian and their number, and the corners of their box."""
+
+    leaf: int
+    first: int
+    size: int
+    low: Any
+    high: Any
+
+
 class StreamedSogWriter:
     """A streamed SOG that is being written: a SOG scene for each node, and lod-meta.json as the last file.
 
@@ -92,34 +102,25 @@ class StreamedSogWriter:
 
     def __init__(self, folder: Path, mode: Mode = "classic", offset: ArrayLike | None = None):
         self._folder, self._mode, self._offset = folder, mode, offset
-        self._files: list[str] = []
-        self._counts: list[int] = []
-        self._lods: dict[int, dict[str, dict[str, int]]] = {}
-        self._corners: dict[int, tuple[Any, Any]] = {}
+        self._written: dict[tuple[int, int], list[_Part]] = {}
 
     def add(self, node: Node) -> None:
-        """Write a node; each comes before its parent.
+        """Write a node. Threads may add nodes at the same time, in any order.
 
         Raises
         ------
         InputError
             If a value is not finite as float32, or a file cannot be written.
         """
-        name = f"{node.height}_{node.number}"
-        self._counts += [0] * (node.height + 1 - len(self._counts))
-        self._counts[node.height] += len(node.gaussians)
-        ordered, at = [], 0
+        ordered, parts, at = [], [], 0
         for leaf, count in node.leaves:
             part = node.gaussians.take(np.arange(at, at + count))
             ordered.append(part.take(morton_order(part.means)))
-            span = {"file": len(self._files), "offset": at, "count": count}
-            self._lods.setdefault(leaf, {})[str(node.height)] = span
-            low, high = bounds(part)
-            finer = self._corners.get(leaf, (low, high))
-            self._corners[leaf] = np.minimum(low, finer[0]), np.maximum(high, finer[1])
+            parts.append(_Part(leaf, at, count, *bounds(part)))
             at += count
-        save_sog_folder(self._folder / name, Gaussians.concatenate(ordered), self._mode, self._offset)
-        self._files.append(f"{name}/{META}")
+        folder = self._folder / _name(node.height, node.number)
+        save_sog_folder(folder, Gaussians.concatenate(ordered), self._mode, self._offset)
+        self._written[node.height, node.number] = parts
 
     def finish(self) -> None:
         """Write lod-meta.json.
@@ -129,22 +130,45 @@ class StreamedSogWriter:
         InputError
             If it cannot be written.
         """
+        # Children come before their parent.
+        places = sorted(self._written, key=lambda place: ((place[1] + 1) << place[0], place[0]))
+        counts = [0] * (1 + max(height for height, _ in places))
+        lods: dict[int, dict[str, dict[str, int]]] = {}
+        corners: dict[int, list[tuple[Any, Any]]] = {}
+        for file, (height, number) in enumerate(places):
+            for part in self._written[height, number]:
+                counts[height] += part.size
+                lods.setdefault(part.leaf, {})[str(height)] = {
+                    "file": file,
+                    "offset": part.first,
+                    "count": part.size,
+                }
+                corners.setdefault(part.leaf, []).append((part.low, part.high))
         meta = {
             "version": 1,
             "asset": {"generator": "clsplat"},
-            "count": sum(self._counts),
-            "counts": self._counts,
-            "lodLevels": len(self._counts),
-            "filenames": self._files,
-            "tree": _branch(sorted(self._lods), self._lods, self._corners),
+            "count": sum(counts),
+            "counts": counts,
+            "lodLevels": len(counts),
+            "filenames": [f"{_name(*place)}/{META}" for place in places],
+            "tree": _branch(sorted(lods), lods, {leaf: _around(boxes) for leaf, boxes in corners.items()}),
         }
-        with replacing(self._folder / LOD_META) as file:
-            file.write(json.dumps(meta).encode())
+        with replacing(self._folder / LOD_META) as out:
+            out.write(json.dumps(meta).encode())
+
+
+def _name(height: int, number: int) -> str:
+    return f"{height}_{number}"
+
+
+def _around(boxes: list[tuple[Any, Any]]) -> tuple[Any, Any]:
+    """The corners around boxes, which are given by theirs."""
+    return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
 
 
 def _branch(leaves: list[int], lods: dict[int, Any], corners: dict[int, tuple[Any, Any]]) -> dict[str, Any]:
     """The tree over consecutive leaves, a power of two of them."""
-    low, high = (f([corners[leaf][k] for leaf in leaves], axis=0) for k, f in ((0, np.min), (1, np.max)))
+    low, high = _around([corners[leaf] for leaf in leaves])
     node: dict[str, Any] = {"bound": {"min": low.tolist(), "max": high.tolist()}}
     if len(leaves) == 1:
         return node | {"lods": lods[leaves[0]]}

@@ -1,4 +1,5 @@
 """3D Tiles 1.1 whose contents are .glb with KHR_gaussian_splatting: levels of detail for CesiumJS and other globes.
+The Gaussians of a tile are compressed as .spz, since CesiumJS draws no others.
 
 ``tileset.json`` has a tree of tiles. A tile is replaced by its children where its geometric error, projected to the
 screen, is too large. Tiles have the axes right, forward, up; the content's axes of glTF are turned to them by the
@@ -18,7 +19,8 @@ from clsplat.atomic import replacing
 from clsplat.config import Mode
 from clsplat.errors import InputError
 from clsplat.formats.detail_tree import Node, bounds
-from clsplat.formats.gltf import EXTENSION, load_glb, save_glb
+from clsplat.formats.gltf import EXTENSION, SPZ_EXTENSION, load_glb
+from clsplat.formats.gltf_spz import save_spz_glb
 from clsplat.formats.validity import reading
 from clsplat.gaussians import Gaussians
 
@@ -46,30 +48,33 @@ class TilesWriter:
 
     def __init__(self, folder: Path, mode: Mode = "classic", offset: ArrayLike | None = None):
         self._folder, self._mode, self._offset = folder, mode, offset
-        self._orphans: dict[tuple[int, int], dict[str, Any]] = {}  # tiles without a parent so far
+        self._written: dict[tuple[int, int], tuple[Any, Any, float]] = {}  # corners and geometric error
 
     def add(self, node: Node) -> None:
-        """Write a node; each comes before its parent.
+        """Write a node. Threads may add nodes at the same time, in any order.
 
         Raises
         ------
         InputError
             If a value is not finite as float32, or a file cannot be written.
         """
-        name = f"{node.height}_{node.number}.glb"
-        save_glb(self._folder / name, node.gaussians, self._mode, self._offset)
+        save_spz_glb(self._folder / _name(node.height, node.number), node.gaussians, self._mode, self._offset)
         largest = np.exp(node.gaussians.log_scales.max(axis=1).astype(np.float64))
-        low, high = bounds(node.gaussians)
-        children = [self._orphans.pop((node.height - 1, 2 * node.number + k)) for k in range(2 if node.height else 0)]
+        error = float(np.quantile(largest, COVERED)) if node.height else 0.0
+        self._written[node.height, node.number] = (*bounds(node.gaussians), error)
+
+    def _tile(self, height: int, number: int) -> dict[str, Any]:
+        """A tile and those below it, with the corners of its box."""
+        low, high, error = self._written[height, number]
+        children = [self._tile(height - 1, 2 * number + k) for k in range(2 if height else 0)]
         for child in children:  # a tile contains its children
             low, high = np.minimum(low, child["corners"][0]), np.maximum(high, child["corners"][1])
-        error = float(np.quantile(largest, COVERED)) if node.height else 0.0
-        self._orphans[node.height, node.number] = {
+        return {
             "corners": (low, high),
             "boundingVolume": {"box": _box(low, high)},
             "geometricError": max([error, *(child["geometricError"] for child in children)]),
             "refine": "REPLACE",
-            "content": {"uri": name},
+            "content": {"uri": _name(height, number)},
             **({"children": [_without_corners(child) for child in children]} if children else {}),
         }
 
@@ -81,17 +86,23 @@ class TilesWriter:
         InputError
             If it cannot be written.
         """
-        (root,) = self._orphans.values()
-        uses = {"extensionsUsed": [EXTENSION], "extensionsRequired": [EXTENSION]}
+        root = self._tile(*max(self._written))
+        names = [EXTENSION, SPZ_EXTENSION]  # CesiumJS takes a tile for a mesh unless both are required here
+        uses = {"extensionsUsed": names, "extensionsRequired": names}
         content = {
             "asset": {"version": "1.1", "generator": "clsplat"},
             "extensionsUsed": ["3DTILES_content_gltf"],
             "extensions": {"3DTILES_content_gltf": uses},
-            "geometricError": 2 * root["geometricError"],
+            # The error of drawing nothing: the size of the scene, which disappears where that is too small to matter.
+            "geometricError": max(root["geometricError"], float(np.linalg.norm(np.subtract(*root["corners"])))),
             "root": _without_corners(root),
         }
         with replacing(self._folder / TILESET) as file:
             file.write(json.dumps(content).encode())
+
+
+def _name(height: int, number: int) -> str:
+    return f"{height}_{number}.glb"
 
 
 def _without_corners(tile: dict[str, Any]) -> dict[str, Any]:

@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clsplat.constants import QUAT_NORM2_MIN
 from clsplat.errors import InputError
@@ -36,6 +36,23 @@ def reading(path: str | Path) -> Iterator[None]:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
 
+def read_rows(path: str | Path, file: BinaryIO, dtype: DTypeLike, count: int) -> Array:
+    """Read an array (count,) from where an open file is. `numpy.fromfile` takes a failing disk for the file's end.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    InputError
+        If it ends earlier; `path` names it.
+    """
+    rows = np.empty(count, dtype)
+    done = file.readinto(rows.view(np.uint8)) if rows.nbytes else 0  # type: ignore[attr-defined]
+    if done != rows.nbytes:
+        raise InputError(f"{path}: expected {rows.nbytes} more bytes, found {done}; the file is truncated")
+    return rows
+
+
 def check_storable(path: str | Path, gaussians: Gaussians) -> None:
     """Raise an InputError if there is no Gaussian to write to `path`, or the shapes of the arrays do not agree."""
     gaussians.validate()
@@ -51,8 +68,11 @@ def check_finite(path: str | Path, gaussians: Gaussians) -> Gaussians:
     return gaussians
 
 
-def not_finite(path: str | Path, columns: Mapping[str, Array]) -> InputError:
-    """Make the error for arrays (N, ...) with a value that is not finite; it names the first such array."""
+def not_finite(path: str | Path, columns: Mapping[str, Array], first: int = 0) -> InputError:
+    """Make the error for arrays (N, ...) with a value that is not finite; it names the first such array.
+
+    `first` is the number of their first row in the scene.
+    """
     finite: dict[str, Any] = {
         name: np.isfinite(array.reshape(len(array), -1)).all(axis=1) for name, array in columns.items()
     }
@@ -60,7 +80,7 @@ def not_finite(path: str | Path, columns: Mapping[str, Array]) -> InputError:
     row = int(np.argmin(finite[name]))
     affected = int((~np.logical_and.reduce(list(finite.values()))).sum())
     return InputError(
-        f"{path}: expected finite values, found {name} = {columns[name][row].tolist()} in Gaussian {row} "
+        f"{path}: expected finite values, found {name} = {columns[name][row].tolist()} in Gaussian {first + row} "
         f"({affected} of {len(finite[name])} Gaussians are affected)"
     )
 

@@ -50,7 +50,10 @@ def encode_join(device: Device, features: Array, rows: Array, rectify: bool) -> 
 
 
 def encode_join_bwd(device: Device, v_joined: Array, features: Array, rectify: bool) -> Array:
-    """Gradient of `encode_join` with respect to the features, (S, W), from v_joined (S, W + E)."""
+    """Gradient of `encode_join` with respect to the features, (S, W), from v_joined (S, W + E).
+
+    Columns of v_joined after the first W are not read, and may be missing.
+    """
     count, wide = features.shape
     v_features = device.empty("v_features", features.shape)
     arguments = [count, wide, v_joined.shape[1] - wide, int(rectify), features, v_joined, v_features]

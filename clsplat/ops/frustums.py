@@ -5,6 +5,9 @@ from pyopencl.array import Array
 from clsplat.device import Device
 from clsplat.field_stages import FRUSTUM_AXES, Span, frustum_width
 
+# Axes that a work-item takes at once on a CPU.
+LANES = 8
+
 
 def frustums_encode(
     device: Device, origins: Array, directions: Array, radii: Array, edges: Array, span: Span, levels: int
@@ -35,5 +38,6 @@ def frustums_encode(
     encoded, deltas = device.empty("encoded frustums", (samples, width)), device.empty("deltas", samples)
     scalars = [samples, count, len(FRUSTUM_AXES), levels, width, float(span.near), float(span.far)]
     arguments = [*scalars, origins, directions, radii, edges, axes, encoded, deltas]
-    device.launch("frustums", "frustums_encode", (samples,), arguments, defines={"CONTRACTED": int(span.contracted)})
+    defines = {"CONTRACTED": int(span.contracted), "LANES": LANES if device.is_cpu else 1}
+    device.launch("frustums", "frustums_encode", (samples,), arguments, defines=defines)
     return encoded, deltas

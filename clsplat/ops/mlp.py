@@ -68,7 +68,14 @@ def mlp_fwd(device: Device, inputs: Array, weights: Array, widths: tuple[int, ..
 
 
 def mlp_bwd(
-    device: Device, inputs: Array, weights: Array, widths: tuple[int, ...], hidden: Array, v_outputs: Array
+    device: Device,
+    inputs: Array,
+    weights: Array,
+    widths: tuple[int, ...],
+    hidden: Array,
+    v_outputs: Array,
+    columns: int,
+    v_weights: Array | None = None,
 ) -> tuple[Array, Array]:
     """Gradients of `mlp_fwd`. They repeat to the bit.
 
@@ -79,23 +86,30 @@ def mlp_bwd(
     hidden
         As returned by it.
     v_outputs : (S, widths[-1]) real
+    columns : int
+        Number of the first inputs whose gradient is computed: 0 to widths[0], a multiple of 16.
+    v_weights : (P,) real, optional
+        A gradient to which that of the weights is added, in place.
 
     Returns
     -------
-    v_inputs : (S, widths[0]) real
+    v_inputs : (S, columns) real
+        One number where there are no columns.
     v_weights : (P,) real
     """
-    rows, count = inputs.shape[0], weights.size
-    v_inputs, v_weights = device.empty("v_inputs", inputs.shape), device.empty("v_weights", count)
+    rows, count, added = inputs.shape[0], weights.size, int(v_weights is not None)
+    v_inputs = device.empty("v_inputs", (rows, columns) if columns else 1)
+    v_weights = device.empty("v_weights", count) if v_weights is None else v_weights
     if device.is_cpu:
         defines = _defines(device, widths)
         items = min(-(-rows // CHUNK), 2 * device.cl_device.max_compute_units)
         turned = device.empty("turned weights", count)
         work, parts = device.empty("work", items * 2 * CHUNK * max(widths)), device.empty("parts", items * count)
         device.launch("mlp_cpu", "mlp_turn", (1,), [weights, turned], defines=defines, group=(1,))
-        arguments = [rows, items, count, sum(widths[1:-1]), inputs, turned, hidden, v_outputs, work, v_inputs, parts]
+        scalars = [rows, items, count, sum(widths[1:-1]), columns]
+        arguments = [*scalars, inputs, turned, hidden, v_outputs, work, v_inputs, parts]
         device.launch("mlp_cpu", "mlp_bwd", (items,), arguments, defines=defines, group=(1,))
-        device.launch("mlp_cpu", "mlp_sum", (count,), [count, items, parts, v_weights], defines=defines)
+        device.launch("mlp_cpu", "mlp_sum", (count,), [count, items, added, parts, v_weights], defines=defines)
         return v_inputs, v_weights
     slab = -(-rows // (SLABS * TILE)) * TILE
     slabs = -(-rows // slab)
@@ -111,10 +125,12 @@ def mlp_bwd(
         group = TILE, TILE, 1
         device.launch("mlp_gpu", "mlp_columns", size, [*scalars, x, v, parts], group=group)
         y, y_first = (work, max(widths) * (layer % 2)) if layer else (v_inputs, 0)
-        scalars = [rows, after, width, 1, 0, int(layer > 0), v_first, place, y_first, x_first]
-        _product(device, rows, width, [*scalars, v, weights, x, y])
+        needed = width if layer else columns
+        if needed:
+            scalars = [rows, after, needed, 1, 0, int(layer > 0), v_first, place, y_first, x_first]
+            _product(device, rows, needed, [*scalars, v, weights, x, y])
         v, v_first = y, y_first
-    device.launch("mlp_gpu", "mlp_sum", (count,), [count, slabs, parts, v_weights])
+    device.launch("mlp_gpu", "mlp_sum", (count,), [count, slabs, added, parts, v_weights])
     return v_inputs, v_weights
 
 

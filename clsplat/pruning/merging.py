@@ -48,13 +48,17 @@ def covariances(gaussians: Gaussians) -> Array:
 
 
 def neighbours(gaussians: Gaussians) -> NDArray[np.intp]:
-    """Pairs (P, 2) of Gaussians, one of which is among the `NEIGHBOURS` nearest of the other; the smaller index is
-    first."""
+    """Pairs (P, 2) of Gaussians, one of which is among the `NEIGHBOURS` nearest of the other, in ascending order; the
+    smaller index is first."""
     from scipy.spatial import cKDTree
 
-    near = cKDTree(gaussians.means).query(gaussians.means, min(NEIGHBOURS + 1, len(gaussians)))[1]
-    pairs = np.stack([np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()], axis=1)
-    return np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
+    n = len(gaussians)
+    near = cKDTree(gaussians.means).query(gaussians.means, min(NEIGHBOURS + 1, n))[1]
+    first = np.repeat(np.arange(n), near.shape[1])
+    second = near.ravel()
+    # A pair as one number, and no np.unique: each takes several times as long on its way.
+    keys = np.sort((np.minimum(first, second) * n + np.maximum(first, second))[first != second])
+    return np.stack(np.divmod(keys[np.diff(keys, prepend=-1) > 0], n), axis=1)
 
 
 def masses(gaussians: Gaussians) -> Array:

@@ -14,7 +14,9 @@ Array = NDArray[Any]
 def distances(origins: Array, directions: Array, edges: Array, span: Span) -> Array:
     """Distances along rays at edges (R, N + 1) in [0, 1]."""
     if span.contracted:
-        return 1 / ((1 - edges) / span.near + edges / span.far)
+        begin, end = (t if t <= 1 else 2 - 1 / t for t in (span.near, span.far))
+        g = begin * (1 - edges) + end * edges
+        return np.where(g > 1, 1 / (2 - np.maximum(g, 1)), g)
     near, far = np.full(len(origins), span.near), np.full(len(origins), span.far)
     for o, d in zip(origins.T, directions.T, strict=True):
         moves = d != 0

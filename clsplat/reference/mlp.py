@@ -27,15 +27,23 @@ def mlp_fwd(inputs: Array, weights: Array, widths: tuple[int, ...]) -> tuple[Arr
 
 
 def mlp_bwd(
-    inputs: Array, weights: Array, widths: tuple[int, ...], hidden: Array, v_outputs: Array
+    inputs: Array,
+    weights: Array,
+    widths: tuple[int, ...],
+    hidden: Array,
+    v_outputs: Array,
+    columns: int,
+    v_weights: Array | None = None,
 ) -> tuple[Array, Array]:
     """Gradients of `mlp_fwd`. Arguments and results as for `clsplat.ops.mlp_bwd`."""
-    rows, v, v_weights = len(inputs), v_outputs, []
+    rows, v, found = len(inputs), v_outputs, []
     layers = [part.reshape(rows, -1) for part in np.split(hidden, rows * np.cumsum(widths[1:-1], dtype=int)[:-1])]
     before = [inputs, *(layers if len(widths) > 2 else [])]
     for index, matrix in reversed(list(enumerate(_matrices(weights, widths)))):
-        v_weights.append((before[index].T @ v).ravel())
+        found.append((before[index].T @ v).ravel())
         v = v @ matrix.T
         if index:
             v = np.where(before[index] > 0, v, 0)
-    return v, np.concatenate(v_weights[::-1])
+    v_weights = np.zeros(len(weights)) if v_weights is None else v_weights
+    v_weights += np.concatenate(found[::-1])
+    return v[:, :columns], v_weights

@@ -141,6 +141,14 @@ def test_the_front_in_words(records, cost, expected):
     assert all(f": {', '.join(expected)}; dominated: bad · 8 it." in sentence for sentence in sentences)
 
 
+def test_fields_are_not_compared_by_gaussians(records):
+    """A radiance field has a time, and no Gaussians: it is neither on the front of their number nor dominated."""
+    field = [r | {"num_gaussians": None} for scene in SCENES for r in training(scene, "plenoxels", None, 500, 20)]
+    found = runs(records + field)
+    assert "plenoxels" in verdict(found, "seconds", "psnr")[0]
+    assert not any("plenoxels" in sentence for sentence in verdict(found, "num_gaussians", "psnr"))
+
+
 def test_the_table_has_every_figure(records):
     rows = table(runs(records), "seconds")
     assert rows[0] == ["training time: PSNR, SSIM", "mean", "fox", "lego"]

@@ -205,3 +205,19 @@ def test_no_color(wanted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "write", lambda _, data: len(data))
     pty.spawn([sys.executable, "-m", "clsplat", "devices", "--help"], read)
     assert b"usage" in shown and (b"\x1b[" in shown) == wanted
+
+
+def test_too_little_memory_is_a_sentence(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The process then ends without the clean-up of its libraries, which may wait for locks that are still held."""
+    ends: list[object] = []
+
+    def run_out(*_: object, **__: object) -> None:
+        raise MemoryError("Unable to allocate 9 GiB")
+
+    monkeypatch.setattr("clsplat.cli.atexit.register", lambda *arguments: ends.append(arguments))
+    monkeypatch.setattr("clsplat.training.session.Training.run_until", run_out)
+    error = fails(capsys, "train", dataset, "-o", tmp_path / "out", *TRAIN)
+    assert "this machine has not enough memory (Unable to allocate 9 GiB); use smaller photos" in error
+    assert ends[-1] == (os._exit, 2)

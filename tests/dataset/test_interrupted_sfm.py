@@ -20,7 +20,7 @@ def stuck(*_):
     print("ready", flush=True)
     signal.pause()
 
-reconstruction._largest_model = stuck
+reconstruction._solved = stuck
 main(["sfm", sys.argv[1], "--camera-model", "PINHOLE"])
 """
 

@@ -10,7 +10,8 @@ from PIL import Image
 from test_reconstruction import take_photos
 
 from clsplat.dataset.sfm import matching as features
-from clsplat.dataset.sfm.matching import COUNT_ROWS, EXIT_WITH_PARENT, extract, match
+from clsplat.dataset.sfm.matching import COUNT_ROWS, extract, match
+from clsplat.dataset.sfm.processes import EXIT_WITH_PARENT
 from clsplat.errors import ClsplatError
 
 READER = """

@@ -1,15 +1,15 @@
-"""Photos of a ball whose colour depends on the place, exact to the pixel, with transparency."""
+"""Photos of a ball whose colour depends on the place, exact to the pixel, with transparency or in a round room."""
 
 import numpy as np
 
 from clsplat.camera import Camera
 from clsplat.scene import Scene, View
 
-RADIUS, DISTANCE, EDGE = 0.7, 4.0, 24
+RADIUS, DISTANCE, EDGE, WALL = 0.7, 4.0, 24, 12.0
 
 
-def photo(position, background=(1.0, 1.0, 1.0), name="photo", edge=EDGE):
-    """A view of the ball around the origin, on a background."""
+def photo(position, background=(1.0, 1.0, 1.0), name="photo", edge=EDGE, room=False):
+    """A view of the ball around the origin, on a background, or in front of the wall of a room that is a sphere."""
     camera = Camera.look_at(position, (0, 0, 0), (0, 0, 1), 2.2 * edge, edge, edge)
     v, u = np.divmod(np.arange(edge * edge), edge)
     directions = camera.rays(u + 0.5, v + 0.5) @ camera.viewmat[:3, :3]
@@ -17,10 +17,13 @@ def photo(position, background=(1.0, 1.0, 1.0), name="photo", edge=EDGE):
     square = along**2 - (camera.position @ camera.position - RADIUS**2)
     hit = square > 0
     points = camera.position + (along - np.sqrt(np.where(hit, square, 0)))[:, None] * directions
+    if room:
+        far = along + np.sqrt(along**2 - (camera.position @ camera.position - WALL**2))
+        background = 0.5 + 0.5 * np.cos(2 * (camera.position + far[:, None] * directions) / WALL)
     colors = np.where(hit[:, None], 0.5 + 0.5 * np.sin(1.5 * points / RADIUS), background)
     image = np.rint(255 * colors).astype(np.uint8).reshape(edge, edge, 3)
     clear = np.where(hit, 0, 255).astype(np.uint8).reshape(edge, edge)
-    return View(name, camera, image, clear=clear)
+    return View(name, camera, image, clear=None if room else clear)
 
 
 def ball(photos=45, held_out=3, **options):

@@ -51,6 +51,18 @@ def test_a_ball_is_learned(device, scene, method, tmp_path):
     assert losses[-1] < 0.1 * losses[0]
 
 
+@pytest.mark.parametrize("method", [SmallNerf, SmallMipNerf360], ids=lambda m: m.name)
+def test_a_room_is_learned(device, method, tmp_path):
+    """Contracted space: the ball in the middle and a wall three times as far as the cameras, in held-out photos.
+
+    Their mean colour alone has 11 dB.
+    """
+    room = ball(room=True)
+    field = train_field(room, method, CONFIG, tmp_path, device)
+    assert field.space.contracted
+    assert quality(field, room.test) > 17
+
+
 @EACH
 def test_runs_repeat_and_resume_to_the_bit(device, scene, method, tmp_path):
     config = replace(CONFIG, iterations=40)
@@ -100,6 +112,18 @@ def test_rays_without_samples_see_the_background(device, scene, monkeypatch):
     field._place(occupied, np.zeros((8, 28)))
     image = field.image(scene.test[0].camera, WHITE)
     np.testing.assert_array_equal(image, np.ones_like(image))
+
+
+def test_cells_are_refined_while_pixels_are_smaller(device, scene):
+    """A pixel of these photos is 1/40 of the cube wide in its middle: 16 cells are allowed, 32 are not."""
+    space = Space.of(scene.train)
+    field, batch = (
+        SmallPlenoxels(space, device, 0),
+        Pixels(scene.train, space, WHITE).draw(stream(0, "pixels of a batch"), 100),
+    )
+    assert field._resolved(batch)
+    field._place(np.ones((16, 16, 16), np.uint8), np.zeros((17**3, 28)))
+    assert not field._resolved(batch)
 
 
 def test_damaged_files_are_refused(device, tmp_path):

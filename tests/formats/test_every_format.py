@@ -264,3 +264,23 @@ def test_morton_order_keeps_neighbours_together():
     codes = [sum((p[axis] >> bit & 1) << (3 * bit + axis) for axis in range(3) for bit in range(3)) for p in ordered]
     assert codes == sorted(codes) and ordered[1].tolist() == [1, 0, 0] and ordered[4].tolist() == [0, 0, 1]
     assert sorted(quantisation.morton_order(np.zeros((5, 3)))) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "size"),
+    [
+        (".ply", "ply_container._check_size"),
+        (".compressed.ply", "compressed_ply.check_length"),
+        (".splat", "splat.file_size"),
+    ],
+)
+def test_a_file_that_gives_fewer_bytes_than_its_size_is_refused(tmp_path, monkeypatch, suffix, size):
+    """A failing disk ends a read early. `numpy.fromfile` then returns the rows until there, as if they were all."""
+    path = tmp_path / f"a{suffix}"
+    save(path, random_gaussians(100, 0))
+    whole = path.stat().st_size
+    with path.open("r+b") as file:
+        file.truncate(whole - 32)
+    monkeypatch.setattr(f"clsplat.formats.{size}", lambda *_: whole)
+    with pytest.raises(InputError, match=r"a\..*: expected \d+ more bytes, found \d+; the file is truncated"):
+        load_gaussians(path)

@@ -176,7 +176,7 @@ def setting(*path, value):
 
 
 BROKEN = {
-    "compressed": (setting("extensionsRequired", value=[f"{KHR}_compression_spz_2"]), "without further extensions"),
+    "compressed": (setting("extensionsRequired", value=[f"{KHR}_compression_other"]), "without further extensions"),
     "no splats": (setting("meshes", 0, "primitives", 0, "extensions", value={}), "is it a mesh"),
     "no scale": (setting("meshes", 0, "primitives", 0, "attributes", value={"POSITION": 0}), f"missing {KHR}:SCALE"),
     "mirror": (setting("nodes", 0, "scale", value=[1, 1, -1]), "rotate, shift and scale alike"),

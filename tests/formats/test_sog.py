@@ -213,3 +213,16 @@ def test_bombs_are_refused_before_they_unfold(tmp_path, monkeypatch):
     bundle(path, meta2(), PICTURES | {"zeros": bytes(1 << 22)})
     with pytest.raises(InputError, match="exhaust memory"):
         load_sog(path)
+
+
+@pytest.mark.parametrize(("number", "error"), [(1, MemoryError), (5, ValueError)])
+def test_an_encoder_without_memory_says_so(tmp_path, monkeypatch, number, error):
+    """Pillow gives the encoder's number alone; 5 is VP8_ENC_ERROR_BAD_DIMENSION."""
+
+    def fail(*_, **__):
+        raise ValueError(f"encoding error {number}")
+
+    monkeypatch.setattr(Image.Image, "save", fail)
+    with pytest.raises(error, match="cannot be compressed" if number == 1 else "encoding error 5"):
+        save_sog(tmp_path / "a.sog", random_gaussians(3, 0))
+    assert list(tmp_path.iterdir()) == []

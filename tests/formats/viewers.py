@@ -14,6 +14,7 @@ from foreign_code import FOREIGN, SCRIPTS
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.formats.tiles_3d import Z_UP
 
 
 class Viewer(NamedTuple):
@@ -27,6 +28,8 @@ class Viewer(NamedTuple):
     worlds: dict[str, NDArray[np.float64]]
 
 
+TILES = np.eye(4)
+TILES[:3, :3] = Z_UP
 SPZ, GLB = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
 
 VIEWERS = {
@@ -34,6 +37,7 @@ VIEWERS = {
     "mkkellogg": Viewer("GaussianSplats3D", "@mkkellogg/gaussian-splats-3d", {}),
     "babylon": Viewer("Babylon.js", "@babylonjs/core", {".glb": GLB}),
     "playcanvas": Viewer("PlayCanvas", "playcanvas", {}),
+    "cesium": Viewer("CesiumJS", "cesium", {".json": TILES}),
 }
 """Viewers by their names in foreign/picture.html."""
 
@@ -67,10 +71,16 @@ def served(folder: Path) -> Iterator[str]:
         server.server_close()
 
 
-def picture_address(address: str, viewer: str, name: str, camera: Camera) -> str:
-    """Address of the page in which a viewer shows a file of the folder from a camera."""
+def pose_of(viewer: str, name: str, camera: Camera) -> list[float]:
+    """The camera in the world in which a viewer shows a file: camera to world, axes right, up, back, row by row."""
     world = VIEWERS[viewer].worlds.get(Path(name).suffix, np.eye(4))
     pose = world @ np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return [float(x) for x in pose.ravel()]
+
+
+def picture_address(address: str, viewer: str, name: str, camera: Camera, allow: float | None = None) -> str:
+    """Address of the page in which a viewer shows a file of the folder from a camera; `allow` limits its detail."""
     fov = np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))
-    query = {"viewer": viewer, "file": f"/{name}", "fov": fov, "pose": ",".join(map(str, pose.ravel()))}
-    return f"{address}/picture.html?{urllib.parse.urlencode(query)}"
+    pose = ",".join(map(str, pose_of(viewer, name, camera)))
+    query: dict[str, object] = {"viewer": viewer, "file": f"/{name}", "fov": fov, "pose": pose}
+    return f"{address}/picture.html?{urllib.parse.urlencode(query | ({} if allow is None else {'allow': allow}))}"

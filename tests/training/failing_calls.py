@@ -117,7 +117,7 @@ class Calls:
     def __init__(self, point: Point | None = None, fault: Fault | None = None):
         self.points: list[Point] = []
         self.failed = False
-        self._point, self._fault = point, fault
+        self.point, self.fault = point, fault
         self._counts: Counter[tuple[str, str]] = Counter()
         self._lock = threading.Lock()
 
@@ -129,9 +129,9 @@ class Calls:
             point = Point(kind, about, self._counts[kind, about])
             self._counts[kind, about] += 1
             self.points.append(point)
-            fails = point == self._point or (self.failed and self._fault is not None and kind in self._fault.family)
+            fails = point == self.point or (self.failed and self.fault is not None and kind in self.fault.family)
             self.failed |= fails
-            return self._fault.error(path) if fails and self._fault else None
+            return self.fault.error(path) if fails and self.fault else None
 
     def check(self, kind: str, about: str, path: str = "") -> None:
         """Count a call, and raise the error that it ends with, if it fails."""

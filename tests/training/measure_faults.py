@@ -4,55 +4,36 @@
 and kind of call, and what went wrong.
 """
 
-import hashlib
 import io
 import json
 import os
 import re
 import shutil
-import signal
 import sys
 import tempfile
-import threading
 import time
-import traceback
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-import pytest
 import tyro
 from cli_runs import write_dataset
 from failing_calls import FAULTS, Calls, Point, is_json, watched
 from fault_commands import COMMANDS, PHOTOS, TRAIN, opens_device, stays
 from filelock import FileLock, Timeout
+from lone_commands import SOLVED, digest, outside, status_of
 from PIL import Image
 from textured_corner import CONFIG, take_photos
 
-from clsplat import cli
 from clsplat.atomic import PART
 from clsplat.commands.console import Out
-from clsplat.dataset.sfm import reconstruction
 from clsplat.dataset.sfm.reconstruction import reconstruct
 from clsplat.renderer import default_device
 from clsplat.run_log import LOG
-from clsplat.training import recorder
 from clsplat.training.checkpoint import CHECKPOINT
 from clsplat.training.run_folder import LOCK
-
-SOLVED = "solved"
-"""Folder of the model that structure from motion finds, each time without its seconds of computation."""
-
-HANG = 30.0
-"""Time after which a command counts as hanging, s; it takes less than one."""
-
-
-class Hung(BaseException):
-    """The command did not end."""
 
 
 class Ended(NamedTuple):
@@ -69,13 +50,16 @@ class Command:
     Parameters
     ----------
     name : str
-        One of `COMMANDS`.
+        One of `commands`.
     root : Path
         Folder, with the dataset and the scene that `prepared` makes.
     """
 
+    commands = COMMANDS
+    faults = FAULTS
+
     def __init__(self, name: str, root: Path):
-        self._arguments, self._root, self._out = COMMANDS[name], root, root / "out"
+        self._arguments, self._root, self._out = self.commands[name], root, root / "out"
         self._trains = self._arguments[0] == "train"
         self._resumed: set[frozenset[tuple[str, str]]] = set()
         self._versions: set[tuple[str, str]] = set()
@@ -87,11 +71,11 @@ class Command:
         self._log = (self._out / LOG).read_text().splitlines() if self._trains else []
 
     def cases(self, per_kind: int | None = None) -> list[tuple[Point, str]]:
-        """Calls and their errors: all of them, or at most so many of each kind, evenly spaced."""
+        """Calls and their errors: all of them, or at most so many of each group, evenly spaced."""
         groups: dict[tuple[str, str], list[Point]] = {}
         for point in self.points:
-            for fault in FAULTS[point.kind]:
-                groups.setdefault((point.kind, fault), []).append(point)
+            for fault in self.faults[point.kind]:
+                groups.setdefault((self.group(point), fault), []).append(point)
         return [
             (points[(2 * i + 1) * len(points) // (2 * count)], fault)
             for (_, fault), points in groups.items()
@@ -99,10 +83,14 @@ class Command:
             for i in range(count)
         ]
 
+    def group(self, point: Point) -> str:
+        """The group of a call for `cases`: its kind."""
+        return point.kind
+
     def problems(self, point: Point, fault: str) -> list[str] | None:
         """What is wrong after a call has failed, and after the run that follows; None if the call was not reached."""
         self._clear()
-        calls = Calls(point, FAULTS[point.kind][fault])
+        calls = Calls(point, self.faults[point.kind][fault])
         ended = self._run(calls, fresh=opens_device(point))
         if not calls.failed:
             return None
@@ -110,11 +98,19 @@ class Command:
         whole = ended.status == 0
         if whole and any(not stays(name, point) for name in self._differing()):
             found.append(f"ended well, with other files: {self._differing()}")
-        state = frozenset(self._files().items())
-        if not found and not whole and state not in self._resumed:
+        state = self._state()
+        if not found and not self._done(whole) and state not in self._resumed:
             found += self._wrong_again()
             self._resumed.add(state)
         return found
+
+    def _state(self) -> frozenset[tuple[str, str]]:
+        """What a run leaves that the next one may depend on."""
+        return frozenset(self._files().items())
+
+    def _done(self, whole: bool) -> bool:
+        """Whether no further run is needed to know that a run left nothing wrong; `whole` if it ended well."""
+        return whole
 
     def _wrong_again(self) -> list[str]:
         """What is wrong after the command ran again without a fault."""
@@ -139,15 +135,20 @@ class Command:
             default_device.cache_clear()
 
         def replaced(path: Path) -> None:
-            if not calls.failed and path.resolve().is_relative_to(self._out):
-                files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-                self._versions.update((self._name(file), digest(file)) for file in files)
+            if not calls.failed:
+                self._versions.update(self._versions_of(path))
 
         with outside(self._root) as stray, watched(self._root, calls, replaced):
             printed = io.StringIO()
             with redirect_stderr(printed), redirect_stdout(printed):
                 status = status_of([*self._arguments, *more])
         return Ended(status, printed.getvalue(), stray)
+
+    def _versions_of(self, path: Path) -> Iterator[tuple[str, str]]:
+        """Names and digests of the outputs in a file or folder that has just been put in its place."""
+        if path.resolve().is_relative_to(self._out):
+            files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+            yield from ((self._name(file), digest(file)) for file in files)
 
     def _name(self, path: Path) -> str:
         return str(path.resolve().relative_to(self._out.resolve()))
@@ -167,7 +168,7 @@ class Command:
             found.append(f"printed {ended.printed[-2000:]}")
         if ended.status == 0:
             return found
-        if point.kind in ("unlink", "rmdir"):
+        if point.kind in ("unlink", "rmdir") and ".db-" not in point.about:  # SQLite commits by removing its journal
             found.append(f"ended because a file could not be removed: {sentences}")
         if ended.status != 2 or len(sentences) != 1:
             found.append(f"status {ended.status}, {sentences}: {ended.printed[-2000:]}")
@@ -216,81 +217,12 @@ class Command:
         return found
 
 
-def status_of(arguments: list[str]) -> int:
-    """The status that the command line ends with; 1, with a traceback, for an exception that it does not catch."""
-    try:
-        cli.main(arguments)
-    except SystemExit as exit_:
-        return int(exit_.code or 0)
-    except (Exception, Hung):
-        traceback.print_exc()
-        return 1
-    return 0
-
-
-@contextmanager
-def outside(root: Path) -> Iterator[list[str]]:
-    """Run the block in a folder as a process of its own would, at a clock that stands still; yields stray exceptions.
-
-    Arguments are parsed once, and charts are blank: both take longer than all the rest.
-    """
-    stray: list[str] = []
-    parse = tyro.cli
-
-    def parse_once(*arguments: Any, args: list[str], **named: Any) -> Any:
-        typed = (named["prog"], *args)
-        if typed not in PARSED:
-            PARSED[typed] = parse(*arguments, args=args, **named)
-        return PARSED[typed]
-
-    def hang(*_: object) -> None:
-        raise Hung
-
-    def solved(*_: object) -> Any:
-        import pycolmap
-
-        return pycolmap.Reconstruction(root / SOLVED / "sparse" / "0")
-
-    def blank(self: Any, file: Any, **_: Any) -> None:
-        file.write(bytes(20000))
-
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        patch.chdir(root)
-        patch.setattr(tempfile, "tempdir", str(root / "tmp"))
-        patch.setattr(tyro, "cli", parse_once)
-        patch.setattr("matplotlib.figure.Figure.savefig", blank)
-        if (root / SOLVED).is_dir():  # pycolmap takes seconds, and threads of its own
-            patch.setattr(reconstruction, "_largest_model", solved)
-        patch.setattr(recorder, "time", SimpleNamespace(perf_counter=lambda: 0.0))
-        patch.setattr(threading, "excepthook", lambda about: stray.append(f"{about.exc_type}: {about.exc_value}"))
-        patch.setattr(sys, "unraisablehook", lambda about: stray.append(f"{about.exc_value!r} {about.object!r}"))
-        signal.signal(signal.SIGALRM, hang)
-        signal.setitimer(signal.ITIMER_REAL, HANG)
-        try:
-            yield stray
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-
-
-PARSED: dict[tuple[str, ...], Any] = {}
-"""Commands by their arguments."""
-
-
-def digest(path: Path) -> str:
-    """Digest of a file's bytes."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def prepared(root: Path) -> Path:
     """Write a dataset and a scene that is trained on it to a folder."""
     write_dataset(root / "data", PHOTOS)
     (root / "tmp").mkdir()
     with outside(root):
-        cli.main([*TRAIN[:3], "first", TRAIN[4], "10", *TRAIN[10:12]])
+        status_of([*TRAIN[:3], "first", TRAIN[4], "10", *TRAIN[10:12]])
     (root / "first" / "scene.ply").rename(root / "scene.ply")
     shutil.rmtree(root / "first")
     (root / "photos").mkdir()

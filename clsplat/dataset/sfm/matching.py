@@ -18,7 +18,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from clsplat.errors import ClsplatError
+from clsplat.dataset.sfm.processes import child, how_it_ended
+from clsplat.errors import ClsplatError, InputError
 
 SEED = 0
 """Seed of RANSAC and of COLMAP's mapper. With it, the same photos give the same bytes on one machine, provided that
@@ -30,13 +31,8 @@ WORKERS_MAX = 8
 PAIRS_MIN = 16
 """Smallest number of pairs of photos per process. Matching them takes about as long as starting a process."""
 
-EXIT_WITH_PARENT = """
-import os, signal, sys, threading
-signal.signal(signal.SIGINT, signal.SIG_IGN)
-threading.Thread(target=lambda: (sys.stdin.read(), os._exit(1)), daemon=True).start()
-"""
-"""First lines of the programs below. The program exits when the process that started it ends for any reason, and
-leaves Ctrl+C to that process."""
+TRACED = (signal.SIGTERM, signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV)
+"""Signals after which COLMAP prints a stack trace."""
 
 COUNT_ROWS = """
 import sqlite3, time
@@ -62,19 +58,23 @@ MATCH_SHARE = """
 import json
 sys.path[:] = json.loads(sys.argv[1])
 from clsplat.dataset.sfm.matching import match_share
-match_share(sys.argv[2], sys.argv[3], sys.argv[4] == "verbose")
+try:
+    match_share(sys.argv[2], sys.argv[3], sys.argv[4] == "verbose")
+except Exception as error:  # without a traceback: COLMAP's errors are of many kinds
+    sys.exit(f"COLMAP: {error!r}")
 """
 """Program that runs `match_share` with the module search path of the process that started it."""
 
 
 @contextmanager
 def quiet(verbose: bool) -> Iterator[None]:
-    """Suppress COLMAP's messages, unless `verbose`, and the stack trace that it prints when it is terminated."""
+    """Suppress COLMAP's messages, unless `verbose`, and the stack trace that it prints when a signal ends it."""
     from pycolmap import logging
 
     if threading.current_thread() is threading.main_thread():
-        # On import pycolmap has replaced the handler without Python's knowledge.
-        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
+        # On import pycolmap has replaced these handlers without Python's knowledge.
+        for number in TRACED:
+            signal.signal(number, signal.getsignal(number))
     before = logging.minloglevel
     logging.minloglevel = before if verbose else int(logging.ERROR)
     try:
@@ -106,6 +106,11 @@ def extract(database: Path, photos: Path, names: list[str], edge_max: int, masks
         Longer edge, in pixels, to which larger photos are reduced.
     masks : Path, optional
         Folder with a mask ``NAME.png`` for each photo. No features are detected where it is black.
+
+    Raises
+    ------
+    InputError
+        If COLMAP cannot read a photo.
     """
     import pycolmap
 
@@ -121,6 +126,18 @@ def extract(database: Path, photos: Path, names: list[str], edge_max: int, masks
             reader_options=reader,
             extraction_options=pycolmap.FeatureExtractionOptions(max_image_size=edge_max, use_gpu=False),
             device=pycolmap.Device.cpu,
+        )
+    with pycolmap.Database.open(database) as opened:
+        read = [image.name for image in opened.read_all_images() if opened.exists_keypoints(image.image_id)]
+    demand(photos, names, read)
+
+
+def demand(photos: Path, names: list[str], read: list[str]) -> None:
+    """Raise an InputError if COLMAP has left out a photo: it continues without those that it cannot read."""
+    if missing := sorted(set(names) - set(read)):
+        raise InputError(
+            f"cannot read {photos / missing[0]}: COLMAP could not read {len(missing)} of {len(names)} photos, which "
+            "could be read shortly before; check the disk, and try again"
         )
 
 
@@ -162,16 +179,13 @@ def match(database: Path, pairs: list[tuple[int, int]], verbose: bool = False) -
             loudness = "verbose" if verbose else "quiet"
             workers = [
                 running.enter_context(
-                    _child(MATCH_SHARE, json.dumps(sys.path), str(copy), str(copy.with_suffix(".txt")), loudness)
+                    child(MATCH_SHARE, json.dumps(sys.path), str(copy), str(copy.with_suffix(".txt")), loudness)
                 )
                 for copy in copies
             ]
             for worker in workers:
                 if worker.wait() != 0:
-                    raise ClsplatError(
-                        f"cannot match photos: the process of COLMAP ended with status {worker.returncode}; its "
-                        "output is above, and -9 means that there was not enough memory"
-                    )
+                    raise ClsplatError(f"cannot match photos: {how_it_ended(worker.returncode)}")
         with pycolmap.Database.open(database) as found:
             for copy in copies:
                 with pycolmap.Database.open(copy) as part:
@@ -213,19 +227,6 @@ def match_share(database: str, listed: str, verbose: bool) -> None:
 
 
 @contextmanager
-def _child(
-    program: str, *arguments: str, stdout: int | None = None, stderr: int | None = None
-) -> Iterator[subprocess.Popen[str]]:
-    """Run one of the programs above in a process that does not outlive the context."""
-    command = [sys.executable, "-I", "-c", EXIT_WITH_PARENT + program, *arguments]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, text=True) as child:
-        try:
-            yield child
-        finally:
-            child.kill()
-
-
-@contextmanager
 def _progress(databases: list[Path], table: str, total: int, label: str, unit: str) -> Iterator[None]:
     """Show a progress bar with the number of rows in a table of COLMAP databases; COLMAP reports no progress."""
     from tqdm import tqdm
@@ -233,7 +234,7 @@ def _progress(databases: list[Path], table: str, total: int, label: str, unit: s
     uris = [f"{database.resolve().as_uri()}?mode=ro" for database in databases]
     with (
         tqdm(total=total, desc=label, unit=unit, dynamic_ncols=True) as bar,
-        _child(COUNT_ROWS, table, *uris, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as counter,
+        child(COUNT_ROWS, table, *uris, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as counter,
     ):
 
         def follow() -> None:

@@ -16,8 +16,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np
-
 from clsplat.atomic import replacing
 from clsplat.config import SfmConfig
 
@@ -28,13 +26,11 @@ from clsplat.dataset.photos import (
     is_plain,
     list_photos,
     photo_folder,
-    photo_size,
     read_photo,
     write_upright_png,
 )
-from clsplat.dataset.sfm.mapping import map_globally, map_incrementally
-from clsplat.dataset.sfm.matching import extract, is_sliver, match, quiet
-from clsplat.dataset.sfm.pairs import pairs_to_match
+from clsplat.dataset.sfm.matching import is_sliver, quiet
+from clsplat.dataset.sfm.processes import apart
 from clsplat.errors import InputError, unwritable
 from clsplat.ranges import check
 
@@ -154,12 +150,8 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
 
     with _workspace(output) as work, quiet(verbose):
         readable = _readable(folder, names, work, config.max_image_size)
-        found = _largest_model(readable, names, work, _matched(config, folder), verbose)
-        registered = 0 if found is None else int(found.num_reg_images())
+        registered = _solved(work, readable, names, _matched(config, folder), verbose)
         _check_registered(registered, len(names), photos, config)
-        _turn_upright(found)
-        (work / "sparse" / "0").mkdir(parents=True)
-        found.write_binary(work / "sparse" / "0")
         where = "." if output.resolve() == photos.resolve() else str(photos.resolve())
         record = {"photos": where, "registered": registered, "options": asdict(config), "hashes": hashes}
         with replacing(work / "sparse" / RECORD) as file:
@@ -281,39 +273,15 @@ def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path
     return work / "photos"
 
 
-def _largest_model(folder: Path, names: list[str], work: Path, config: SfmConfig, verbose: bool) -> Any:
-    """Detect features, match them and run the mapper; None if no pair of photos can start a model."""
-    import pycolmap
-
-    database = work / "database.db"
-    pycolmap.Database.open(database).close()
-
-    by_size: dict[tuple[int, int], list[str]] = {}
-    for name in names:
-        by_size.setdefault(photo_size(folder / name), []).append(name)
-    reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
-    mode = pycolmap.CameraMode.SINGLE if config.single_camera else pycolmap.CameraMode.PER_IMAGE
-    for group in by_size.values():  # COLMAP's single camera has one size, and it skips photos of another
-        pycolmap.import_images(database, folder, image_names=group, camera_mode=mode, options=reader)
-    extract(database, folder, names, config.max_image_size)
-    with pycolmap.Database.open(database) as opened:
-        pairs = pairs_to_match(opened, folder, config)
-    match(database, pairs, verbose)
-    (work / "models").mkdir()
-    mapped = map_globally if config.mapper == "global" else map_incrementally
-    models = mapped(database, folder, work / "models", len(names), config.min_registered)
-    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
-
-
-def _turn_upright(model: Any) -> None:
-    """Rotate the world of a model so that its y axis is the mean downward direction of the photos.
-
-    Viewers take -y as up. COLMAP's world has the axes of the first photo, which may be tilted.
-    """
-    import pycolmap
-    from scipy.spatial.transform import Rotation
-
-    down = np.mean([image.cam_from_world().rotation.matrix()[1] for image in model.images.values()], axis=0)
-    if np.linalg.norm(down) > 0.1:  # otherwise upright and upside-down photos cancel: no common direction
-        rotation, _ = Rotation.align_vectors([[0.0, 1.0, 0.0]], [down / np.linalg.norm(down)])
-        model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation.as_matrix()), np.zeros(3)))
+def _solved(work: Path, folder: Path, names: list[str], config: SfmConfig, verbose: bool) -> int:
+    """Run `solve` in a process of its own."""
+    registered: int = apart(
+        "recover the cameras",
+        "clsplat.dataset.sfm.solving:solve",
+        work,
+        folder=str(folder),
+        names=names,
+        options=asdict(config),
+        verbose=verbose,
+    )
+    return registered

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from clsplat.camera import Camera
-from clsplat.dataset.sfm.matching import SEED, extract, is_sliver, match, quiet
+from clsplat.dataset.sfm.matching import SEED, demand, extract, is_sliver, match, quiet
+from clsplat.dataset.sfm.processes import apart
 from clsplat.errors import InputError, unwritable
 from clsplat.randomness import stream
 from clsplat.scene import View
@@ -40,6 +41,12 @@ POINTS_TARGET = 20_000
 FILL_NEIGHBOURS = 8
 """Number of nearest points of a point, towards which points are added."""
 
+POINTS = "points.npz"
+"""File in the working folder with the points that were found."""
+
+Photo = tuple[str, str, list[float], list[list[float]]]
+"""Name of a photo, its camera model and parameters as COLMAP has them, and its viewmat."""
+
 
 def pairs(cameras: list[Camera]) -> list[tuple[int, int]]:
     """Choose the pairs of photos to match: each with the nearest ones of similar viewing direction and other
@@ -60,8 +67,8 @@ def pairs(cameras: list[Camera]) -> list[tuple[int, int]]:
     for i, (position, axis) in enumerate(zip(positions, axes, strict=True)):
         distances = np.linalg.norm(positions - position, axis=1)
         # The faces of a panorama have one position, apart from rounding: they cannot triangulate anything.
-        apart = distances > 1e-9 * np.abs(positions).max()
-        distances = np.where(apart & (axes @ axis > np.cos(ANGLE_MAX)), distances, np.inf)
+        elsewhere = distances > 1e-9 * np.abs(positions).max()
+        distances = np.where(elsewhere & (axes @ axis > np.cos(ANGLE_MAX)), distances, np.inf)
         nearest = np.argsort(distances, kind="stable")[:NEIGHBOURS]
         found |= {(min(i, j), max(i, j)) for j in nearest.tolist() if np.isfinite(distances[j])}
     return sorted(found)
@@ -90,18 +97,47 @@ def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[n
     InputError
         If a camera is neither a pinhole nor a fisheye, or temporary files cannot be written.
     """
-    import pycolmap
-
-    with TemporaryDirectory(prefix="clsplat_triangulate_", ignore_cleanup_errors=True) as folder, quiet(verbose):
+    with TemporaryDirectory(prefix="clsplat_triangulate_", ignore_cleanup_errors=True) as folder:
         work = Path(folder)
         if problem := unwritable(work):
             raise InputError(f"cannot triangulate points: {work.parent} takes no files: {problem}")
-        database = work / "database.db"
-        cameras = _database(views, database, work)
+        cameras = _write_photos(views, work)
         chosen = pairs(list(cameras.values()))
         if not chosen:
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-        names = list(cameras)
+        photos = [(name, *_lens(camera), camera.viewmat.tolist()) for name, camera in cameras.items()]
+        apart("triangulate points", f"{__name__}:solve", work, photos=photos, chosen=chosen, verbose=verbose)
+        with np.load(work / POINTS) as found:
+            return found["points"], found["colors"]
+
+
+def solve(work: Path, photos: list[Photo], chosen: list[tuple[int, int]], verbose: bool) -> None:
+    """Triangulate points from the photos in a folder, and write them to `POINTS` in it.
+
+    Parameters
+    ----------
+    work : Path
+        The folder.
+    photos : list
+        Name, camera model of COLMAP, its parameters and viewmat of each photo.
+    chosen : list of (int, int)
+        Pairs to match, by their indices in `photos`.
+    verbose : bool
+        Whether to show COLMAP's own messages.
+    """
+    import pycolmap
+
+    database = work / "database.db"
+    viewmats = {name: np.array(viewmat) for name, _, _, viewmat in photos}
+    names = list(viewmats)
+    with quiet(verbose):
+        pycolmap.Database.open(database).close()
+        for name, lens, params, _ in photos:
+            reader = pycolmap.ImageReaderOptions(camera_model=lens, camera_params=",".join(map(repr, params)))
+            mode = pycolmap.CameraMode.PER_IMAGE
+            pycolmap.import_images(database, work, image_names=[name], camera_mode=mode, options=reader)
+        with pycolmap.Database.open(database) as opened:
+            demand(work, names, [row.name for row in opened.read_all_images()])
         extract(database, work, names, EDGE_MAX, work / "masks")
         with pycolmap.Database.open(database) as opened:
             numbers = {row.name: row.image_id for row in opened.read_all_images()}
@@ -112,15 +148,16 @@ def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[n
                 model.add_camera_with_trivial_rig(camera)
             for row in opened.read_all_images():
                 image = pycolmap.Image(name=row.name, camera_id=row.camera_id, image_id=row.image_id)
-                model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(cameras[row.name].viewmat[:3]))
+                model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmats[row.name][:3]))
         options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, num_threads=1)
         (work / "model").mkdir()
         model = pycolmap.triangulate_points(model, database, work, work / "model", options=options)
     points = [point for _, point in sorted(model.points3D.items())]
     kept = points if len(points) >= TRIANGULATED_MIN else []
-    return (
-        np.array([point.xyz for point in kept]).reshape(-1, 3),
-        np.array([point.color for point in kept], np.uint8).reshape(-1, 3),
+    np.savez(
+        work / POINTS,
+        points=np.array([point.xyz for point in kept]).reshape(-1, 3),
+        colors=np.array([point.color for point in kept], np.uint8).reshape(-1, 3),
     )
 
 
@@ -154,17 +191,22 @@ def filled(points: NDArray[np.float64], colors: NDArray[np.uint8]) -> tuple[NDAr
     return np.concatenate([points, between]), np.concatenate([colors, blended])
 
 
-def _database(views: Iterable[View], database: Path, work: Path) -> dict[str, Camera]:
-    """Write photos and masks as files for COLMAP and add their cameras to its database.
+def _lens(camera: Camera) -> tuple[str, list[float]]:
+    """Camera model of COLMAP and its parameters."""
+    fisheye = camera.model == "fisheye"
+    more = camera.distortion if fisheye else ()
+    params = [float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy, *more)]
+    return "OPENCV_FISHEYE" if fisheye else "PINHOLE", params
+
+
+def _write_photos(views: Iterable[View], work: Path) -> dict[str, Camera]:
+    """Write photos and masks as files for COLMAP.
 
     Returns
     -------
     dict of Camera
         Cameras by the name of the file.
     """
-    import pycolmap
-
-    pycolmap.Database.open(database).close()
     cameras: dict[str, Camera] = {}
     (work / "masks").mkdir()
     for number, view in enumerate(views):
@@ -182,10 +224,5 @@ def _database(views: Iterable[View], database: Path, work: Path) -> dict[str, Ca
             raise InputError(
                 f"cannot triangulate points: cannot write to {work.parent}: {error.strerror or error}"
             ) from error
-        lens = ("OPENCV_FISHEYE", camera.distortion) if camera.model == "fisheye" else ("PINHOLE", ())
-        params = (camera.fx, camera.fy, camera.cx, camera.cy, *lens[1])
-        reader = pycolmap.ImageReaderOptions(camera_model=lens[0], camera_params=",".join(map(repr, params)))
-        mode = pycolmap.CameraMode.PER_IMAGE
-        pycolmap.import_images(database, work, image_names=[name], camera_mode=mode, options=reader)
         cameras[name] = camera
     return cameras
