@@ -9,7 +9,7 @@ doubling of the bytes. After that all photos train.
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from math import ceil, log2, pi, sqrt
+from math import ceil, log2, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,9 +40,6 @@ pruning must be below its price."""
 
 NORMAL_DEVIATIONS = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
-
-NORMAL_MEDIAN = sqrt(pi / 2)
-"""Standard error of the median of many normal values over that of their mean."""
 
 PATIENCE = 2.0
 """Factor by which the number of Gaussians grows without paying before growth ends."""
@@ -126,10 +123,14 @@ class Trial(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """`SURE` standard errors of the gain, dB, for gains whose spread is estimated by their median deviation."""
+        """`SURE` standard errors of the gain, dB.
+
+        The spread of the gains is the smaller one of their standard deviation and of what their median deviation tells,
+        which single photos do not raise. The median of two is their mean, and has its error.
+        """
         gains = self.gains
-        spread = NORMAL_DEVIATIONS * float(np.median(np.abs(gains - self.gain)))
-        return SURE * NORMAL_MEDIAN * spread / sqrt(len(gains))
+        deviation = NORMAL_DEVIATIONS * float(np.median(np.abs(gains - self.gain)))
+        return SURE * min(float(gains.std(ddof=1)), deviation) / sqrt(len(gains))
 
     @property
     def price(self) -> float:
