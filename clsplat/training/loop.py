@@ -156,7 +156,6 @@ def finish(training: Training, out: Path) -> Gaussians:
         write_photos(out / "photos.json", state, scene)
     gaussians = fetch(state.shown(training.renderer))
     state.move(None)  # what follows needs the device's memory
-    gaussians = training.with_room(gaussians)
     if state.search:
         held = [view.name for view in split(scene.train)[1]]
         write_report(out / "size.json", state.search, training.config, held)

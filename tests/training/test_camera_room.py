@@ -1,7 +1,6 @@
 """No Gaussian surrounds a viewpoint."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from clsplat.device import Device
 from clsplat.gaussians import Gaussians, logit
 from clsplat.scene import Scene
 from clsplat.training.camera_room import LEAST, room_factors, steepest_slope, viewpoints
-from clsplat.training.loop import train
 from clsplat.training.session import Training
 from clsplat.training.state import initial_state
 
@@ -75,8 +73,8 @@ def test_viewpoints_are_between_neighbours_in_free_space() -> None:
 
 
 @pytest.mark.parametrize("strategy", ["error", "adc"])
-def test_training_leaves_room(strategy: str, scene: Scene, device: Device, tmp_path: Path) -> None:
-    """In each round, after the last one, and at the end; the paper's strategy does not."""
+def test_training_leaves_room(strategy: str, scene: Scene, device: Device) -> None:
+    """In each round and after the last one; the paper's strategy does not."""
     config = with_strategy(strategy)
     training = Training(with_near_planes(scene), config, device, initial_state(scene, config))
     cameras = [view.camera for view in training.scene.train]
@@ -93,7 +91,3 @@ def test_training_leaves_room(strategy: str, scene: Scene, device: Device, tmp_p
         training.densify(61)
         training.state.move(None)
         assert left(training.state.gaussians) == (strategy == "error")
-    # A point beside a camera, far from all others, is a large Gaussian around it.
-    points = np.concatenate([scene.points, [scene.train[0].camera.position + 0.1]])
-    wide = replace(scene, points=points, colors=np.full(points.shape, 128, np.uint8))
-    assert left(train(wide, replace(config, iterations=1), tmp_path, device)) == (strategy == "error")

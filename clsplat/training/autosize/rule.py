@@ -125,8 +125,8 @@ class Trial(NamedTuple):
     def margin(self) -> float:
         """`SURE` standard errors of the gain, dB.
 
-        The spread of the gains is the smaller one of their standard deviation and of what their median deviation tells,
-        which single photos do not raise. The median of two is their mean, and has its error.
+        The spread of the gains is the smaller one of their standard deviation and of what their median deviation
+        tells, which single photos do not raise. The median of two is their mean, and has its error.
         """
         gains = self.gains
         deviation = NORMAL_DEVIATIONS * float(np.median(np.abs(gains - self.gain)))

@@ -57,6 +57,7 @@ class ErrorGuided(Strategy):
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         super().__init__(config, extent, n)
         self.config, self.schedule = config.error, Schedule(config, config.error)
+        self.last = config.iterations - config.error.every
         self.statistics = {"differences": np.zeros(n, np.float32)}
 
     def penalties(self, n: int) -> tuple[float, float]:
@@ -65,8 +66,9 @@ class ErrorGuided(Strategy):
 
     def due(self, iteration: int) -> bool:
         """See `clsplat.training.densify.Strategy`."""
-        # After the last round, too: Gaussians that reach a viewpoint are shrunk until the end.
-        return iteration >= self.schedule.start and iteration % self.schedule.every == 0
+        # After the last round, too, Gaussians that reach a viewpoint are shrunk. The last time leaves an interval to
+        # train what has become smaller.
+        return self.schedule.start <= iteration <= self.last and iteration % self.schedule.every == 0
 
     def edit(self, iteration: int, gaussians: Gaussians, cap: int, survey: Survey) -> Edit:
         """See `clsplat.training.densify.Strategy`."""
