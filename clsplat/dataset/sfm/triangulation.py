@@ -44,8 +44,8 @@ FILL_NEIGHBOURS = 8
 POINTS = "points.npz"
 """File in the working folder with the points that were found."""
 
+# Name of a photo, its camera model and parameters as COLMAP has them, and its viewmat.
 Photo = tuple[str, str, list[float], list[list[float]]]
-"""Name of a photo, its camera model and parameters as COLMAP has them, and its viewmat."""
 
 
 def pairs(cameras: list[Camera]) -> list[tuple[int, int]]:
