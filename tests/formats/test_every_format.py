@@ -269,7 +269,7 @@ def test_morton_order_keeps_neighbours_together():
 @pytest.mark.parametrize(
     ("suffix", "size"),
     [
-        (".ply", "ply_container._check_size"),
+        (".ply", "ply_container.check_size"),
         (".compressed.ply", "compressed_ply.check_length"),
         (".splat", "splat.file_size"),
     ],
