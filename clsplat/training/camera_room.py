@@ -5,6 +5,8 @@ its size by its depth, and takes its slope from the edge of the image. Where no 
 direction, training corrects nothing, and a new viewpoint sees nothing else (measured: docs/stability.md).
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -109,7 +111,5 @@ def room_factors(gaussians: Gaussians, positions: NDArray[np.float64], slope: fl
 
 def with_room(gaussians: Gaussians, positions: NDArray[np.float64], slope: float) -> Gaussians:
     """Shrink the Gaussians that reach a viewpoint. Parameters as for `room_factors`."""
-    result = gaussians.take(np.arange(len(gaussians)))
-    factors = room_factors(gaussians, positions, slope)
-    result.log_scales[:] += np.log(factors)[:, None].astype(result.log_scales.dtype)
-    return result
+    change = np.log(room_factors(gaussians, positions, slope))[:, None]
+    return replace(gaussians, log_scales=gaussians.log_scales + change.astype(gaussians.log_scales.dtype))

@@ -147,11 +147,7 @@ def test_a_change_is_earned_beyond_chance() -> None:
     assert not trial(True, [0.11, 0.4]).takes_smaller and trial(True, [0.09, 0.4]).takes_smaller
     assert trial(False, [-0.3, 0.09]).takes_smaller and not trial(False, [-0.3, 0.11]).takes_smaller
     assert trial(True, [0.09, 0.09]).takes_smaller and not trial(True, [0.11, 0.11]).takes_smaller
-
-
-def test_one_photo_does_not_decide() -> None:
-    """In three of four photos the larger side gains 0.8 dB; in front of the fourth camera is a Gaussian."""
-    assert not trial(True, [-3.7, 0.72, 0.74, 0.87]).takes_smaller
+    assert not trial(True, [-3.7, 0.72, 0.74, 0.87]).takes_smaller, "one photo does not decide"
 
 
 def side(n: int, quality: float = 30.0) -> SmallSide:
