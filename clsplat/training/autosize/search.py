@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from math import ceil
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from clsplat.training.autosize.rule import (
     candidate,
     first_pruning,
     growth_ends,
+    most_allowed,
     most_grown,
     prunes,
     validation_times,
@@ -108,7 +110,9 @@ def _pruned(training: Training, search: Search, iteration: int, after_fork: Afte
     best = max(degrees, key=lambda c: c.worth).sh_degree
     if best < len(degrees) - 1:
         here.state.rows = here.state.rows.with_degree(best)
-    here.state.search = replace(search, settled=iteration, degrees=degrees)
+    photos = len(training.scene.train)
+    most = min(ceil(search.most * photos / (photos - len(held))), most_allowed(training.config))
+    here.state.search = replace(search, most=most, settled=iteration, degrees=degrees)
     return here.state
 
 
