@@ -267,6 +267,19 @@ def most_grown(search: Search, config: TrainConfig) -> int:
     return min(ceil(search.pace * search.most), most_allowed(config)) if search.grows else search.most
 
 
+def most_with_all(search: Search, trained: int, photos: int, config: TrainConfig) -> int:
+    """Largest number of Gaussians once all photos train, not only `trained` of them.
+
+    If growth paid until its end, and no pruning did, it is in proportion to the photos: what only those show that were
+    held back has few Gaussians until then.
+    """
+    grown = [trial for trial in search.trials if trial.grows]
+    pruned = any(not trial.grows and trial.takes_smaller for trial in search.trials)
+    if not grown or grown[-1].takes_smaller or pruned:
+        return search.most
+    return min(ceil(search.most * photos / trained), most_allowed(config))
+
+
 def prunes(search: Search, iteration: int, held: int, config: TrainConfig) -> bool:
     """Whether a trial of pruning begins at one of the `window_bounds`: until one is rejected or time is over.
 

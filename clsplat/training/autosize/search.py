@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import ceil
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from clsplat.training.autosize.rule import (
     candidate,
     first_pruning,
     growth_ends,
-    most_allowed,
     most_grown,
+    most_with_all,
     prunes,
     validation_times,
     window_bounds,
@@ -111,7 +110,7 @@ def _pruned(training: Training, search: Search, iteration: int, after_fork: Afte
     if best < len(degrees) - 1:
         here.state.rows = here.state.rows.with_degree(best)
     photos = len(training.scene.train)
-    most = min(ceil(search.most * photos / (photos - len(held))), most_allowed(training.config))
+    most = most_with_all(search, photos - len(held), photos, training.config)
     here.state.search = replace(search, most=most, settled=iteration, degrees=degrees)
     return here.state
 
