@@ -145,8 +145,8 @@ class OptimConfig:
     sh_rest_lr: NonNegative = 5e-3 / 20
     """Learning rate of the spherical harmonics of degree 1 and above."""
     rates_final: PositiveFraction = 0.1
-    """Factor on the learning rates above, except that of the means, at the last iteration; it falls exponentially from 1
-    over the last two fifths of the iterations."""
+    """Factor on the learning rates above, except that of the means, at the last iteration; it falls exponentially
+    from 1 over the last two fifths of the iterations."""
     beta1: PartialFraction = 0.9
     """Decay rate of Adam's mean of the gradients."""
     beta2: PartialFraction = 0.999
