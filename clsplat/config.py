@@ -14,6 +14,7 @@ Background = Literal["black", "white"]
 # The ranges of most fields. `clsplat.ranges.check` checks them.
 Count = Annotated[int, within(least=1)]
 Fraction = Annotated[float, within(least=0, most=1)]
+PositiveFraction = Annotated[float, within(above=0, most=1)]
 PartialFraction = Annotated[float, within(least=0, below=1)]
 Positive = Annotated[float, within(above=0)]
 NonNegative = Annotated[float, within(least=0)]
@@ -143,6 +144,9 @@ class OptimConfig:
     """Learning rate of the spherical harmonics of degree 0."""
     sh_rest_lr: NonNegative = 5e-3 / 20
     """Learning rate of the spherical harmonics of degree 1 and above."""
+    rates_final: PositiveFraction = 0.1
+    """Factor on the learning rates above, except that of the means, at the last iteration; it falls exponentially
+    from 1 over the last two fifths of the iterations."""
     beta1: PartialFraction = 0.9
     """Decay rate of Adam's mean of the gradients."""
     beta2: PartialFraction = 0.999

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
+FALL = 0.6
+"""Fraction of the iterations after which the learning rates, except that of the means, fall (measured:
+docs/howto/strategies.md)."""
+
 
 @dataclass
 class Moments:
@@ -64,7 +68,7 @@ def adam_settings(
     iteration : int
         Counted from 1.
     progress : float
-        Fraction of the training, 0 to 1; means_lr_final is reached at 1.
+        Fraction of the training, 0 to 1; means_lr_final and rates_final are reached at 1.
     extent : float
         Scale of the scene, world units; the learning rate of the means is proportional to it.
     sh_degree : int
@@ -72,13 +76,14 @@ def adam_settings(
     penalties : three floats
         Weights in the loss of the sums of all opacities, of all scales, and of the penalties of needles.
     """
+    factor = config.rates_final ** max(0.0, (progress - FALL) / (1 - FALL))
     rates = {
         "means": extent * config.means_lr * (config.means_lr_final / config.means_lr) ** progress,
-        "log_scales": config.log_scales_lr,
-        "quats": config.quats_lr,
-        "logit_opacities": config.logit_opacities_lr,
-        "sh0": config.sh0_lr,
-        "sh_rest": config.sh_rest_lr,
+        "log_scales": factor * config.log_scales_lr,
+        "quats": factor * config.quats_lr,
+        "logit_opacities": factor * config.logit_opacities_lr,
+        "sh0": factor * config.sh0_lr,
+        "sh_rest": factor * config.sh_rest_lr,
     }
     return AdamStep(iteration, rates, config.beta1, config.beta2, config.eps, sh_degree, penalties)
 

@@ -81,7 +81,7 @@ TRAINING = {
         f"tests/training/test_{name}.py" for name in ("densify", "mcmc", "error_guided", "loop")
     ),
     "clsplat/training/autosize": (
-        *(f"tests/training/test_autosize{part}.py" for part in ("_reduction", "")),
+        *(f"tests/training/test_autosize{part}.py" for part in ("_rule", "_reduction", "")),
         "tests/commands/test_cli.py",
     ),
 }

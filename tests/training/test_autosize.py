@@ -1,4 +1,4 @@
-"""The size of a scene: the rules in numbers, the search on known Gaussians, the same bits after a resume."""
+"""The size of a scene: quality, the search on known Gaussians, the same bits after a resume."""
 
 import json
 import re
@@ -25,17 +25,10 @@ from clsplat.training.autosize.reduction import costliest_rows, unvalidated
 from clsplat.training.autosize.rule import (
     Search,
     SmallSide,
-    Trial,
     candidate,
-    first_pruning,
     growth_bounds,
-    growth_ends,
     most_grown,
-    prunes,
-    sh_bytes,
     start,
-    validation_times,
-    window_bounds,
 )
 from clsplat.training.autosize.search import _compared
 from clsplat.training.autosize.validation import PERFECT, can_validate, split, validate
@@ -129,91 +122,28 @@ def test_quality_is_the_mean_of_two_measures(device: Device) -> None:
     ), "SSIM of the training loss sees black beyond the mask"
 
 
-def trial(grows: bool, gains: list[float], price: float = 0.1) -> Trial:
-    """A comparison of 100 and 200 Gaussians by the gains of the larger side in each photo."""
-    config = replace(CONFIG, size_price=price)
-    views = np.linspace(25, 30, len(gains))
-    smaller, larger = views.tolist(), (views + gains).tolist()
-    return Trial(grows, candidate(1, 100, 3, [smaller], config), candidate(1, 200, 3, [larger], config))
-
-
-def test_a_change_is_earned_beyond_chance() -> None:
-    """Growth must gain more than its price by the standard error; what pruning loses must be below it by as much."""
-    found = trial(True, [0.1, 0.3])
-    assert (found.gain, found.margin, found.price) == pytest.approx((0.2, 0.1, 0.1))
-    assert trial(True, [-9.0, 0.1, 0.3, 0.4]).margin == pytest.approx(1.4826 * 0.15 / 2), (
-        "one photo is far from all others"
-    )
-    assert not trial(True, [0.11, 0.4]).takes_smaller and trial(True, [0.09, 0.4]).takes_smaller
-    assert trial(False, [-0.3, 0.09]).takes_smaller and not trial(False, [-0.3, 0.11]).takes_smaller
-    assert trial(True, [0.09, 0.09]).takes_smaller and not trial(True, [0.11, 0.11]).takes_smaller
-    assert not trial(True, [-3.7, 0.72, 0.74, 0.87]).takes_smaller, "one photo does not decide"
-
-
-def side(n: int, quality: float = 30.0) -> SmallSide:
-    return SmallSide(None, candidate(1, n, 3, [[quality, quality]], CONFIG))  # type: ignore[arg-type]
-
-
-def test_growth_ends_where_it_has_not_paid_for_a_doubling() -> None:
-    search = Search(1000, 1.5, small_side=side(500))
-    assert not growth_ends(search, 999, 900, CONFIG) and growth_ends(search, 1000, 900, CONFIG)
-    assert growth_ends(search, 600, 1500, CONFIG), "its time is over"
-    assert growth_ends(search, 600, 900, replace(CONFIG, max_gaussians=600)), "the user's limit is reached"
-
-
 @pytest.mark.parametrize(("gain", "paid"), [(1.0, 1800), (0.0, 500)])
 def test_what_has_paid_is_what_later_growth_is_compared_with(device: Device, gain: float, paid: int) -> None:
     scene = known_scene(20, device, copies=90, views=10)
     training = Training(scene, CONFIG, device, initial_state(scene, CONFIG))
     assert len(training.state.gaussians) == 1800
-    search = _compared(training, Search(1800, small_side=side(500), validated=[[30 + gain] * 2]), 900)
+    side = SmallSide(None, candidate(1, 500, 3, [[30.0, 30.0]], CONFIG))  # type: ignore[arg-type]
+    search = _compared(training, Search(1800, small_side=side, validated=[[30 + gain] * 2]), 900)
     assert search.small_side and search.small_side.candidate.n == paid
     assert [trial.takes_smaller for trial in search.trials] == [paid == 500]
 
 
-def test_photos_are_held_back_in_the_iteration_that_settles() -> None:
-    search = Search(1000, settled=5)
-    assert [search.holds_back(iteration) for iteration in (4, 5, 6)] == [True, True, False]
-    assert Search(1000).holds_back(6)
-
-
 def test_growth_has_a_pace(device: Device) -> None:
-    """To three times the first Gaussians within half of the run, or to 0.6 per pixel."""
+    """To three times the first Gaussians within two fifths of the run, or to one per pixel."""
     scene = known_scene(20, device, copies=1, views=10)
     growing = len(growth_bounds(CONFIG)) - 1  # the first window has the first Gaussians
-    assert growing == 4
+    assert growing == 3
     search = start(scene, 1000, CONFIG)
-    assert search.most == 1000 and search.pace**growing == pytest.approx(0.6 * 96 * 80 / 1000)
+    assert search.most == 1000 and search.pace**growing == pytest.approx(96 * 80 / 1000)
     assert start(scene, 5000, CONFIG).pace ** growing == pytest.approx(3)
     assert most_grown(search, CONFIG) == np.ceil(1000 * search.pace)
     assert most_grown(search, replace(CONFIG, max_gaussians=1100)) == 1100
     assert most_grown(replace(search, grows=False), CONFIG) == 1000
-
-
-def test_pruning_is_tried_until_it_fails() -> None:
-    """By at least four held-back photos."""
-    failed, went = trial(False, [1.0, 1.0]), trial(False, [-1.0, -1.0])
-    search, first = Search(500, grows=False), first_pruning(CONFIG)
-    assert prunes(search, first, 4, CONFIG) and not prunes(search, first, 3, CONFIG)
-    assert prunes(replace(search, trials=[trial(True, [-1, -1]), went]), first, 4, CONFIG)
-    assert not prunes(replace(search, trials=[went, failed]), first, 4, CONFIG)
-    assert not prunes(search, window_bounds(CONFIG)[-1], 4, CONFIG), "time is over"
-
-
-def test_worth_counts_doublings_of_bytes() -> None:
-    config = replace(CONFIG, size_price=0.25)
-    one, two = (candidate(1, n, 3, [[30.0]], config) for n in (100, 200))
-    assert one.worth - two.worth == pytest.approx(0.25)
-    plain, rich = (candidate(1, 100, degree, [[30.0]], config) for degree in (0, 3))
-    assert plain.worth - rich.worth == pytest.approx(0.25 * np.log2(sh_bytes(3) / sh_bytes(0)))
-
-
-def test_windows_are_within_the_run() -> None:
-    assert window_bounds(CONFIG) == [300, 600, 900, 1200, 1500, 1650, 1800, 1950]
-    assert sorted(validation_times(CONFIG))[:3] == [200, 250, 300]
-    for iterations in (1, 2, 3, 10, 19):
-        found = window_bounds(replace(CONFIG, iterations=iterations))
-        assert found and 1 <= found[0] and found[-1] <= iterations
 
 
 def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
@@ -245,7 +175,7 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     assert (tmp_path / "size.png").read_bytes().startswith(b"\x89PNG")
 
     # A trial tells of the iteration before it, once for each of its own.
-    for iteration, told in ((102, 1), (109, 4)):
+    for iteration, told in ((82, 1), (89, 4)):
         calls: list[int] = []
 
         def interrupt(
@@ -256,7 +186,7 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            train(scene, config, tmp_path / "parts", device, resume=iteration > 102, progress=interrupt)
+            train(scene, config, tmp_path / "parts", device, resume=iteration > 82, progress=interrupt)
     resumed = train(scene, config, tmp_path / "parts", device, resume=True)
     assert len(resumed) == len(whole)
     for name, array in whole.arrays().items():
@@ -300,13 +230,13 @@ def test_a_fifth_of_many_photos_says_what_gaussians_are_worth(photos: int, prici
 
 
 def test_flat_walls_need_little(device: Device, tmp_path: Path) -> None:
-    """Grey all around: what is off by less than a level in 255 is not improved. Measured: 171 Gaussians, no error;
-    the start has 200, and growth goes up to 476 while holes are filled."""
+    """Grey all around: what is off by less than a level in 255 is not improved. The start has 200 Gaussians, growth
+    may go up to 7680; a tenth of these is enough. Measured on two processors: 171 and 293, without an error."""
     scene = known_scene(20, device, copies=10)
     walls = [replace(view, image=np.full_like(view.image, 128)) for view in (*scene.train, *scene.test)]
     scene = replace(scene, train=walls[:32], test=walls[32:])
     gaussians = train(scene, TrainConfig(iterations=2000), tmp_path, device)
-    assert len(gaussians) < 200 and held_out(gaussians, scene, device) > 48
+    assert len(gaussians) < 768 and held_out(gaussians, scene, device) > 48
     trials = json.loads((tmp_path / "size.json").read_text())["trials"]
     assert max(max(trial["quality"]) for trial in trials) <= 20 * np.log10(255)
 

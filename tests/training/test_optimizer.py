@@ -30,6 +30,11 @@ def test_schedules_at_their_ends() -> None:
     assert (first.iteration, last.iteration) == (1, 1000)
     assert first.rates["means"] == pytest.approx(3 * CONFIG.means_lr)
     assert last.rates["means"] == pytest.approx(3 * CONFIG.means_lr_final)
+    before, falling = (adam_settings(1, progress, 3.0, CONFIG, 3) for progress in (0.6, 0.8))
+    for name in ("log_scales", "quats", "logit_opacities", "sh0", "sh_rest"):
+        assert first.rates[name] == before.rates[name] == getattr(CONFIG, f"{name}_lr")
+        assert falling.rates[name] == pytest.approx(0.1**0.5 * first.rates[name])
+        assert last.rates[name] == pytest.approx(0.1 * first.rates[name])
     assert [sh_degree_at(i, 1000, 3) for i in (1, 1000, 1001, 3001, 9999)] == [0, 0, 1, 3, 3]
     assert sh_degree_at(9999, 1000, 1) == 1
 

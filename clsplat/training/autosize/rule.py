@@ -21,13 +21,14 @@ from clsplat.scene import Scene
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.rows import Rows
 
-GROWTH_END = 0.5
-"""Fraction of the iterations at which growth ends, as the paper's densification does."""
+GROWTH_END = 0.4
+"""Fraction of the iterations at which growth ends. The paper's densification ends at 0.5; the photos that are held
+back train longer if growth ends earlier (measured: docs/size.md)."""
 
 TRIAL_LENGTH = 0.05
 """Fraction of the iterations in a trial of pruning."""
 
-PRUNING_END = 0.65
+PRUNING_END = 0.55
 """Fraction of the iterations at which trials of pruning end; all photos train afterwards."""
 
 GROWTH_START = 500
@@ -52,7 +53,7 @@ PACE = 3.0
 """Multiple of the first Gaussians that growth reaches by its end, unless `PER_PIXEL` allows more. Faster growth ends
 worse (measured: docs/size.md)."""
 
-PER_PIXEL = 0.6
+PER_PIXEL = 1.0
 """Gaussians per pixel of a photo that growth reaches by its end, unless `PACE` allows more."""
 
 VALIDATIONS = 3
@@ -265,6 +266,19 @@ def most_allowed(config: TrainConfig) -> int:
 def most_grown(search: Search, config: TrainConfig) -> int:
     """Largest number of Gaussians that growth may reach in the next window."""
     return min(ceil(search.pace * search.most), most_allowed(config)) if search.grows else search.most
+
+
+def most_with_all(search: Search, trained: int, photos: int, config: TrainConfig) -> int:
+    """Largest number of Gaussians once all photos train, not only `trained` of them.
+
+    If growth paid until its end, and no pruning did, it is in proportion to the photos: what only those show that
+    were held back has few Gaussians until then.
+    """
+    grown = [trial for trial in search.trials if trial.grows]
+    pruned = any(not trial.grows and trial.takes_smaller for trial in search.trials)
+    if not grown or grown[-1].takes_smaller or pruned:
+        return search.most
+    return min(ceil(search.most * photos / trained), most_allowed(config))
 
 
 def prunes(search: Search, iteration: int, held: int, config: TrainConfig) -> bool:

@@ -17,6 +17,7 @@ from clsplat.training.autosize.rule import (
     first_pruning,
     growth_ends,
     most_grown,
+    most_with_all,
     prunes,
     validation_times,
     window_bounds,
@@ -108,7 +109,9 @@ def _pruned(training: Training, search: Search, iteration: int, after_fork: Afte
     best = max(degrees, key=lambda c: c.worth).sh_degree
     if best < len(degrees) - 1:
         here.state.rows = here.state.rows.with_degree(best)
-    here.state.search = replace(search, settled=iteration, degrees=degrees)
+    photos = len(training.scene.train)
+    most = most_with_all(search, photos - len(held), photos, training.config)
+    here.state.search = replace(search, most=most, settled=iteration, degrees=degrees)
     return here.state
 
 

@@ -1,0 +1,100 @@
+"""The rule of the size in numbers: what a change must earn, when growth and pruning end, how far growth goes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.config import TrainConfig
+from clsplat.training.autosize.rule import (
+    Search,
+    SmallSide,
+    Trial,
+    candidate,
+    first_pruning,
+    growth_ends,
+    most_with_all,
+    prunes,
+    sh_bytes,
+    validation_times,
+    window_bounds,
+)
+
+CONFIG = TrainConfig(iterations=3000)
+
+
+def trial(grows: bool, gains: list[float], price: float = 0.1) -> Trial:
+    """A comparison of 100 and 200 Gaussians by the gains of the larger side in each photo."""
+    config = replace(CONFIG, size_price=price)
+    views = np.linspace(25, 30, len(gains))
+    smaller, larger = views.tolist(), (views + gains).tolist()
+    return Trial(grows, candidate(1, 100, 3, [smaller], config), candidate(1, 200, 3, [larger], config))
+
+
+def test_a_change_is_earned_beyond_chance() -> None:
+    """Growth must gain more than its price by the standard error; what pruning loses must be below it by as much."""
+    found = trial(True, [0.1, 0.3])
+    assert (found.gain, found.margin, found.price) == pytest.approx((0.2, 0.1, 0.1))
+    assert trial(True, [-9.0, 0.1, 0.3, 0.4]).margin == pytest.approx(1.4826 * 0.15 / 2), (
+        "one photo is far from all others"
+    )
+    assert not trial(True, [0.11, 0.4]).takes_smaller and trial(True, [0.09, 0.4]).takes_smaller
+    assert trial(False, [-0.3, 0.09]).takes_smaller and not trial(False, [-0.3, 0.11]).takes_smaller
+    assert trial(True, [0.09, 0.09]).takes_smaller and not trial(True, [0.11, 0.11]).takes_smaller
+    assert not trial(True, [-3.7, 0.72, 0.74, 0.87]).takes_smaller, "one photo does not decide"
+
+
+def side(n: int, quality: float = 30.0) -> SmallSide:
+    return SmallSide(None, candidate(1, n, 3, [[quality, quality]], CONFIG))  # type: ignore[arg-type]
+
+
+def test_growth_ends_where_it_has_not_paid_for_a_doubling() -> None:
+    search = Search(1000, 1.5, small_side=side(500))
+    assert not growth_ends(search, 999, 900, CONFIG) and growth_ends(search, 1000, 900, CONFIG)
+    assert growth_ends(search, 600, 1500, CONFIG), "its time is over"
+    assert growth_ends(search, 600, 900, replace(CONFIG, max_gaussians=600)), "the user's limit is reached"
+
+
+def test_photos_are_held_back_in_the_iteration_that_settles() -> None:
+    search = Search(1000, settled=5)
+    assert [search.holds_back(iteration) for iteration in (4, 5, 6)] == [True, True, False]
+    assert Search(1000).holds_back(6)
+
+
+def test_pruning_is_tried_until_it_fails() -> None:
+    """By at least four held-back photos."""
+    failed, went = trial(False, [1.0, 1.0]), trial(False, [-1.0, -1.0])
+    search, first = Search(500, grows=False), first_pruning(CONFIG)
+    assert prunes(search, first, 4, CONFIG) and not prunes(search, first, 3, CONFIG)
+    assert prunes(replace(search, trials=[trial(True, [-1, -1]), went]), first, 4, CONFIG)
+    assert not prunes(replace(search, trials=[went, failed]), first, 4, CONFIG)
+    assert not prunes(search, window_bounds(CONFIG)[-1], 4, CONFIG), "time is over"
+
+
+def test_worth_counts_doublings_of_bytes() -> None:
+    config = replace(CONFIG, size_price=0.25)
+    one, two = (candidate(1, n, 3, [[30.0]], config) for n in (100, 200))
+    assert one.worth - two.worth == pytest.approx(0.25)
+    plain, rich = (candidate(1, 100, degree, [[30.0]], config) for degree in (0, 3))
+    assert plain.worth - rich.worth == pytest.approx(0.25 * np.log2(sh_bytes(3) / sh_bytes(0)))
+
+
+def test_windows_are_within_the_run() -> None:
+    assert window_bounds(CONFIG) == [300, 600, 900, 1200, 1350, 1500, 1650]
+    assert sorted(validation_times(CONFIG))[:3] == [200, 250, 300]
+    for iterations in (1, 2, 3, 10, 19):
+        found = window_bounds(replace(CONFIG, iterations=iterations))
+        assert found and 1 <= found[0] and found[-1] <= iterations
+
+
+def test_photos_that_return_bring_gaussians_where_growth_paid() -> None:
+    """In proportion to the photos, if the last growth was taken and no pruning was."""
+    paid, unpaid, halved = trial(True, [1.0, 1.0]), trial(True, [0.0, 0.0]), trial(False, [-1.0, -1.0])
+    kept = trial(False, [1.0, 1.0])
+
+    def most(*trials: Trial, config: TrainConfig = CONFIG) -> int:
+        return most_with_all(Search(1000, grows=False, trials=list(trials)), 22, 26, config)
+
+    assert most(unpaid, paid) == most(paid, kept) == 1182
+    assert most(paid, unpaid) == most(paid, halved, kept) == most() == 1000
+    assert most(paid, config=replace(CONFIG, max_gaussians=1100)) == 1100
