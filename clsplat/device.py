@@ -229,6 +229,14 @@ class Device:
         shape = shape if isinstance(shape, tuple) else (int(shape),)
         return self.buffers.empty(what, shape, self.real if dtype is None else np.dtype(dtype))
 
+    def zeros(self, what: str, shape: tuple[int, ...] | int, dtype: DTypeLike | None = None) -> cl.array.Array:
+        """Array of zeros, as `empty`; the device writes them."""
+        result = self.empty(what, shape, dtype)
+        if result.nbytes:
+            memory: Any = result.base_data
+            cl.enqueue_fill_buffer(self.queue, memory, np.zeros(1, result.dtype), 0, result.nbytes)
+        return result
+
     def scratch(self, what: str, size: int, layout: Any = None) -> cl.array.Array:
         """Flat array of `size` reals named `what`, kept between calls.
 
@@ -237,7 +245,7 @@ class Device:
         if what in self._scratch and self._scratch[what][0] != (size, layout):
             del self._scratch[what]
         if what not in self._scratch:
-            self._scratch[what] = (size, layout), self.upload(what, np.zeros(size, self.real))
+            self._scratch[what] = (size, layout), self.zeros(what, size)
         return self._scratch[what][1]
 
     def upload(self, what: str, array: Any, dtype: DTypeLike | None = None) -> cl.array.Array:

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from pyopencl.array import Array
 
 from clsplat.device import Device
 from clsplat.errors import InputError
@@ -11,13 +12,20 @@ from clsplat.stages import AnySplats, Bins, Removal
 
 
 def removal(
+    device: Device, splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
+) -> Removal:
+    """The sums of `removal_sums`, with the same arguments, on the host."""
+    return Removal.of(removal_sums(device, splats, bins, background, residuals, mask).get())
+
+
+def removal_sums(
     device: Device,
     splats: AnySplats,
     bins: Bins,
     background: Any,
     residuals: Any = None,
     mask: Any = None,
-) -> Removal:
+) -> Array:
     """Change of an image's squared error if a single splat is removed or changes its colour.
 
     Parameters
@@ -32,8 +40,8 @@ def removal(
 
     Returns
     -------
-    Removal
-        Arrays on the host.
+    (N, 4 + C) real
+        The fields of `Removal` as columns, on the device.
 
     Raises
     ------
@@ -68,5 +76,4 @@ def removal(
     device.launch(stage, "removal", (tiles * group,), arguments, defines=defines, group=(group,))
     arguments = [n, bins.order, bins.first_slots, records, sums]
     device.launch(stage, "removal_sum", (n,), arguments, defines=defines)
-    errors, differences, weights, squares, *pulls = sums.get().T
-    return Removal(errors, differences, weights, squares, np.stack(pulls, axis=1))
+    return sums

@@ -46,7 +46,8 @@ def curvatures(gaussians: Gaussians, views: list[View], renderer: Renderer) -> A
     k = gaussians.sh.shape[1]
     a, b = np.triu_indices(k)
     out = np.zeros((len(gaussians), len(a)), np.float32)
-    for view, _, residuals, part in measure_removals(renderer, gaussians, views):
+    for measured in measure_removals(renderer, gaussians, views):
+        view, part, residuals = measured.view, measured.removal, measured.residuals
         pixels = residuals[:, :, 0].size if view.mask is None else max(1, int(view.mask.sum()))
         weights = np.maximum(part.squares, 0) / pixels
         seen = np.flatnonzero(weights > 0)

@@ -9,7 +9,7 @@ at least the difference that a removal makes to the image, and more where that d
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,13 +56,19 @@ class Prices(NamedTuple):
 class Measured(NamedTuple):
     """Removal of each Gaussian measured in one view.
 
-    residuals (H, W, 3): render less photo, in [-1, 1] for a clamped render.
+    residuals (H, W, 3): render less photo, in [-1, 1] for a clamped render; sums: those of the stage removal, where
+    the stages run. The rows of the backdrop, if there is one, follow those of the Gaussians.
     """
 
     view: View
     run: Pass
     residuals: Array
-    removal: Removal
+    sums: Any
+
+    @property
+    def removal(self) -> Removal:
+        """The sums of the Gaussians on the host."""
+        return Removal.of(download(self.sums)[: len(self.run.gaussians)])
 
 
 def measure_removals(
@@ -97,9 +103,9 @@ def measure_removals(
         run = renderer.forward(placed, view.camera, sh_degree)
         rgb = download(run.image.rgb)
         residuals = (np.clip(rgb, 0, 1) if clamped else rgb) - view.image / 255
-        removal = renderer.stages.removal(run.drawn, run.bins, np.array(renderer.background), residuals, view.mask)
-        removal = Removal(*(part[: len(gaussians)] for part in removal))  # without the backdrop
-        yield Measured(view, run, residuals, removal)
+        background = np.array(renderer.background)
+        sums = renderer.stages.removal_sums(run.drawn, run.bins, background, residuals, view.mask)
+        yield Measured(view, run, residuals, sums)
 
 
 def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands: bool = True) -> Prices:
@@ -130,7 +136,9 @@ def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands:
     total = Prices(
         np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros((n, degree))
     )
-    for view, run, residuals, part in measure_removals(renderer, gaussians, views, clamped=True):
+    for measured in measure_removals(renderer, gaussians, views, clamped=True):
+        view, run, residuals, _ = measured
+        part = measured.removal
         pixels = residuals[:, :, 0].size if view.mask is None else max(1, int(view.mask.sum()))
         total.errors[:] += part.errors / pixels
         total.differences[:] += part.differences / pixels

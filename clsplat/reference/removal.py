@@ -39,3 +39,8 @@ def removal(splats: AnySplats, bins: Bins, background: Any, residuals: Any = Non
         out.squares[g] += (weight**2 * counts[hit.box]).sum()
         out.pulls[g] += np.einsum("hw,hwc->c", weight, r[hit.box])
     return out
+
+
+def removal_sums(splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None) -> Any:
+    """The same as columns. Arguments and result as for `clsplat.ops.removal_sums`."""
+    return np.column_stack(removal(splats, bins, background, residuals, mask))
