@@ -3,10 +3,11 @@
 import warnings
 from collections.abc import Callable
 from copy import copy
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.constants import ALPHA_MIN
@@ -205,7 +206,12 @@ def step(training: Training, view: View) -> float:
 def view_at(iteration: int, views: list[View], seed: int) -> View:
     """The view of an iteration, counted from 1: every epoch takes all views in an order of its own."""
     epoch, position = divmod(iteration - 1, len(views))
-    return views[stream(seed, "order of the views", epoch).permutation(len(views))[position]]
+    return views[_order(seed, epoch, len(views))[position]]
+
+
+@lru_cache(2)  # epochs: views are read ahead
+def _order(seed: int, epoch: int, count: int) -> NDArray[np.intp]:
+    return stream(seed, "order of the views", epoch).permutation(count)
 
 
 def reset_shown(edit: Edit, gaussians: Gaussians, shown: Gaussians) -> None:
