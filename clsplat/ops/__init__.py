@@ -40,7 +40,7 @@ from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import add_column, observe
 from clsplat.ops.project import join_rows, project_bwd, project_bwd_adam, project_disparities, project_fwd
 from clsplat.ops.rays import rays_bwd, rays_fwd
-from clsplat.ops.removal import removal, removal_sums
+from clsplat.ops.removal import removal, removal_residuals, removal_sums
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
 from clsplat.ops.take import take_rows
@@ -70,6 +70,7 @@ class Launches:
         self.median_splats = partial(median_splats, device)
         self.removal = partial(removal, device)
         self.removal_sums = partial(removal_sums, device)
+        self.removal_residuals = partial(removal_residuals, device)
         self.disparity_loss = partial(disparity_loss, device)
         self.disparity_grad = partial(disparity_grad, device)
         self.exposure_fwd = partial(exposure_fwd, device)

@@ -37,7 +37,7 @@ from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import add_column, observe
 from clsplat.reference.project import join_rows, project_bwd, project_bwd_adam, project_disparities, project_fwd
 from clsplat.reference.rays import rays_bwd, rays_fwd
-from clsplat.reference.removal import removal, removal_sums
+from clsplat.reference.removal import removal, removal_residuals, removal_sums
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
 from clsplat.reference.take import take_rows

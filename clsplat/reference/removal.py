@@ -44,3 +44,11 @@ def removal(splats: AnySplats, bins: Bins, background: Any, residuals: Any = Non
 def removal_sums(splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None) -> Any:
     """The same as columns. Arguments and result as for `clsplat.ops.removal_sums`."""
     return np.column_stack(removal(splats, bins, background, residuals, mask))
+
+
+def removal_residuals(image: Any, photo: Any, mask: Any = None, *, clamped: bool = False) -> tuple[Any, Any]:
+    """Residuals and squared errors. Arguments and result as for `clsplat.ops.removal_residuals`."""
+    residuals = (np.clip(image, 0, 1) if clamped else image) - photo / 255
+    errors = np.zeros_like(residuals)
+    errors[:, :, 0] = (residuals**2).sum(axis=2) * (1 if mask is None else np.asarray(mask) != 0)
+    return residuals, errors

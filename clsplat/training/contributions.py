@@ -37,10 +37,8 @@ def contributions(
     """
     names = "weights", "errors", "prices", "differences"
     sums = {name: renderer.zeros(f"sums of {name}", (len(gaussians), 2)) for name in names}
-    for view, run, residuals, removals in measure_removals(renderer, gaussians, views, sh_degree):
-        squares = (residuals**2).sum(axis=2) * (1 if view.mask is None else view.mask)
-        v_image = np.stack([squares, np.zeros_like(squares), np.zeros_like(squares)], axis=2)
-        v = Image(renderer.upload("v_image", v_image), renderer.no_alpha_gradient(view.camera))
+    for view, run, squares, removals in measure_removals(renderer, gaussians, views, sh_degree):
+        v = Image(squares, renderer.no_alpha_gradient(view.camera))
         renderer.stages.add_column(renderer.backward_to_splats(run, v).colors, 0, sums["errors"])
         for name, field in (("weights", "weights"), ("prices", "errors"), ("differences", "differences")):
             renderer.stages.add_column(removals, Removal._fields.index(field), sums[name])

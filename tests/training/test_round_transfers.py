@@ -1,4 +1,4 @@
-"""What a round of densification brings to the host and back: bytes per Gaussian, counted."""
+"""What a round of densification brings to the host and back: bytes per Gaussian and per pixel, counted."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,19 +26,22 @@ STATISTICS = {"error": 1 * REAL, "adc": 2 * REAL, "mcmc": 0}
 SURVEYS = {"error": 4 * 2 * REAL}
 """Sums of twice the precision, whatever the number of photos."""
 
+WIDTH, HEIGHT, VIEWS = 40, 32, 3
+PIXEL = 4
+"""A photo and a mask; the render and its errors stay on the device."""
+
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_only_what_an_edit_changes_crosses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: str) -> None:
     """At commit e9b3102 all parameters crossed, and the rows ten times: 236 B down and 276 B up per Gaussian, beside
-    the statistics; `error` brought 40 B more for each photo, 400 B in a round."""
+    the statistics; `error` brought 40 B more for each photo, 400 B in a round, and 41 B for each pixel."""
     rounds: list[tuple[int, int]] = []
-    crossed = {"down": 0, "up": 0}
+    rows, pixels = {"down": 0, "up": 0}, {"down": 0, "up": 0}
     densify, get, put = Training.densify, pyopencl.array.Array.get, pyopencl.array.Array.set
     sizes: set[int] = set()
 
     def counted(array: Any, way: str) -> None:
-        if array.shape[0] in sizes:  # of rows; the others are photos
-            crossed[way] += array.nbytes
+        (rows if array.shape[0] in sizes else pixels)[way] += array.nbytes
 
     def read(array: Any, *arguments: Any, **options: Any) -> Any:
         counted(array, "down")
@@ -50,15 +53,18 @@ def test_only_what_an_edit_changes_crosses(tmp_path: Path, monkeypatch: pytest.M
 
     def watched(training: Training, cap: int) -> None:
         n = len(training.state.gaussians)
-        sizes.update(range(n // 2, 2 * n))
-        crossed.update(down=0, up=0)
+        sizes.update(range(n // 2, 2 * n))  # of arrays with a row per Gaussian; the others are images
+        for crossed in (rows, pixels):
+            crossed.update(down=0, up=0)
         densify(training, cap)
         sizes.clear()
         m = len(training.state.gaussians)
         rounds.append((n, m))
         statistics = STATISTICS[strategy]
-        assert crossed["down"] == n * (GEOMETRY + statistics + SURVEYS.get(strategy, 0))
-        assert crossed["up"] == m * (GEOMETRY + statistics + ROWS)
+        assert rows["down"] == n * (GEOMETRY + statistics + SURVEYS.get(strategy, 0))
+        assert rows["up"] == m * (GEOMETRY + statistics + ROWS)
+        surveyed = PIXEL * WIDTH * HEIGHT * VIEWS if strategy in SURVEYS else 0
+        assert pixels == {"down": 0, "up": surveyed}
 
     monkeypatch.setattr(Training, "densify", watched)
     monkeypatch.setattr(pyopencl.array.Array, "get", read)
@@ -67,13 +73,14 @@ def test_only_what_an_edit_changes_crosses(tmp_path: Path, monkeypatch: pytest.M
         strategy=strategy,
         size="fixed",
         max_gaussians=700,
-        iterations=40,
+        iterations=20,
         eval_every=0,
         init=InitConfig(sh_degree=3),
         optim=OptimConfig(sh_degree_every=1),
         adc=AdcConfig(grad_threshold=1e-6),
     )
-    config = with_rounds(config, every=5, start=5)
-    train(make_scene(500, 40, 32), replace(config, error=replace(config.error, views=3)), tmp_path, Device())
+    config = with_rounds(config, every=5, start=5, stop_fraction=1)
+    config = replace(config, error=replace(config.error, views=VIEWS))
+    train(make_scene(500, WIDTH, HEIGHT), config, tmp_path, Device())
     assert len(rounds) >= 2
     assert any(m > n for n, m in rounds)
