@@ -295,8 +295,10 @@ class Device:
             # pyopencl passes a value whose type it does not know beforehand several times more slowly.
             run.set_scalar_arg_dtypes([self._type_of(a) for a in arguments])
         # An int becomes its lower 32 bits, unsigned or not the same. A step passes 200 arguments: no calls here.
-        array = cl.array.Array
-        passed = [a.data if type(a) is array else a & 0xFFFFFFFF if isinstance(a, int) else a for a in arguments]
+        passed: list[Any] = [
+            a.data if isinstance(a, cl.array.Array) else a & 0xFFFFFFFF if isinstance(a, int) else a
+            for a in arguments
+        ]
         run(self.queue, global_size, group, *passed)
 
     def _type_of(self, argument: Any) -> np.dtype[Any] | None:

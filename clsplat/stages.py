@@ -163,7 +163,8 @@ class Removal(NamedTuple):
     @classmethod
     def of(cls, sums: Any) -> "Removal":
         """The fields from their columns in (N, 4 + C) on the host, as `Stages.removal_sums` returns them."""
-        return cls(*sums.T[:4], sums[:, 4:])
+        errors, differences, weights, squares = sums.T[:4]
+        return cls(errors, differences, weights, squares, sums[:, 4:])
 
 
 class AdamStep(NamedTuple):
