@@ -64,6 +64,7 @@ class Buffers:
         self.pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(queue))
         self._largest: dict[str, int] = {}
         self._blank = lru_cache(BLANKS)(self._new_blank)
+        self._block = lru_cache(BLANKS)(self._size_class)
 
     @property
     def memory(self) -> int:
@@ -92,17 +93,20 @@ class Buffers:
 
     def _array(self, shape: tuple[int, ...], dtype: np.dtype[Any], memory: Any) -> cl.array.Array:
         result = cl.array.Array.__new__(cl.array.Array)
-        vars(result).update(vars(self._blank(shape, dtype)), events=[], base_data=memory)
+        fields = self._blank(shape, dtype).copy()
+        fields["events"], fields["base_data"] = [], memory
+        result.__dict__ = fields
         return result
 
-    def _new_blank(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> cl.array.Array:
-        """An array without memory. To make one takes as long as several launches; to copy it does not."""
+    def _new_blank(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
+        """Attributes of an array without memory. To make one takes as long as several launches; to copy it does
+        not."""
         nothing: Any = lambda nbytes: None  # noqa: E731
         result = cl.array.Array(self._queue, shape, dtype, allocator=nothing)
         result.allocator = None
-        return result
+        return vars(result)
 
-    def _block(self, nbytes: int) -> int:
+    def _size_class(self, nbytes: int) -> int:
         """Bytes that the pool allocates for a buffer of `nbytes`: it rounds up to a size class."""
         return int(self.pool.alloc_size(self.pool.bin_number(nbytes)))
 
@@ -122,22 +126,22 @@ class Buffers:
 
     def allocate(self, what: str, nbytes: int) -> cl.MemoryObjectHolder:
         """A block of at least `nbytes`. Errors as for `empty`."""
-        capacity = self.capacity(what, nbytes)
-        if self.memory + self._block(capacity) > self._limit:
-            self.pool.free_held()
+        capacity, pool = self.capacity(what, nbytes), self.pool
+        if pool.managed_bytes + self._block(capacity) > self._limit:
+            pool.free_held()
             capacity = nbytes
-        if self.memory + self._block(capacity) > self._limit:
-            raise DeviceError(
-                f"{what}: needs {nbytes / 2**20:.0f} MiB in addition to {self.memory / 2**20:.0f} MiB in use, "
-                f"but the limit is {self._limit / 2**20:.0f} MiB (--memory-limit); use fewer Gaussians or a "
-                "smaller image (--downscale)"
-            )
+            if pool.managed_bytes + self._block(capacity) > self._limit:
+                raise DeviceError(
+                    f"{what}: needs {nbytes / 2**20:.0f} MiB in addition to {self.memory / 2**20:.0f} MiB in use, "
+                    f"but the limit is {self._limit / 2**20:.0f} MiB (--memory-limit); use fewer Gaussians or a "
+                    "smaller image (--downscale)"
+                )
         try:
-            block = self.pool.allocate(capacity)
+            block = pool.allocate(capacity)
         except cl.MemoryError as error:
             raise DeviceError(
                 f"{what}: {self._label} has no memory left for {nbytes / 2**20:.0f} MiB; use fewer Gaussians or a "
                 "smaller image (--downscale)"
             ) from error
-        self.peak = max(self.peak, self.memory)
+        self.peak = max(self.peak, pool.managed_bytes)
         return block

@@ -102,13 +102,6 @@ def select_device(name: str | None = None) -> cl.Device:
     return min(devices, key=lambda d: next((i for i, kind in enumerate(kinds) if d.type & kind), len(kinds)))
 
 
-def _converted(argument: Any) -> Any:
-    """A kernel's argument as pyopencl takes it. An int becomes its lower 32 bits, unsigned or not the same."""
-    if isinstance(argument, cl.array.Array):
-        return argument.data
-    return argument & 0xFFFFFFFF if isinstance(argument, int) else argument
-
-
 class Device:
     """An OpenCL device with its queue, programs and buffers.
 
@@ -162,7 +155,7 @@ class Device:
         self.lengths: dict[str, int] = {}
         self._constants: dict[str, tuple[bytes, cl.array.Array]] = {}
         self._programs: dict[tuple[Any, ...], cl.Program] = {}
-        self._kernels: dict[tuple[str, tuple[Any, ...]], cl.Kernel] = {}
+        self._kernels: dict[tuple[Any, ...], cl.Kernel] = {}
         self._scratch: dict[str, tuple[tuple[int, Any], cl.array.Array]] = {}
         self._kept: dict[str, tuple[Any, ...]] = {}
 
@@ -229,6 +222,14 @@ class Device:
         shape = shape if isinstance(shape, tuple) else (int(shape),)
         return self.buffers.empty(what, shape, self.real if dtype is None else np.dtype(dtype))
 
+    def zeros(self, what: str, shape: tuple[int, ...] | int, dtype: DTypeLike | None = None) -> cl.array.Array:
+        """Array of zeros, as `empty`; the device writes them."""
+        result = self.empty(what, shape, dtype)
+        if result.nbytes:
+            memory: Any = result.base_data
+            cl.enqueue_fill_buffer(self.queue, memory, np.zeros(1, result.dtype), 0, result.nbytes)
+        return result
+
     def scratch(self, what: str, size: int, layout: Any = None) -> cl.array.Array:
         """Flat array of `size` reals named `what`, kept between calls.
 
@@ -237,7 +238,7 @@ class Device:
         if what in self._scratch and self._scratch[what][0] != (size, layout):
             del self._scratch[what]
         if what not in self._scratch:
-            self._scratch[what] = (size, layout), self.upload(what, np.zeros(size, self.real))
+            self._scratch[what] = (size, layout), self.zeros(what, size)
         return self._scratch[what][1]
 
     def upload(self, what: str, array: Any, dtype: DTypeLike | None = None) -> cl.array.Array:
@@ -285,16 +286,20 @@ class Device:
         if group is None and len(global_size) == 1:
             group = (self.group(GROUP),)
             global_size = (-(-global_size[0] // group[0]) * group[0],)
-        program = (stage, *sorted((defines or {}).items()))
-        if (kernel, program) not in self._kernels:
+        program = stage, frozenset((defines or {}).items())
+        run = self._kernels.get((kernel, program))
+        if run is None:
             if program not in self._programs:
                 self._programs[program] = self.program(stage, defines or {})
-            built = cl.Kernel(self._programs[program], kernel)
+            run = self._kernels[kernel, program] = cl.Kernel(self._programs[program], kernel)
             # pyopencl passes a value whose type it does not know beforehand several times more slowly.
-            built.set_scalar_arg_dtypes([self._type_of(a) for a in arguments])
-            self._kernels[kernel, program] = built
-        converted = [_converted(a) for a in arguments]
-        self._kernels[kernel, program](self.queue, global_size, group, *converted)
+            run.set_scalar_arg_dtypes([self._type_of(a) for a in arguments])
+        # An int becomes its lower 32 bits, unsigned or not the same. A step passes 200 arguments: no calls here.
+        passed: list[Any] = [
+            a.data if isinstance(a, cl.array.Array) else a & 0xFFFFFFFF if isinstance(a, int) else a
+            for a in arguments
+        ]
+        run(self.queue, global_size, group, *passed)
 
     def _type_of(self, argument: Any) -> np.dtype[Any] | None:
         """Type of a number or struct passed to a kernel; None for arrays, vectors and local memory."""

@@ -135,10 +135,14 @@ class Renderer:
             return np.asarray(array, dtype=dtype or np.float64)
         return self.device.upload(name, array, dtype)
 
+    def zeros(self, name: str, shape: tuple[int, ...]) -> Any:
+        """An array of zeros where the stages run."""
+        return np.zeros(shape) if self.device is None else self.device.zeros(name, shape)
+
     def no_alpha_gradient(self, camera: Camera) -> Any:
         """Zero gradients with respect to the alpha of a camera's image, for losses that do not depend on it."""
         size = camera.height * camera.width
-        # No kernel writes this buffer: it is uploaded once per size.
+        # No kernel writes this buffer: it is filled once per size.
         return (
             np.zeros((camera.height, camera.width)) if self.device is None else self.device.scratch("v_alpha", size)
         )

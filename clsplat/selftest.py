@@ -196,7 +196,7 @@ def test_finite(b: Bench) -> Found:
 
 def test_take(b: Bench) -> Found:
     values, rows = b.random(40, 3), np.array([39, -1, 0, 0, 7])
-    yield b.stages.take_rows(b.up(values), rows), reference.take_rows(values, rows)
+    yield b.stages.take_rows(b.up(values), b.up(rows)), reference.take_rows(values, rows)
 
 
 def test_loss(b: Bench) -> Found:
@@ -229,6 +229,11 @@ def test_observe(b: Bench) -> Found:
     b.stages.observe(b.up(b.splats.extents), b.up(b.v_splats.means2d), WIDTH, HEIGHT, found[0], found[1])
     reference.observe(b.splats.extents, b.v_splats.means2d, WIDTH, HEIGHT, grad_sum, seen)
     yield from pairs(found, (grad_sum, seen))
+    values, sums = b.random(COUNT, 3), np.zeros((COUNT, 2))
+    added = b.up(sums)
+    b.stages.add_column(b.up(values), 1, added)
+    reference.add_column(values, 1, sums)
+    yield added, sums
 
 
 def test_project(b: Bench) -> Found:
@@ -253,6 +258,9 @@ def test_removal(b: Bench) -> Found:
     residuals = b.random(*b.image.rgb.shape)
     found = b.stages.removal(b.up(b.splats), b.lists(), BACKGROUND, residuals)
     yield from pairs(found, reference.removal(b.splats, b.bins, BACKGROUND, residuals))
+    photo = b.rng.integers(0, 256, b.image.rgb.shape, dtype=np.uint8)
+    residuals_found = b.stages.removal_residuals(b.up(b.image.rgb), b.up(photo))
+    yield from pairs(residuals_found, reference.removal_residuals(b.rounded(b.image.rgb), photo))
 
 
 def test_scan(b: Bench) -> Found:

@@ -160,6 +160,12 @@ class Removal(NamedTuple):
     squares: Any
     pulls: Any
 
+    @classmethod
+    def of(cls, sums: Any) -> "Removal":
+        """The fields from their columns in (N, 4 + C) on the host, as `Stages.removal_sums` returns them."""
+        errors, differences, weights, squares = sums.T[:4]
+        return cls(errors, differences, weights, squares, sums[:, 4:])
+
 
 class AdamStep(NamedTuple):
     """One step of the optimiser: its number, counted from 1, and its constants.
@@ -259,6 +265,12 @@ class Stages(FieldStages, Protocol):
     def removal(
         self, splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
     ) -> Removal: ...
+    def removal_sums(
+        self, splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
+    ) -> Array: ...
+    def removal_residuals(
+        self, image: Array, photo: Array, mask: Array = None, *, clamped: bool = False
+    ) -> tuple[Array, Array]: ...
     def disparity_loss(self, image: Array, target: Array, weight: float) -> tuple[float, Array]: ...
     def disparity_grad(self, image: Array, target: Array, weight: float, v_rgb: Array) -> Array: ...
     def exposure_fwd(self, image: Array, affine: Any, photo: Array) -> Array: ...
@@ -269,6 +281,7 @@ class Stages(FieldStages, Protocol):
     def observe(
         self, extents: Array, v_means2d: Array, width: int, height: int, grad_sum: Array, seen: Array
     ) -> None: ...
+    def add_column(self, values: Array, column: int, sums: Array) -> None: ...
     def adam_step(
         self,
         gaussians: "Gaussians",

@@ -1,5 +1,6 @@
 """NumPy dtypes of the structs that kernels take by value. cl/structs.h holds their OpenCL counterparts."""
 
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,15 @@ PENALTIES = ("opacity_penalty", "scale_penalty", "erank_penalty")
 RATES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "sh_rest")
 
 
-def camera_struct(camera: Camera, real: Any) -> np.ndarray:
-    """The struct `Camera` of cl/structs.h, for a build with reals of the type `real` (float32 or float64)."""
-    dtype = np.dtype(
+ADAM = (*RATES, "keep1", "take1", "keep2", "take2", "inv_correction2", "eps", *PENALTIES, "erank_slack")
+
+CAMERAS = 1024
+"""Number of cameras whose structs are kept. A step of training takes the same one twice, and again in each epoch."""
+
+
+@cache
+def _camera_type(real: Any) -> np.dtype[Any]:
+    return np.dtype(
         [
             ("rotation", real, 9),
             ("translation", real, 3),
@@ -26,7 +33,17 @@ def camera_struct(camera: Camera, real: Any) -> np.ndarray:
             ("size", "i4", 2),
         ]
     )
-    struct = np.zeros((), dtype=dtype)
+
+
+@cache
+def _adam_type(real: Any) -> np.dtype[Any]:
+    return np.dtype([(name, real) for name in ADAM])
+
+
+@lru_cache(CAMERAS)
+def camera_struct(camera: Camera, real: Any) -> np.ndarray:
+    """The struct `Camera` of cl/structs.h, for a build with reals of the type `real` (float32 or float64)."""
+    struct = np.zeros((), dtype=_camera_type(real))
     struct["rotation"] = camera.viewmat[:3, :3].ravel()
     struct["translation"] = camera.viewmat[:3, 3]
     struct["position"] = camera.position
@@ -61,6 +78,5 @@ def adam_struct(step: AdamStep, real: Any) -> np.ndarray:
     correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
     rates = [step.rates[name] / correction1 for name in RATES]
     betas = [step.beta1, 1 - step.beta1, step.beta2, 1 - step.beta2]
-    names = (*RATES, "keep1", "take1", "keep2", "take2", "inv_correction2", "eps", *PENALTIES, "erank_slack")
     values = (*rates, *betas, 1 / correction2, step.eps, *step.penalties, ERANK_SLACK)
-    return np.array(values, dtype=[(name, real) for name in names])
+    return np.array(values, dtype=_adam_type(real))

@@ -1,4 +1,6 @@
-"""Stage observe: numbers worked out by hand, and the kernel against the twin."""
+"""Stage observe: numbers worked out by hand, and the kernels against the twin."""
+
+import math
 
 import numpy as np
 import pytest
@@ -39,3 +41,25 @@ def test_matches_twin(any_device, n):
     reference.observe(extents, v_means2d, 640, 333, *expected)
     assert_matches("grad_sum", found[0], expected[0], DOUBLE if any_device.real == np.float64 else FLOAT)
     np.testing.assert_array_equal(found[1], expected[1])
+
+
+@pytest.mark.parametrize("n", [1, 64, 1000])
+def test_columns_are_added_with_twice_the_digits(any_device, n):
+    """Of sums that cancel, far more is left than the rounding of a real leaves; later rows do not count."""
+    rng = np.random.default_rng(n)
+    terms = (rng.normal(size=(10, n + 3, 4)) * 10 ** rng.uniform(-3, 3, (10, n + 3, 4))).astype(any_device.real)
+    terms[9] = -terms[:9].sum(axis=0)  # up to rounding
+    sums, twin = any_device.zeros("sums", (n, 2)), np.zeros((n, 2))
+    for values in terms:
+        ops.add_column(any_device, any_device.upload("values", values), 2, sums)
+        reference.add_column(values.astype(np.float64), 2, twin)
+    exact = np.array([math.fsum(column) for column in terms[:, :n, 2].T.astype(np.float64)])
+    scale = np.abs(terms[:, :n, 2]).max(axis=0).astype(np.float64)
+    assert n == 1 or (np.abs(exact) > 0.01 * np.finfo(any_device.real).eps * scale).any()
+    high, low = sums.get().astype(np.float64).T
+    # Ten additions; in the sum of their errors, each rounds by at most half an eps of eps.
+    atol = 20 * np.finfo(any_device.real).eps ** 2
+    np.testing.assert_array_less(
+        np.abs([math.fsum(pair) for pair in zip(high, low, -exact, strict=True)]), atol * scale
+    )
+    np.testing.assert_array_less(np.abs(twin.sum(axis=1) - exact), 20 * np.finfo(np.float64).eps * scale)

@@ -221,3 +221,26 @@ def test_lists_without_slots_are_refused(device):
     bins = ops.bin_splats(device, uploaded, width, height, 16, gradients=False)
     with pytest.raises(InputError, match="bins: expected lists made with gradients=True"):
         ops.removal(device, uploaded, bins, BACKGROUND)
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+@pytest.mark.parametrize("masked", [False, True])
+def test_residuals_and_squared_errors(any_device, masked, clamped):
+    """To the bit, where the device has double precision."""
+    rng = np.random.default_rng(0)
+    image = rng.uniform(-0.5, 1.5, (13, 17, 3)).astype(any_device.real)
+    photo, mask = rng.integers(0, 256, image.shape, dtype=np.uint8), rng.random((13, 17)) < 0.5 if masked else None
+    uploaded = [any_device.upload("image", image), any_device.upload("photo", photo, np.uint8)]
+    uploaded += [any_device.upload("mask", mask, np.uint8)] if masked else []
+    found = ops.removal_residuals(any_device, *uploaded, clamped=clamped)
+    expected = reference.removal_residuals(image.astype(np.float64), photo, mask, clamped=clamped)
+    for a, b in zip(found, expected, strict=True):
+        if "cl_khr_fp64" in any_device.cl_device.extensions:
+            np.testing.assert_array_equal(a.get(), b.astype(any_device.real))
+        else:
+            np.testing.assert_allclose(a.get(), b, rtol=1e-5, atol=1e-6)
+    residuals, errors = expected
+    assert not errors[:, :, 1:].any()
+    assert residuals.max() > 1 or clamped
+    if masked:
+        assert not errors[~mask].any() and errors[mask, 0].all()

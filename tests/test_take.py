@@ -14,7 +14,8 @@ def test_matches_twin(any_device, shape, m):
     array = rng.normal(size=(100, *shape)).astype(any_device.real)
     rows = rng.integers(-1, 100, m)
     rows[0] = 99
-    found = ops.take_rows(any_device, any_device.upload("array", array), rows).get()
+    uploaded = any_device.upload("array", array), any_device.upload("rows", rows, np.int32)
+    found = ops.take_rows(any_device, *uploaded).get()
     expected = reference.take_rows(array, rows)
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(expected[0], array[99])

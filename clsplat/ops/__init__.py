@@ -37,10 +37,10 @@ from clsplat.ops.march import march
 from clsplat.ops.median import median_splats
 from clsplat.ops.mlp import mlp_bwd, mlp_fwd
 from clsplat.ops.noise import add_noise
-from clsplat.ops.observe import observe
+from clsplat.ops.observe import add_column, observe
 from clsplat.ops.project import join_rows, project_bwd, project_bwd_adam, project_disparities, project_fwd
 from clsplat.ops.rays import rays_bwd, rays_fwd
-from clsplat.ops.removal import removal
+from clsplat.ops.removal import removal, removal_residuals, removal_sums
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
 from clsplat.ops.take import take_rows
@@ -69,12 +69,15 @@ class Launches:
         self.count_pairs = partial(count_pairs, device)
         self.median_splats = partial(median_splats, device)
         self.removal = partial(removal, device)
+        self.removal_sums = partial(removal_sums, device)
+        self.removal_residuals = partial(removal_residuals, device)
         self.disparity_loss = partial(disparity_loss, device)
         self.disparity_grad = partial(disparity_grad, device)
         self.exposure_fwd = partial(exposure_fwd, device)
         self.exposure_bwd = partial(exposure_bwd, device)
         self.l1_ssim = partial(l1_ssim, device)
         self.observe = partial(observe, device)
+        self.add_column = partial(add_column, device)
         self.adam_step = partial(adam_step, device)
         self.add_noise = partial(add_noise, device)
         self.take_rows = partial(take_rows, device)

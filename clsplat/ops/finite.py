@@ -13,6 +13,6 @@ def count_not_finite(device: Device, values: Array) -> int:
     ----------
     values : real array of any shape, with at least one value
     """
-    count = device.upload("values that are not finite", np.zeros(1), np.uint32)
+    count = device.zeros("values that are not finite", 1, np.uint32)
     device.launch("finite", "count_not_finite", (values.size,), [values.size, values, count])
     return int(count.get()[0])

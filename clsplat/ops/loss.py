@@ -7,6 +7,7 @@ from clsplat.constants import SSIM_C1, SSIM_C2, SSIM_TAPS
 from clsplat.device import GROUP, Device
 
 RADIUS = len(SSIM_TAPS) // 2
+TAPS = ",".join(map(repr, SSIM_TAPS))
 
 # Number of values per vector, and number of neighbouring vectors per work-item. Long runs suit the prefetchers of a
 # CPU. On a GPU, neighbouring work-items should access neighbouring values.
@@ -44,7 +45,7 @@ def l1_ssim(
     defines = shape | {
         "SSIM_C1": SSIM_C1,
         "SSIM_C2": SSIM_C2,
-        "SSIM_TAPS": ",".join(map(repr, SSIM_TAPS)),
+        "SSIM_TAPS": TAPS,
         "RADIUS": RADIUS,
         "GROUP": largest,
     }

@@ -25,3 +25,19 @@ def observe(
     n = seen.shape[0]
     half_size = np.array([width / 2, height / 2], device.real)
     device.launch("observe", "observe", (n,), [n, half_size, extents, v_means2d, grad_sum, seen])
+
+
+def add_column(device: Device, values: Array, column: int, sums: Array) -> None:
+    """Add a column of an array to sums of twice the precision, in place.
+
+    Parameters
+    ----------
+    values : (M, W) real
+        M >= N; the first N rows count.
+    column : int
+        Less than W.
+    sums : (N, 2) real
+        The sum of both columns is the sum of what was added. 0 before the first call.
+    """
+    n = sums.shape[0]
+    device.launch("observe", "add_column", (n,), [n, values.shape[1], column, values, sums])

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from pyopencl.array import Array
 
 from clsplat.device import Device
 from clsplat.errors import InputError
@@ -11,13 +12,20 @@ from clsplat.stages import AnySplats, Bins, Removal
 
 
 def removal(
+    device: Device, splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
+) -> Removal:
+    """The sums of `removal_sums`, with the same arguments, on the host."""
+    return Removal.of(removal_sums(device, splats, bins, background, residuals, mask).get())
+
+
+def removal_sums(
     device: Device,
     splats: AnySplats,
     bins: Bins,
     background: Any,
     residuals: Any = None,
     mask: Any = None,
-) -> Removal:
+) -> Array:
     """Change of an image's squared error if a single splat is removed or changes its colour.
 
     Parameters
@@ -25,15 +33,15 @@ def removal(
     splats : Splats with C colour channels
     bins : Bins of the same splats, made with gradients
     background : (C,) array on the host
-    residuals : (H, W, C) array on the host, optional
+    residuals : (H, W, C) array on the host or the device, optional
         Image minus target. Default: 0.
-    mask : (H, W) array of bool on the host, optional
+    mask : (H, W) array of bool on the host, or of uint8 on the device, optional
         True where pixels count. Default: everywhere.
 
     Returns
     -------
-    Removal
-        Arrays on the host.
+    (N, 4 + C) real
+        The fields of `Removal` as columns, on the device.
 
     Raises
     ------
@@ -49,9 +57,11 @@ def removal(
     size = bins.height, bins.width
     records = device.empty("prices per intersection", (max(m, 1), 4 + channels))
     sums = device.empty("prices", (n, 4 + channels))
+    if residuals is None:
+        residuals = device.zeros("residuals", (*size, channels))
     pixels = [
-        device.upload("residuals", np.zeros((*size, channels)) if residuals is None else residuals),
-        device.upload("mask", np.ones(size) if mask is None else mask, np.uint8),
+        residuals if isinstance(residuals, Array) else device.upload("residuals", residuals),
+        mask if isinstance(mask, Array) else device.upload("mask", np.ones(size) if mask is None else mask, np.uint8),
     ]
     stage = "removal_cpu" if device.is_cpu else "removal_gpu"
     pack = packed(device, splats, bins, variant(device))
@@ -68,5 +78,33 @@ def removal(
     device.launch(stage, "removal", (tiles * group,), arguments, defines=defines, group=(group,))
     arguments = [n, bins.order, bins.first_slots, records, sums]
     device.launch(stage, "removal_sum", (n,), arguments, defines=defines)
-    errors, differences, weights, squares, *pulls = sums.get().T
-    return Removal(errors, differences, weights, squares, np.stack(pulls, axis=1))
+    return sums
+
+
+def removal_residuals(
+    device: Device, image: Array, photo: Array, mask: Array | None = None, *, clamped: bool = False
+) -> tuple[Array, Array]:
+    """Residuals of an image, and its squared error in each pixel.
+
+    Parameters
+    ----------
+    image : (H, W, 3) real
+    photo : (H, W, 3) uint8
+    mask : (H, W) uint8, optional
+        Not 0 where errors count. Default: everywhere.
+    clamped : bool
+        Clamp the image to [0, 1] as a screen does: values above white are then no error.
+
+    Returns
+    -------
+    residuals : (H, W, 3) real
+        Image minus photo / 255.
+    errors : (H, W, 3) real
+        The squared residuals summed over RGB, where the mask counts, in the first channel; 0 in the others.
+    """
+    residuals, errors = device.empty("residuals", image.shape), device.empty("squared errors", image.shape)
+    pixels = image.shape[0] * image.shape[1]
+    pair = [image, photo, photo if mask is None else mask]
+    arguments = [pixels, int(clamped), int(mask is not None), *pair, residuals, errors]
+    device.launch("removal_residuals", "removal_residuals", (pixels,), arguments)
+    return residuals, errors

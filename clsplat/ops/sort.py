@@ -87,7 +87,7 @@ def argsort(
     groups = groups if group == (1,) else min(groups, RADIX_GROUPS)
     size = (groups * group[0],)
     histogram = device.empty("sort histogram", groups << digit_bits, np.uint32)
-    order = device.empty("sort order", n, np.uint32) if values is None else values
+    order = keys if values is None else values  # not read in the first pass
     for shift in range(0, max(bits, 1), digit_bits):
         arguments = [n, groups, shift, keys, histogram]
         device.launch("sort", "sort_count", size, arguments, defines=defines, group=group)

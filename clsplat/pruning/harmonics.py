@@ -46,9 +46,9 @@ def curvatures(gaussians: Gaussians, views: list[View], renderer: Renderer) -> A
     k = gaussians.sh.shape[1]
     a, b = np.triu_indices(k)
     out = np.zeros((len(gaussians), len(a)), np.float32)
-    for view, _, residuals, part in measure_removals(renderer, gaussians, views):
-        pixels = residuals[:, :, 0].size if view.mask is None else max(1, int(view.mask.sum()))
-        weights = np.maximum(part.squares, 0) / pixels
+    for measured in measure_removals(renderer, gaussians, views):
+        view, part = measured.view, measured.removal
+        weights = np.maximum(part.squares, 0) / measured.pixels
         seen = np.flatnonzero(weights > 0)
         basis = sh_basis(sight(gaussians, view.camera)[0][seen], gaussians.sh_degree)
         scaled = (basis * np.sqrt(weights[seen, None])).astype(np.float32)

@@ -9,7 +9,7 @@ at least the difference that a removal makes to the image, and more where that d
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,13 +56,25 @@ class Prices(NamedTuple):
 class Measured(NamedTuple):
     """Removal of each Gaussian measured in one view.
 
-    residuals (H, W, 3): render less photo, in [-1, 1] for a clamped render.
+    errors (H, W, 3): squared error of each pixel in the first channel, 0 in the others; sums: those of the stage
+    removal. Both are where the stages run. The rows of the backdrop, if there is one, follow those of the Gaussians.
     """
 
     view: View
     run: Pass
-    residuals: Array
-    removal: Removal
+    errors: Any
+    sums: Any
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels that count; 1 if there is none."""
+        mask = self.view.mask
+        return self.view.image[:, :, 0].size if mask is None else max(1, int(mask.sum()))
+
+    @property
+    def removal(self) -> Removal:
+        """The sums of the Gaussians on the host."""
+        return Removal.of(download(self.sums)[: len(self.run.gaussians)])
 
 
 def measure_removals(
@@ -95,11 +107,12 @@ def measure_removals(
     placed = renderer.place(gaussians)
     for view in in_turn(views):
         run = renderer.forward(placed, view.camera, sh_degree)
-        rgb = download(run.image.rgb)
-        residuals = (np.clip(rgb, 0, 1) if clamped else rgb) - view.image / 255
-        removal = renderer.stages.removal(run.drawn, run.bins, np.array(renderer.background), residuals, view.mask)
-        removal = Removal(*(part[: len(gaussians)] for part in removal))  # without the backdrop
-        yield Measured(view, run, residuals, removal)
+        photo = renderer.upload("photo", view.image, np.uint8)
+        mask = None if view.mask is None else renderer.upload("mask", view.mask, np.uint8)
+        residuals, errors = renderer.stages.removal_residuals(run.image.rgb, photo, mask, clamped=clamped)
+        background = np.array(renderer.background)
+        sums = renderer.stages.removal_sums(run.drawn, run.bins, background, residuals, mask)
+        yield Measured(view, run, errors, sums)
 
 
 def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands: bool = True) -> Prices:
@@ -130,8 +143,8 @@ def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands:
     total = Prices(
         np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros((n, degree))
     )
-    for view, run, residuals, part in measure_removals(renderer, gaussians, views, clamped=True):
-        pixels = residuals[:, :, 0].size if view.mask is None else max(1, int(view.mask.sum()))
+    for measured in measure_removals(renderer, gaussians, views, clamped=True):
+        view, run, part, pixels = measured.view, measured.run, measured.removal, measured.pixels
         total.errors[:] += part.errors / pixels
         total.differences[:] += part.differences / pixels
         total.weights[:] += part.weights / pixels

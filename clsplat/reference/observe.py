@@ -13,3 +13,8 @@ def observe(extents: Array, v_means2d: Array, width: int, height: int, grad_sum:
     visible = extents[:, 0] > 0
     grad_sum[visible] += np.hypot(v_means2d[visible, 0] * (width / 2), v_means2d[visible, 1] * (height / 2))
     seen[visible] += 1
+
+
+def add_column(values: Array, column: int, sums: Array) -> None:
+    """Add a column to sums, in place. Arguments as for `clsplat.ops.add_column`."""
+    sums[:, 0] += values[: len(sums), column]

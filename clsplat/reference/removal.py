@@ -39,3 +39,16 @@ def removal(splats: AnySplats, bins: Bins, background: Any, residuals: Any = Non
         out.squares[g] += (weight**2 * counts[hit.box]).sum()
         out.pulls[g] += np.einsum("hw,hwc->c", weight, r[hit.box])
     return out
+
+
+def removal_sums(splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None) -> Any:
+    """The same as columns. Arguments and result as for `clsplat.ops.removal_sums`."""
+    return np.column_stack(removal(splats, bins, background, residuals, mask))
+
+
+def removal_residuals(image: Any, photo: Any, mask: Any = None, *, clamped: bool = False) -> tuple[Any, Any]:
+    """Residuals and squared errors. Arguments and result as for `clsplat.ops.removal_residuals`."""
+    residuals = (np.clip(image, 0, 1) if clamped else image) - photo / 255
+    errors = np.zeros_like(residuals)
+    errors[:, :, 0] = (residuals**2).sum(axis=2) * (1 if mask is None else np.asarray(mask) != 0)
+    return residuals, errors

@@ -8,7 +8,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import measure_removals
 from clsplat.renderer import Renderer, download
 from clsplat.scene import View
-from clsplat.stages import Image
+from clsplat.stages import Image, Removal
 from clsplat.training.densify import Contributions
 
 
@@ -35,14 +35,11 @@ def contributions(
     -------
     Contributions
     """
-    n = len(gaussians)
-    result = Contributions(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n))
-    for view, run, residuals, removal in measure_removals(renderer, gaussians, views, sh_degree):
-        squares = (residuals**2).sum(axis=2) * (1 if view.mask is None else view.mask)
-        v_image = np.stack([squares, np.zeros_like(squares), np.zeros_like(squares)], axis=2)
-        v = Image(renderer.upload("v_image", v_image), renderer.upload("v_alpha", np.zeros_like(squares)))
-        result.errors[:] += download(renderer.backward_to_splats(run, v).colors)[:, 0]
-        result.weights[:] += removal.weights
-        result.prices[:] += removal.errors
-        result.differences[:] += removal.differences
-    return result
+    names = "weights", "errors", "prices", "differences"
+    sums = {name: renderer.zeros(f"sums of {name}", (len(gaussians), 2)) for name in names}
+    for view, run, squares, removals in measure_removals(renderer, gaussians, views, sh_degree):
+        v = Image(squares, renderer.no_alpha_gradient(view.camera))
+        renderer.stages.add_column(renderer.backward_to_splats(run, v).colors, 0, sums["errors"])
+        for name, field in (("weights", "weights"), ("prices", "errors"), ("differences", "differences")):
+            renderer.stages.add_column(removals, Removal._fields.index(field), sums[name])
+    return Contributions(**{name: download(parts).astype(np.float64).sum(axis=1) for name, parts in sums.items()})

@@ -36,13 +36,9 @@ class Moments:
         first, second = (Gaussians(**{k: np.zeros_like(a) for k, a in gaussians.arrays().items()}) for _ in range(2))
         return cls(first, second)
 
-    def take(self, rows: Array, stages: Stages = reference) -> "Moments":
-        """Moments whose row i continues row rows[i], or is 0 where that is negative, where `stages` run."""
-
-        def taken(moments: Gaussians) -> Gaussians:
-            return Gaussians(**{name: stages.take_rows(a, rows) for name, a in moments.arrays().items()})
-
-        return Moments(taken(self.first), taken(self.second))
+    def take(self, rows: Array) -> "Moments":
+        """Copies of some rows, on the host."""
+        return Moments(self.first.take(rows), self.second.take(rows))
 
 
 def sh_degree_at(iteration: int, every: int, stored: int) -> int:
@@ -152,6 +148,10 @@ class Optimizer:
     def bring(self, array: Any) -> Any:
         """A device array where the optimiser works."""
         return download(array) if self.home is None else array
+
+    def place_rows(self, rows: Array) -> Any:
+        """Numbers of rows from the host, for `take_rows` of the stages."""
+        return rows if self.home is None else self.home.upload("rows", rows, np.int32)
 
     def step(
         self,

@@ -3,16 +3,17 @@
 import warnings
 from collections.abc import Callable
 from copy import copy
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.constants import ALPHA_MIN
 from clsplat.gaussians import Gaussians, logit
 from clsplat.randomness import stream
-from clsplat.renderer import Renderer, fetch
+from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
 from clsplat.stages import Dropout
 from clsplat.training.autosize.validation import split
@@ -23,6 +24,7 @@ from clsplat.training.corrections import compare, example, learn_pose
 from clsplat.training.densify import Contributions, Edit
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
 from clsplat.training.optimizer import Optimizer, adam_settings
+from clsplat.training.rows import without_harmonics
 from clsplat.training.state import State
 
 if TYPE_CHECKING:
@@ -146,26 +148,25 @@ class Training:
         """
         self.state.move(self.optimizer.home)
         edit = self._edit(cap)
-        self.state.change_rows(self.state.rows.after(edit, self.optimizer.stages))
+        self.state.change_rows(self.state.rows.after(edit, self.optimizer))
         self.state.move(self.optimizer.home)
 
     def _edit(self, cap: int) -> Edit:
-        """The strategy's edit. It leaves the rows where they are to be edited."""
+        """The strategy's edit. It leaves the strategy's statistics on the host."""
         state = self.state
-        shown = fetch(state.shown(self.renderer)) if state.filter else None
-        surveyed = shown or state.gaussians
         sh_degree = state.sh_degree(state.iteration, self.config)
 
         def survey(count: int) -> Contributions:
             order = stream(self.config.seed, "surveyed views", state.iteration).permutation(len(self._views))
             chosen = state.corrected([self._views[i] for i in order[:count]])
-            found = contributions(self.renderer, surveyed, chosen, sh_degree)
+            found = contributions(self.renderer, state.shown(self.renderer), chosen, sh_degree)
             return found._replace(share=len(chosen) / len(self._views))
 
-        state.rows = state.rows.to_edit()
-        edit = state.strategy.edit(state.iteration, state.gaussians, cap, survey)
-        if edit.reset_opacities and shown:
-            reset_shown(edit, state.gaussians, shown)
+        state.rows = state.rows._replace(strategy=state.strategy.on(None))
+        gaussians = without_harmonics(state.gaussians)
+        edit = state.strategy.edit(state.iteration, gaussians, cap, survey)
+        if edit.reset_opacities and state.filter:
+            reset_shown(edit, gaussians, without_harmonics(state.shown(self.renderer)))
         return edit._replace(gaussians=self.with_room(edit.gaussians))
 
 
@@ -205,7 +206,12 @@ def step(training: Training, view: View) -> float:
 def view_at(iteration: int, views: list[View], seed: int) -> View:
     """The view of an iteration, counted from 1: every epoch takes all views in an order of its own."""
     epoch, position = divmod(iteration - 1, len(views))
-    return views[stream(seed, "order of the views", epoch).permutation(len(views))[position]]
+    return views[_order(seed, epoch, len(views))[position]]
+
+
+@lru_cache(2)  # epochs: views are read ahead
+def _order(seed: int, epoch: int, count: int) -> NDArray[np.intp]:
+    return stream(seed, "order of the views", epoch).permutation(count)
 
 
 def reset_shown(edit: Edit, gaussians: Gaussians, shown: Gaussians) -> None:

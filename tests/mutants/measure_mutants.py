@@ -65,6 +65,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "project": PROJECT,
     "removal_cpu": REMOVAL,
     "removal_gpu": REMOVAL,
+    "removal_residuals": REMOVAL,
     "removal_sums": REMOVAL,
     "sh": PROJECT,
     "spans": ("tests/test_intervals.py", "tests/test_frustums.py"),

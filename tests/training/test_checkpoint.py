@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from small_run import CONFIG, same
 
-from clsplat import reference
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.renderer import Renderer
@@ -18,6 +17,8 @@ from clsplat.scene import Scene
 from clsplat.training.checkpoint import load_state, save_state
 from clsplat.training.densify import Edit
 from clsplat.training.loop import train
+from clsplat.training.optimizer import Optimizer
+from clsplat.training.rows import without_harmonics
 from clsplat.training.state import State, initial_state
 
 
@@ -46,20 +47,19 @@ def test_a_checkpoint_holds_everything(scene: Scene, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("on_device", [False, True], ids=["on the host", "on the device"])
 @pytest.mark.parametrize("reset", [False, True])
-def test_moments_follow_an_edit(scene: Scene, device: Device, reset: bool, on_device: bool) -> None:
-    state = random_state(scene)
-    before = state.rows
+def test_moments_and_harmonics_follow_an_edit(scene: Scene, device: Device, reset: bool, on_device: bool) -> None:
+    before = random_state(scene).rows
+    optimizer = Optimizer(Renderer(device), "device" if on_device else "numpy")
     rows, fresh = np.array([3, 1, 1]), np.array([False, False, True])
-    edit = Edit(state.gaussians.take(rows), rows, fresh, reset_opacities=reset)
-    if on_device:
-        edited = before.on(device).to_edit()
-        assert isinstance(edited.gaussians.means, np.ndarray)
-        after = edited.after(edit, Renderer(device).stages)
-        assert not isinstance(after.moments.first.means, np.ndarray)
-        after = after.on(None)
-    else:
-        after = before.after(edit, reference)
-    assert len(after.gaussians) == 3
+    gaussians = without_harmonics(before.gaussians).take(rows)
+    gaussians.means[2] = 7
+    edited = before.on(optimizer.home).after(Edit(gaussians, rows, fresh, reset_opacities=reset), optimizer)
+    assert isinstance(edited.gaussians.means, np.ndarray)
+    assert isinstance(edited.gaussians.sh, np.ndarray) == isinstance(edited.moments.first.means, np.ndarray)
+    assert isinstance(edited.gaussians.sh, np.ndarray) == (not on_device)
+    after = edited.on(optimizer.home).on(None)
+    np.testing.assert_array_equal(after.gaussians.means, gaussians.means)
+    np.testing.assert_array_equal(after.gaussians.sh, before.gaussians.sh[rows])
     pairs = (before.moments.first, after.moments.first), (before.moments.second, after.moments.second)
     for old, new in pairs:
         for name in ("means", "logit_opacities"):

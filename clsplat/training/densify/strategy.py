@@ -44,8 +44,9 @@ Survey = Callable[[int], Contributions]
 class Edit(NamedTuple):
     """New rows in exchange for old ones.
 
-    gaussians: the M rows after the edit; rows (M,): the old row that each new one continues; fresh (M,) bool: whether
-    the optimiser's moments of a new row start at 0; reset_opacities: whether the moments of all opacities do.
+    gaussians: the M rows after the edit, but for their spherical harmonics, which are those of the old rows; rows
+    (M,): the old row that each new one continues; fresh (M,) bool: whether the optimiser's moments of a new row start
+    at 0; reset_opacities: whether the moments of all opacities do.
     """
 
     gaussians: Gaussians
@@ -158,7 +159,7 @@ class Strategy:
         iteration : int
             Number of the iteration, counted from 1.
         gaussians : Gaussians
-            On the host; they stay as they are.
+            On the host, without spherical harmonics in a training; they stay as they are.
         cap : int
             Largest number of Gaussians after the edit: the user's limit or what fits the device. There may be more
             before it; then none are added.

@@ -79,8 +79,8 @@ def shown_by(gaussians: Gaussians, scene: Scene, config: TrainConfig, device: De
     """(N,) Number of training photos of which each Gaussian makes up half a pixel or more."""
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     count = np.zeros(len(gaussians), int)
-    for _, _, _, removal in measure_removals(renderer, gaussians, with_near_planes(scene).train, None):
-        count += removal.weights > 0.5
+    for measured in measure_removals(renderer, gaussians, with_near_planes(scene).train, None):
+        count += measured.removal.weights > 0.5
     return count
 
 
