@@ -19,6 +19,12 @@ from clsplat.training import photo_poses as poses
 GAINS = (0.0, 0.1, 0.2, 0.4)
 """Largest relative change of a photo's gain."""
 
+WHITE_BALANCE = 0.15
+"""Largest relative change of a channel's gain in a photo."""
+
+CONTRAST = 0.3
+"""Largest curve c of x + c x (1 - x) in a photo: it lightens or darkens the middle grey 0.5 by 0.075."""
+
 NOISES = (0.0, 0.2, 0.5, 1.0)
 """Standard deviation of the rotation about each axis, degrees."""
 
@@ -30,14 +36,34 @@ FEW_ITERATIONS = 2000
 
 
 def with_gains(scene: Scene, largest: float) -> Scene:
-    """Multiply each training photo by a random gain, uniform between 1 - largest and 1 + largest."""
-    rng = np.random.default_rng(0)
+    """Multiply each training photo by a random gain, uniform between 1 - largest and 1 + largest.
 
-    def dimmed(view: View) -> View:
-        gain = rng.uniform(1 - largest, 1 + largest)
-        return replace(view, image=np.clip(np.rint(gain * view.image), 0, 255).astype(np.uint8))
+    The gains are divided by their mean: a change that all photos share belongs to the scene, and no method can tell.
+    """
+    gains = np.random.default_rng(0).uniform(1 - largest, 1 + largest, (len(scene.train), 1))
+    return bent(scene, gains / gains.mean(), np.zeros(len(gains)))
 
-    return replace(scene, train=[dimmed(view) for view in scene.train])
+
+def with_curves(scene: Scene) -> Scene:
+    """Change white balance, brightness and contrast of each training photo by a curve per channel.
+
+    Gains of the channels differ by up to `WHITE_BALANCE`, curves by up to `CONTRAST`; their means are 1 and 0.
+    """
+    rng, count = np.random.default_rng(0), len(scene.train)
+    gains = rng.uniform(1 - WHITE_BALANCE, 1 + WHITE_BALANCE, (count, 3))
+    curves = rng.uniform(-CONTRAST, CONTRAST, count)
+    return bent(scene, gains / gains.mean(axis=0), curves - curves.mean())
+
+
+def bent(scene: Scene, gains: np.ndarray, curves: np.ndarray) -> Scene:
+    """Replace the colours x of each training photo by g (x + c x (1 - x)), for gains (V, 1 or 3) and curves (V,)."""
+
+    def changed(view: View, gain: np.ndarray, curve: float) -> View:
+        x = view.image / 255
+        image = np.rint(255 * gain * (x + curve * x * (1 - x)))
+        return replace(view, image=np.clip(image, 0, 255).astype(np.uint8))
+
+    return replace(scene, train=[changed(*one) for one in zip(scene.train, gains, curves, strict=True)])
 
 
 def displaced(scene: Scene, degrees: float) -> Scene:
@@ -68,15 +94,33 @@ def _exposure(device: Device, data: Path) -> Found:
             series[label].append((gain, held_out(gaussians, scene, asked, device)))
             fitted[label, gain] = held_out(gaussians, scene, asked, device, psnr_fitted)
     unchanged = series[labels[False]][0][1] or 0.0
+    curves = _lost_to_curves(device, data)
     after = {label: fitted[labels[False], 0.0] - fitted[label, 0.2] for label in labels.values()}
     return Found(
         [
             *(Figure(label, unchanged - (dict(points)[0.2] or 0.0), "dB") for label, points in series.items()),
             Figure("--exposure, photos that agree", unchanged - (dict(series["--exposure"])[0.0] or 0.0), "dB"),
             *(Figure(f"{label}, after an affine fit", lost, "dB") for label, lost in after.items()),
+            *(Figure(f"{label}, curves on fox_pinhole", lost, "dB") for label, lost in curves.items()),
         ],
         Plot("largest change of a photo's gain", "PSNR of held-out photos, dB", series),
     )
+
+
+def _lost_to_curves(device: Device, data: Path) -> dict[str, float]:
+    """PSNR that held-out photos of a phone lose to curves of the training photos, by the options."""
+    scene, config = load(data, "fox_pinhole")
+    changed = with_curves(scene)
+    options = {
+        "one exposure for all": {},
+        "--exposure": {"exposure": True},
+        "--exposure --response": {"exposure": True, "response": True},
+    }
+    unchanged = held_out(trained(scene, config, device), scene, config, device)
+    return {
+        label: unchanged - held_out(trained(changed, replace(config, **on), device), scene, config, device)
+        for label, on in options.items()
+    }
 
 
 def _poses(device: Device, data: Path) -> Found:
