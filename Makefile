@@ -106,8 +106,8 @@ bench-quality:
 
 # Measure the charts of docs/howto/fields.md: make bench-fields DATA=folder of real scenes. The lengths of trainings of
 # fields are chosen for one to three minutes of two cores each. Finished trainings are not repeated.
-FIELD_SCENES = lego:downscale=4:background=white fern:downscale=8 fox_pinhole:downscale=8 castle_p30:downscale=8
-FIELD_LENGTHS = plenoxels=800 ingp-base=400 nerf-small=1000 mip-nerf360-small=500
+FIELD_SCENES = lego:downscale=4:background=white fern:downscale=8 fox_pinhole:downscale=8 bonsai:downscale=8
+FIELD_LENGTHS = plenoxels=1500 ingp-base=1500 nerf-small=1500 mip-nerf360-small=1000
 bench-fields:
 	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-fields DATA=..."; exit 2; }
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(FIELD_SCENES)) --methods auto paper-7k -o build/fields

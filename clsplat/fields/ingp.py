@@ -24,9 +24,9 @@ padded to 16."""
 LEVELS, COARSEST = 16, 16
 """Number of levels, and cells along an edge of the coarsest (Müller et al. 2022, table 1)."""
 
-FINEST, FINEST_CONTRACTED = 2048, 8192
-"""Cells along an edge of the finest level in the unit cube (Müller et al. 2022, section 5.4), and with a background,
-where the cameras' surroundings are a quarter to a half of the contracted space."""
+CELL_PIXELS = 0.4
+"""Edge of a cell of the finest level, in widths of a pixel at the middle of the scene. The paper's 2048 cells are so
+wide for photos of 800 x 800 pixels (Müller et al. 2022, section 5.4). Finer cells are seen by single pixels."""
 
 RATE, RATE_FINAL = 1e-2, 1e-2 / 30
 """Learning rates at the start (Müller et al. 2022, section 4) and at the end; exponential in between, over a training
@@ -74,9 +74,8 @@ class IngpBase(Field):
 
     def __init__(self, space: Space, device: "Device", seed: int):
         super().__init__(space, device, seed)
-        self.levels = HashLevels.geometric(
-            LEVELS, COARSEST, FINEST_CONTRACTED if space.contracted else FINEST, self.entries
-        )
+        finest = max(round(space.edge / (CELL_PIXELS * space.pixel)), COARSEST)
+        self.levels = HashLevels.geometric(LEVELS, COARSEST, finest, self.entries)
         rng = stream(seed, "parameters of a field")
         table = rng.uniform(-TABLE_RANGE, TABLE_RANGE, (self.levels.offsets[-1], 2))
         networks = [first_weights(rng, widths) for widths in (DENSITY_WIDTHS, COLOR_WIDTHS)]

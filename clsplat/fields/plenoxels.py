@@ -106,13 +106,13 @@ class Plenoxels(Field):
         step = STEP_CELLS / len(self.occupied)
         if not self.space.contracted:
             return Marching(step, 0.0, 0.0, 1e6, False)
-        return Marching(4 * step, CONE, self.space.near, FAR, True)  # the contracted space is four wide
+        return Marching(self.space.edge * step, CONE, self.space.near, FAR, True)
 
     def step(self, batch: Batch, progress: float) -> float:
         """See `Field`."""
         while self._events < len(EVENTS) and progress >= EVENTS[self._events][0]:
             self._prune()
-            if EVENTS[self._events][1] == "refine" and self._resolved(batch):
+            if EVENTS[self._events][1] == "refine" and self._resolved():
                 self._refine()
             self._events += 1
         self.iteration += 1
@@ -147,12 +147,9 @@ class Plenoxels(Field):
         # With beta1 = 0 the mean of the gradients is the gradient, which is where it is already.
         self.stages.adam_array(self.table, gradient, gradient, self._squares, rate, step, sparse=True)
 
-    def _resolved(self, batch: Batch) -> bool:
-        """Whether the pixels of a batch are small enough for cells of half the edge."""
-        centre, edge = (0.0, 4.0) if self.space.contracted else (0.5, 1.0)
-        spacings = batch.radii * 12**0.5 / 2  # of pixels, at a distance of 1
-        widths = spacings * np.linalg.norm(batch.origins - centre, axis=1)
-        return bool(edge / (2 * len(self.occupied)) >= CELL_PIXELS * np.median(widths))
+    def _resolved(self) -> bool:
+        """Whether the photos' pixels are small enough for cells of half the edge."""
+        return self.space.edge / (2 * len(self.occupied)) >= CELL_PIXELS * self.space.pixel
 
     def _prune(self) -> None:
         """Keep the cells with a dense corner, and those around them."""

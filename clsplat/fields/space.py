@@ -36,13 +36,15 @@ class Space:
     """Field coordinates: (x - centre) / scale + shift for a point x of the world.
 
     Without `contracted` the field is the unit cube. With it, the unit ball around 0 has the cameras in it, and the
-    space around it is contracted.
+    space around it is contracted. `pixel` is the width of a pixel of the photos at the centre, the median of all
+    photos, in field coordinates.
     """
 
     centre: NDArray[np.float64]
     scale: float
     contracted: bool
     near: float
+    pixel: float
 
     @classmethod
     def of(cls, views: list[View]) -> "Space":
@@ -56,10 +58,12 @@ class Space:
         cameras = [view.camera for view in views]
         centre = focus_point(cameras)
         distances = [float(np.linalg.norm(camera.position - centre)) for camera in cameras]
+        pixel = float(np.median([d * _spacing(camera) for camera, d in zip(cameras, distances, strict=True)]))
         if any(view.clear is not None for view in views):
-            return cls(centre, 2 * BOX_SHARE * float(np.mean(distances)), False, 0.0)
+            scale = 2 * BOX_SHARE * float(np.mean(distances))
+            return cls(centre, scale, False, 0.0, pixel / scale)
         scale = max(distances)
-        return cls(centre, scale, True, min(camera.near_depth for camera in cameras) / scale)
+        return cls(centre, scale, True, min(camera.near_depth for camera in cameras) / scale, pixel / scale)
 
     @property
     def marching(self) -> Marching:
@@ -67,6 +71,11 @@ class Space:
         if not self.contracted:
             return Marching(STEP, 0.0, 0.0, CUBE_FAR, False)
         return Marching(2 * STEP, CONE, self.near, FAR, True)  # the unit ball is two wide
+
+    @property
+    def edge(self) -> float:
+        """Edge of the grid around the field, in field coordinates: the contracted space is four wide."""
+        return 4.0 if self.contracted else 1.0
 
     @property
     def density_scale(self) -> float:
@@ -97,3 +106,9 @@ class Space:
         """
         widths = np.linalg.norm(camera.rays(u + 1, v) - camera.rays(u, v), axis=1)
         return np.nan_to_num(widths) * 2 / 12**0.5
+
+
+def _spacing(camera: Camera) -> float:
+    """Distance of neighbouring rays in the middle of an image, at a distance of 1."""
+    u, v = np.array([[camera.width / 2], [camera.height / 2]])
+    return float(np.linalg.norm(camera.rays(u + 1, v) - camera.rays(u, v)))

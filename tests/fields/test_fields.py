@@ -116,14 +116,18 @@ def test_rays_without_samples_see_the_background(device, scene, monkeypatch):
 
 def test_cells_are_refined_while_pixels_are_smaller(device, scene):
     """A pixel of these photos is 1/40 of the cube wide in its middle: 16 cells are allowed, 32 are not."""
-    space = Space.of(scene.train)
-    field, batch = (
-        SmallPlenoxels(space, device, 0),
-        Pixels(scene.train, space, WHITE).draw(stream(0, "pixels of a batch"), 100),
-    )
-    assert field._resolved(batch)
+    field = SmallPlenoxels(Space.of(scene.train), device, 0)
+    assert field._resolved()
     field._place(np.ones((16, 16, 16), np.uint8), np.zeros((17**3, 28)))
-    assert not field._resolved(batch)
+    assert not field._resolved()
+
+
+def test_the_finest_level_has_the_resolution_of_the_photos(device, scene):
+    """Photos with half as many pixels along an edge have a finest level with half as many cells."""
+    space = Space.of(scene.train)
+    fine, coarse = (SmallIngp(replace(space, pixel=width), device, 0) for width in (space.pixel, 2 * space.pixel))
+    assert fine.levels.resolutions[-1] == round(1 / (0.4 * space.pixel))
+    assert abs(fine.levels.resolutions[-1] - 2 * coarse.levels.resolutions[-1]) <= 1
 
 
 def test_damaged_files_are_refused(device, tmp_path):
