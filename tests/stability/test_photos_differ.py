@@ -49,7 +49,7 @@ def test_gains_of_photos_cost_little(scene, plain, device, tmp_path):
         on: held_out(train(changed, replace(CONFIG, exposure=on), tmp_path, device), scene, device)
         for on in (False, True)
     }
-    # Measured: 29.1 dB with unchanged photos and with the remedy, 28.9 dB with one learning rate for gains and the rest.
+    # Measured: 29.1 dB with unchanged photos and with the remedy, 28.9 dB with one rate for gains and the rest.
     assert found[False] < plain - 0.8
     assert found[True] > plain - 0.1
 
