@@ -164,7 +164,7 @@ class OptimConfig:
     depth_weight_final: Positive = 0.1
     """This weight at the last iteration; it changes exponentially in between."""
     exposure_lr: Positive = 1e-2
-    """Learning rate of the photos' exposures at the start (original code)."""
+    """Learning rate of the photos' exposures at the start (original code); that of gains is ten times as high."""
     exposure_lr_final: Positive = 1e-3
     """Learning rate of the exposures at the last iteration; it changes exponentially in between."""
     poses_lr: Positive = 1e-3

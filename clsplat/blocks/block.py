@@ -14,7 +14,7 @@ from clsplat.blocks.jobs import Job, digest_of, read_job
 from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.survey import seen_by_block
 from clsplat.config import BACKGROUNDS, TrainConfig
-from clsplat.dataset import load_scene
+from clsplat.dataset import load_scene, read_depth_maps
 from clsplat.errors import ClsplatError, InputError
 from clsplat.formats import load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
@@ -90,9 +90,7 @@ def train_block(
         return result
     job = read_job(job_file)
     start = _start(job_file, job)
-    views = job.views(
-        load_scene(job.data, job.config.data, memory=photo_memory(job.config)).train if loaded is None else loaded
-    )
+    views = job.views(_loaded(job) if loaded is None else loaded)
     device = device or open_device(job.config)
     with held(work):
         if not result.exists():
@@ -102,6 +100,14 @@ def train_block(
             save_gaussians(result, gaussians, job.config.render.mode)
     shutil.rmtree(work, ignore_errors=True)
     return result
+
+
+def _loaded(job: Job) -> list[View]:
+    """The training photos of the dataset, and the depth maps of those of the block."""
+    views = load_scene(job.data, job.config.data, memory=photo_memory(job.config)).train
+    if not job.depths:
+        return views
+    return read_depth_maps([view for view in views if view.name in job.photos], job.data, job.config.data)
 
 
 def _start(job_file: Path, job: Job) -> Gaussians:
@@ -144,7 +150,8 @@ def _seen(
     folder.mkdir(parents=True, exist_ok=True)
     files = Files(folder)
     _, shown = seen_by_block(renderer, start, trains, views, files.write)
-    return files.views(views, budget), shown
+    streamed = files.views(views, budget)
+    return [made.with_depth(view.depth) for made, view in zip(streamed, views, strict=True)], shown
 
 
 def _trained(

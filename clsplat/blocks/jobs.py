@@ -1,7 +1,7 @@
 """Jobs: files that say how a block is trained, named by the digest of everything that its result depends on."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,16 @@ from clsplat.blocks.plan import Block
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
-from clsplat.scene import DIGEST_BYTES, View
+from clsplat.scene import DIGEST_BYTES, DepthMap, View, digest
 from clsplat.training.checkpoint import FREE
 from clsplat.training.inputs import Photo, named
 from clsplat.training.presets import with_settings
 
 BOXES = ("near", "box", "wide")
 """Boxes of a job."""
+
+FIT = ("inverse", "scale", "shift")
+"""Fields of a depth map that its fit to the scene's points determines."""
 
 FORMAT = 1
 """Version of the files of jobs."""
@@ -33,7 +36,8 @@ class Job:
     data: folder of the dataset; scene: name of the file, beside that of the job, of the Gaussians from which the
     block starts and that surround it, named by its digest; near: where these are used; far: the file of those
     elsewhere; box, wide: what the block keeps and trains; photos: digests of pixels and mask, by name; cameras: as
-    the scene has them, by name; config: settings of the block.
+    the scene has them, by name; depths: for photos with a depth map, by name, the digest of its values and its fit to
+    the points; config: settings of the block.
     """
 
     data: str
@@ -44,6 +48,7 @@ class Job:
     wide: Box
     photos: dict[str, Photo]
     cameras: dict[str, dict[str, Any]]
+    depths: dict[str, dict[str, Any]]
     config: TrainConfig
 
     @property
@@ -68,6 +73,7 @@ class Job:
                 for name, photo in self.photos.items()
             },
             "config": asdict(self.config),
+            **({"depths": self.depths} if self.depths else {}),
         }
 
     def write(self, folder: Path) -> Path:
@@ -83,7 +89,7 @@ class Job:
         Raises
         ------
         InputError
-            If one is missing, or has other pixels or another mask than the job was made for.
+            If one is missing, or has other pixels, another mask or other depths than the job was made for.
         """
         by_name = {view.name: view for view in loaded}
         missing = [name for name in self.photos if name not in by_name]
@@ -99,7 +105,20 @@ class Job:
                 f"{self.data}: expected the photos that the block was planned with, found other pixels or masks "
                 f"({named(other)}); start a new run in another folder"
             )
-        return [view.with_camera(_camera(self.cameras[view.name])) for view in chosen]
+        posed = [view.with_camera(_camera(self.cameras[view.name])) for view in chosen]
+        return [view.with_depth(self._depth(view)) for view in posed]
+
+    def _depth(self, view: View) -> DepthMap | None:
+        """The depth map of a photo as the whole scene is trained with it."""
+        if view.name not in self.depths:
+            return None
+        values, fit = self.depths[view.name]["values"], self.depths[view.name]["fit"]
+        if view.depth is None or digest(view.depth.values) != values:
+            raise InputError(
+                f"{self.data}: expected the depth map that the block was planned with, found another one "
+                f"({view.name}); start a new run in another folder"
+            )
+        return replace(view.depth, **fit)
 
 
 def make_job(
@@ -109,7 +128,12 @@ def make_job(
     names = [view.name for view in views]
     cameras = {view.name: asdict(view.camera) | {"viewmat": view.camera.viewmat.tolist()} for view in views}
     own = {name: photos[name] for name in names}
-    return Job(str(data), scene, EVERYWHERE, scene, block.box, block.wide, own, cameras, config)
+    depths = {
+        view.name: {"values": digest(depth.values), "fit": {name: getattr(depth, name) for name in FIT}}
+        for view in views
+        if (depth := view.depth)
+    }
+    return Job(str(data), scene, EVERYWHERE, scene, block.box, block.wide, own, cameras, depths, config)
 
 
 def read_job(path: Path) -> Job:
@@ -128,16 +152,17 @@ def read_job(path: Path) -> Job:
         scenes: dict[str, Any] = {name: str(content[name]) for name in ("data", "scene", "far")}
         photos = {name: Photo(str(p["pixels"]), str(p["mask"]), []) for name, p in content["photos"].items()}
         cameras = {name: dict(p["camera"]) for name, p in content["photos"].items()}
+        depths = {str(name): dict(depth) for name, depth in content.get("depths", {}).items()}
         config = with_settings(TrainConfig(), content["config"], str(path))
-        job = Job(**scenes, **boxes, photos=photos, cameras=cameras, config=config)
-        digest = job.digest
+        job = Job(**scenes, **boxes, photos=photos, cameras=cameras, depths=depths, config=config)
+        found = job.digest
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     except (AttributeError, IndexError, KeyError, RecursionError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: expected a job that `clsplat train --blocks` wrote, found {error!r}") from error
-    if path.stem != digest:
+    if path.stem != found:
         raise InputError(f"{path}: expected a job as it was written, found a changed one; plan the run again")
     return job
 

@@ -167,8 +167,26 @@ def with_depth_maps(scene: Scene, path: str | Path, config: DataConfig, tell: Ca
     Raises
     ------
     InputError
+        As `read_depth_maps`; if no map agrees with the points, or there are none.
+    """
+    return aligned(replace(scene, train=read_depth_maps(scene.train, path, config)), tell)
+
+
+def read_depth_maps(views: list[View], path: str | Path, config: DataConfig) -> list[View]:
+    """Read the depth maps of photos, with the values of the files.
+
+    Parameters
+    ----------
+    views : list of View
+        Photos of the dataset.
+    path, config
+        As for `with_depth_maps`.
+
+    Raises
+    ------
+    InputError
         If a photo has no depth map, or one of another shape or that cannot be read; if the photos are faces of
-        panoramas; if no map agrees with the points, or there are none.
+        panoramas.
     """
     assert config.depth is not None
     path = Path(path)
@@ -181,11 +199,10 @@ def with_depth_maps(scene: Scene, path: str | Path, config: DataConfig, tell: Ca
             "--depth: expected photos that train whole, found panoramas, which train as faces; use --panoramas whole"
         )
     photos = {photo.name: photo for photo in dataset.photos}
-    files = {view.name: find_depth_map(folder, view.name) for view in scene.train}
+    files = {view.name: find_depth_map(folder, view.name) for view in views}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         maps = pool.map(lambda name: load_depth_map(files[name], photos[name], dataset), files)
-        train = [view.with_depth(depth) for view, depth in zip(scene.train, maps, strict=True)]
-    return aligned(replace(scene, train=train), tell)
+        return [view.with_depth(depth) for view, depth in zip(views, maps, strict=True)]
 
 
 def _full_size(path: Path, config: DataConfig) -> Dataset:

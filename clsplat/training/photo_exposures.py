@@ -26,6 +26,11 @@ RESPONSE = np.eye(3, 6)
 FALLOFF = 5
 """The column of the vignetting."""
 
+GAIN_RATE = 10.0
+"""Learning rate of the gains, the diagonal of a map, as a multiple of that of the other numbers. Most changes of a
+camera are gains. Adam moves all numbers by about the same step: at one rate, it would mix channels and shift black
+in place of most of a gain (docs/stages/exposure.md)."""
+
 
 def start(names: list[str], response: bool = False) -> PerPhoto:
     """Identity maps, (V, 3, 4) for V photos; with `response` (V, 3, 6), with curves and vignetting."""
@@ -34,12 +39,13 @@ def start(names: list[str], response: bool = False) -> PerPhoto:
 
 
 def update(exposures: PerPhoto, name: str, v_affine: Array, progress: float, config: OptimConfig) -> None:
-    """Take a step on a photo's map by its gradient, of the shape of the map; the rate falls with progress, 0 to 1,
+    """Take a step on a photo's map by its gradient, of the shape of the map; the rates fall with progress, 0 to 1,
     through the training."""
     rate = config.exposure_lr * (config.exposure_lr_final / config.exposure_lr) ** progress
+    rates = np.where(np.eye(*v_affine.shape) == 1, GAIN_RATE * rate, rate)
     gradient = v_affine.copy()
     gradient[:, FALLOFF:] = v_affine[:, FALLOFF:].mean(axis=0)
-    exposures.of(name)[:] += exposures.step(name, gradient, rate, config)
+    exposures.of(name)[:] += exposures.step(name, gradient, rates, config)
     values = exposures.values
     values[:, :, :FALLOFF] += RESPONSE[:, : min(FALLOFF, values.shape[2])] - values[:, :, :FALLOFF].mean(axis=0)
     values[:, :, FALLOFF:] = np.minimum(exposures.of(name)[:, FALLOFF:], 0)  # a lens darkens the corners

@@ -10,7 +10,6 @@ from clsplat.config import CoarseConfig, TrainConfig
 from clsplat.dataset import load_scene, with_depth_maps, with_points
 from clsplat.dataset.finding import mask_folder
 from clsplat.dataset.near_planes import with_near_planes
-from clsplat.errors import InputError
 from clsplat.ranges import check, parse_bytes
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
@@ -74,8 +73,6 @@ def prepare(
         masks = str(mask_folder(Path(path), config.data.masks).resolve())
         config = replace(config, data=replace(config.data, masks=masks))
     if config.data.depth is not None:
-        if config.blocks != 1:
-            raise InputError("--depth: expected not with --blocks, which train without depth maps; leave out one")
         maps = str(mask_folder(Path(path), config.data.depth, "--depth").resolve())
         config = replace(config, data=replace(config.data, depth=maps))
     if scene is None:

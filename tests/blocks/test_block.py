@@ -19,6 +19,7 @@ from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
+from clsplat.scene import DepthMap
 from clsplat.show.training_curve import read_log
 
 
@@ -183,3 +184,27 @@ def test_a_second_training_is_surrounded_by_the_first_ones(planned: Planned, dev
         start.means, np.concatenate([first.means[inside], far.means[~near.contains(far.means)]])
     )
     assert 0 < inside.sum() < len(first)
+
+
+def test_blocks_train_with_depth_maps(planned: Planned, dataset: Path, device: Device, tmp_path: Path) -> None:
+    """The maps of a block are scaled as in the whole scene, in this process and in another that reads them itself."""
+    depth, maps = tmp_path / "depth", {}
+    depth.mkdir()
+    for k, view in enumerate(planned.scene.train):
+        values = np.full(view.image.shape[:2], 3.0 + 0.1 * k, np.float32)
+        np.save(depth / f"{Path(view.name).stem}.npy", values)
+        maps[view.name] = DepthMap(values, scale=0.9, shift=0.1)
+    scene = replace(planned.scene, train=[view.with_depth(maps[view.name]) for view in planned.scene.train])
+    config = replace(planned.config, data=replace(planned.config.data, depth=str(depth)))
+    job = plan_blocks(scene, config, device, dataset, tmp_path / "out", unseen, lambda text: None)[0][0]
+    without = train_block(planned.jobs[0], planned.scene.train, device).read_bytes()
+    here = train_block(job, scene.train, device)
+    expected = here.read_bytes()
+    assert expected != without
+    here.unlink()
+    assert train_block(job, None, device).read_bytes() == expected
+    here.unlink()
+    for file in depth.iterdir():
+        np.save(file, np.load(file) + 1)
+    with pytest.raises(InputError, match="expected the depth map that the block was planned with, found another one"):
+        train_block(job, None, device)

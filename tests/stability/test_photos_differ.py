@@ -49,9 +49,9 @@ def test_gains_of_photos_cost_little(scene, plain, device, tmp_path):
         on: held_out(train(changed, replace(CONFIG, exposure=on), tmp_path, device), scene, device)
         for on in (False, True)
     }
-    # Measured: 28.5 dB with unchanged photos, 27.4 dB without the remedy, 28.5 dB with it.
+    # Measured: 29.1 dB with unchanged photos and with the remedy, 28.9 dB with one rate for gains and the rest.
     assert found[False] < plain - 0.8
-    assert found[True] > plain - 0.3
+    assert found[True] > plain - 0.1
 
 
 def bent(view, rng):

@@ -112,7 +112,6 @@ def test_refusals_name_the_file(data: Path, tmp_path: Path, capsys: pytest.Captu
     )
     (data / "depth" / "4.npy").unlink()
     (data / "depth" / "4.png").write_bytes(kept)
-    assert "--blocks" in fails(capsys, "train", data, "-o", tmp_path / "d", *OPTIONS, "--blocks", 2)
     message = fails(capsys, "train", data, "-o", tmp_path / "e", "--method", "plenoxels", "--depth", "depth")
     assert "found depth" in message
 
