@@ -103,7 +103,8 @@ def test_one_photo_at_many_poses(scene, trained):
 def test_many_photos_at_one_pose(scene, trained, points):
     same = replace(scene, train=[replace(view, camera=scene.train[0].camera) for view in scene.train])
     same = same if points else replace(same, points=same.points[:0], colors=same.colors[:0])
-    assert trained(same, "--init.random-points", 500).gain > 0.3
+    # In 40 iterations, rates that fall at the end learn too little of a random start.
+    assert trained(same, "--init.random-points", 500, "--optim.rates-final", 1).gain > 0.3
 
 
 def test_two_photos(scene, trained):

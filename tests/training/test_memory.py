@@ -191,7 +191,7 @@ def test_growth_stops_where_memory_ends(tmp_path: Path, strategy: str) -> None:
     device = Device(memory_limit=limit)
     with pytest.warns(UserWarning, match=r"no more than \d+ Gaussians fit the memory: growth stops"):
         held = train(scene, config, tmp_path, device)
-    assert 1500 < len(held) < 0.7 * grown
+    assert 1500 < len(held) < 0.8 * grown  # about half of what growth adds fits; a round takes memory, too
     assert device.memory_peak <= limit
     numbers = [json.loads(line)["num_gaussians"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert numbers[-1] == len(held)
