@@ -222,7 +222,7 @@ class McmcConfig:
     """Fraction of the iterations after which Gaussians are no longer relocated or added (gsplat: 25 000 of 30
     000)."""
     every: Count = 100
-    """Iterations between two rounds."""
+    """Iterations between two rounds; fewer with --size auto in runs shorter than 3000, in proportion."""
     growth: NonNegative = 0.05
     """Gaussians added per round, as a fraction of all; more if the cap would otherwise be reached too late."""
     full_fraction: Fraction = 0.25
@@ -249,7 +249,7 @@ class ErrorConfig:
     stop_fraction: Fraction = 0.8
     """Fraction of the iterations after which Gaussians are no longer split or removed."""
     every: Count = 100
-    """Iterations between two rounds."""
+    """Iterations between two rounds; fewer with --size auto in runs shorter than 3000, in proportion."""
     growth: NonNegative = 0.05
     """Gaussians added per round, as a fraction of all; more if the cap would otherwise be reached too late."""
     full_fraction: Fraction = 0.4

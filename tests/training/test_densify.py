@@ -1,6 +1,7 @@
 """Every strategy keeps rows, moments and statistics in step; ADC does what the paper says."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -221,6 +222,17 @@ def test_growth_takes_nothing_away() -> None:
 def test_the_search_grows_by_a_quarter_up_to_its_cap() -> None:
     schedule = Schedule(replace(CONFIG, size="auto", max_gaussians=None), ErrorConfig())
     assert [schedule.count_after(200, 1000, cap) for cap in (10_000, 1050)] == [1250, 1050]
+
+
+@pytest.mark.parametrize(("size", "rounds"), [("auto", 21), ("fixed", 10)])
+def test_the_search_has_as_many_rounds_in_short_runs(size: Literal["auto", "fixed"], rounds: int) -> None:
+    """Since a round grows by at most a quarter."""
+
+    def due(iterations: int) -> int:
+        config = replace(CONFIG, size=size, iterations=iterations, max_gaussians=5000)
+        return sum(map(Schedule(config, ErrorConfig()).due, range(1, iterations + 1)))
+
+    assert (due(3000), due(1500)) == (21, rounds)
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "error"])

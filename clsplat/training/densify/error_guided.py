@@ -57,7 +57,7 @@ class ErrorGuided(Strategy):
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         super().__init__(config, extent, n)
         self.config, self.schedule = config.error, Schedule(config, config.error)
-        self.last = config.iterations - config.error.every
+        self.last = config.iterations - self.schedule.every
         self.statistics = {"differences": np.zeros(n, np.float32)}
 
     def penalties(self, n: int) -> tuple[float, float]:

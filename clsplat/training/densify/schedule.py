@@ -5,6 +5,7 @@ from typing import Protocol
 
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
+from clsplat.training.run_length import FEWEST_ITERATIONS
 
 MOST_GROWTH = 1.25
 """Factor by which the number of Gaussians grows in a round with ``--size auto``, up to the cap (measured:
@@ -27,8 +28,11 @@ class Growth(Protocol):
 
 
 class Schedule:
-    """Rounds at equal intervals, and growth by equal factors to the cap. With ``--size auto``, which raises the cap
-    step by step, the factor is `MOST_GROWTH`.
+    """Rounds at equal intervals, and growth by equal factors to the cap.
+
+    With ``--size auto``, which raises the cap step by step, the factor is `MOST_GROWTH`, whatever the length of the
+    run. Runs shorter than `FEWEST_ITERATIONS` therefore have shorter intervals, in proportion: as many rounds as that
+    run, and as much growth.
 
     Raises
     ------
@@ -42,11 +46,12 @@ class Schedule:
                 f"--max-gaussians: expected with --strategy {config.strategy}, which grows to that number, found "
                 "none; --size auto finds one"
             )
-        self.every, self.growth = settings.every, settings.growth
+        self.stepwise = config.size == "auto"
+        share = min(1.0, config.iterations / FEWEST_ITERATIONS) if self.stepwise else 1.0
+        self.every, self.growth = max(1, round(settings.every * share)), settings.growth
         self.start = config.shortened(settings.start)
         self.full = round(settings.full_fraction * config.iterations)
         self.stop = round(settings.stop_fraction * config.iterations)
-        self.stepwise = config.size == "auto"
 
     def due(self, iteration: int) -> bool:
         """Whether a round is due after an iteration, counted from 1."""
