@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
 from clsplat.blocks.block import Progress, log_of, read_scene, result_of, train_block
@@ -27,6 +28,8 @@ from clsplat.blocks.plan import (
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians, save_gaussians
+from clsplat.formats.ply import save_ply_parts
+from clsplat.formats.ply_parts import PlyParts
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
 from clsplat.run_log import LOG
@@ -125,8 +128,11 @@ def plan_refinement(jobs: list[Path], blocks: list[Block]) -> list[Path]:
     list of Path
         The files of the jobs, in the order of the blocks.
     """
-    scene, first = merge(jobs), [read_job(job) for job in jobs]
-    name = _save(scene, jobs[0].parent, first[0].config)
+    folder, first = jobs[0].parent, [read_job(job) for job in jobs]
+    with TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as beside:
+        merge(jobs, Path(beside) / "scene.ply")
+        scene = load_gaussians(Path(beside) / "scene.ply")[0]
+    name = _save(scene, folder, first[0].config)
     refined = []
     for job, block in zip(first, blocks, strict=True):
         settings = refining_config(job.config, int(block.wide.contains(scene.means).sum()))
@@ -200,24 +206,35 @@ def run_here(jobs: list[Path], scene: Scene, device: "Device", watch: Watch) -> 
                 train_block(job, scene.train, device, progress)
 
 
-def merge(jobs: list[Path]) -> Gaussians:
-    """Join the results of blocks in their order, whoever computed them.
+def merge(jobs: list[Path], path: Path, offset: NDArray[np.float64] | None = None) -> int:
+    """Join the results of blocks in their order, whoever computed them, into a PLY.
+
+    A part of a result is in memory at a time, so that the memory does not grow with the scene.
+
+    Parameters
+    ----------
+    jobs : list of Path
+    path : Path
+        The file to write, whole or not at all: in the scene's coordinates, with the highest degree of spherical
+        harmonics that a block has.
+    offset : (3,) array, optional
+        What was subtracted from the world's coordinates, in world units.
 
     Returns
     -------
-    Gaussians
-        In the scene's coordinates, on the host, with the highest degree of spherical harmonics that a block has.
+    int
+        The number of Gaussians.
 
     Raises
     ------
     InputError
-        If a result cannot be read.
+        If a result cannot be read, or the file cannot be written.
     """
-    parts = [load_gaussians(result_of(job))[0] for job in jobs]
-    most = max(part.sh.shape[1] for part in parts)
-    for part in parts:
-        part.sh = np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))
-    return Gaussians.concatenate(parts)
+    results = [PlyParts(result_of(job)) for job in jobs]
+    count, most = sum(rows.count for rows in results), max(rows.coefficients for rows in results)
+    parts = (part for rows in results for _, part in rows.chunks())
+    save_ply_parts(path, parts, count, most, results[0].mode, offset)
+    return count
 
 
 def write_log(out: Path, jobs: list[Path], last: dict[str, Any]) -> None:
