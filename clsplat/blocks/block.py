@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clsplat.atomic import replacing
 from clsplat.blocks.jobs import Job, read_job
 from clsplat.blocks.partition import EVERYWHERE
-from clsplat.blocks.parts import bounds_of, read_index, read_part
+from clsplat.blocks.parts import Part, bounds_of, read_index, read_part
 from clsplat.blocks.sight import Bounds, seen
 from clsplat.blocks.survey import seen_by_block
 from clsplat.config import BACKGROUNDS, TrainConfig
@@ -113,24 +113,36 @@ def _loaded(job: Job) -> list[View]:
     return read_depth_maps([view for view in views if view.name in job.photos], job.data, job.config.data)
 
 
-def _start(job_file: Path, job: Job) -> Gaussians:
-    """The Gaussians from which a block starts, and those around it that its photos may show, in their order."""
+def needed_parts(job_file: Path, job: Job) -> Iterator[tuple[bool, Part]]:
+    """Yield the parts of scenes that a block trains or its photos may show, and whether the part's Gaussians are used
+    in the surroundings that are drawn as they were trained, or beyond them; in their order.
 
-    def chosen(name: str, near: bool) -> Iterator[Gaussians]:
-        parts = read_index(job_file.with_name(name))
+    Raises
+    ------
+    InputError
+        If an index cannot be read or has been changed.
+    """
+    for near in (True,) if job.near == EVERYWHERE else (True, False):
+        parts = read_index(job_file.with_name(job.scene if near else job.far))
         bounds = bounds_of(parts)
-        wanted = job.wide.meets(bounds.low, bounds.high) | seen(cameras, bounds, rays)
+        wanted = job.wide.meets(bounds.low, bounds.high) | seen(job.posed(), bounds, _along_rays(job))
         if near:
             wanted &= job.near.meets(bounds.low, bounds.high)
-        for part in (part for part, needed in zip(parts, wanted, strict=True) if needed):
-            gaussians = with_coefficients(read_part(job_file.parent, part), coefficients)
-            here = gaussians.take(job.near.contains(gaussians.means) == near)
-            yield here.take(job.wide.contains(here.means) | seen(cameras, Bounds.of(here), rays))
+        yield from ((near, part) for part, needed in zip(parts, wanted, strict=True) if needed)
 
-    cameras, rays = job.posed(), job.config.render.projection == "ray"
-    coefficients = (job.config.init.sh_degree + 1) ** 2
-    found = list(chosen(job.scene, True))
-    return Gaussians.concatenate(found if job.near == EVERYWHERE else [*found, *chosen(job.far, False)])
+
+def _along_rays(job: Job) -> bool:
+    return job.config.render.projection == "ray"
+
+
+def _start(job_file: Path, job: Job) -> Gaussians:
+    """The Gaussians from which a block starts, and those around it that its photos may show, in their order."""
+    cameras, coefficients, found = job.posed(), (job.config.init.sh_degree + 1) ** 2, []
+    for near, part in needed_parts(job_file, job):
+        gaussians = with_coefficients(read_part(job_file.parent, part), coefficients)
+        here = gaussians.take(job.near.contains(gaussians.means) == near)
+        found.append(here.take(job.wide.contains(here.means) | seen(cameras, Bounds.of(here), _along_rays(job))))
+    return Gaussians.concatenate(found)
 
 
 def _seen(

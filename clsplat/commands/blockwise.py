@@ -75,7 +75,7 @@ def _run(jobs: list[Path], scene: "Scene", device: "Device", watch: "Watch", whe
     if where.scheduler is not None:
         from clsplat.blocks.cluster import run_on_cluster
 
-        run_on_cluster(where.scheduler, jobs, say)
+        run_on_cluster(where.scheduler, jobs, scene.train, say)
     elif len(alike := devices_like(device)) > 1:
         say(f"blocks: {len(alike)} devices of this name train one each")
         run_on_devices(jobs, alike, say)
