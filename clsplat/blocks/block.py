@@ -13,7 +13,7 @@ from clsplat.atomic import replacing
 from clsplat.blocks.jobs import Job, read_job
 from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.parts import Part, bounds_of, read_index, read_part
-from clsplat.blocks.sight import Bounds, seen
+from clsplat.blocks.sight import Bounds, may_see, seen
 from clsplat.blocks.survey import seen_by_block
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset import load_scene, read_depth_maps
@@ -141,7 +141,8 @@ def _start(job_file: Path, job: Job) -> Gaussians:
     for near, part in needed_parts(job_file, job):
         gaussians = with_coefficients(read_part(job_file.parent, part), coefficients)
         here = gaussians.take(job.near.contains(gaussians.means) == near)
-        found.append(here.take(job.wide.contains(here.means) | seen(cameras, Bounds.of(here), _along_rays(job))))
+        looking = [camera for camera in cameras if may_see(camera, bounds_of([part]), _along_rays(job))[0]]
+        found.append(here.take(job.wide.contains(here.means) | seen(looking, Bounds.of(here), _along_rays(job))))
     return Gaussians.concatenate(found)
 
 
