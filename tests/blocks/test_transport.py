@@ -1,5 +1,8 @@
 """Blocks of workers without a shared folder: the same bytes, in checked chunks, and errors in a sentence."""
 
+import os
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -42,8 +45,8 @@ def held(dask_worker: Any) -> list[str]:
 
 
 @contextmanager
-def two_workers() -> Iterator[Any]:
-    settings = {"threads_per_worker": 1, "dashboard_address": None, "resources": {"CL": 1}}
+def two_workers(**options: Any) -> Iterator[Any]:
+    settings = {"threads_per_worker": 1, "dashboard_address": None, "resources": {"CL": 1}} | options
     with distributed.LocalCluster(n_workers=2, processes=True, **settings) as started:
         yield started
 
@@ -67,6 +70,43 @@ def test_workers_without_a_shared_folder_give_the_same_bytes(
     names = {name for names in folders.values() for name in names}
     assert {Path(name).suffix for name in names} == {".json", ".parts", ".rows", ".npy"}
     assert not list(planned.jobs[0].parent.glob(".*"))
+
+
+APART = """
+from clsplat.blocks import cluster
+cluster._is_here = lambda job: False
+"""
+"""Makes each worker share no folder, also one that dask starts again."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reached", ["*.npy", "*/checkpoint.npz", "*.ply"])
+def test_a_worker_without_a_shared_folder_is_killed(
+    dataset: Path, device: Device, tmp_path: Path, reached: str
+) -> None:
+    """Kill a worker that gets photos, trains, or has a result that it has not sent, once."""
+    expected = plan(dataset, device, tmp_path / "alone", 3)
+    results = [train_block(job, expected.scene.train, device).read_bytes() for job in expected.jobs]
+    planned, ends, killed = plan(dataset, device, tmp_path / "run", 3), threading.Event(), []
+
+    def hunt() -> None:
+        while not ends.wait(0.002) and not killed:
+            for pid, folder in list(workers.values()):
+                if any(Path(folder).glob(f"{cluster.CACHE}/{reached}")):
+                    os.kill(pid, signal.SIGKILL)
+                    killed.append(pid)
+                    break
+
+    with two_workers(preload=[APART]) as started, distributed.Client(started) as client:
+        workers = client.run(lambda dask_worker: (os.getpid(), dask_worker.local_directory))
+        hunter = threading.Thread(target=hunt)
+        hunter.start()
+        try:
+            run_on_cluster(started.scheduler_address, planned.jobs, planned.scene.train, lambda text: None)
+        finally:
+            ends.set()
+            hunter.join()
+    assert killed and [result_of(job).read_bytes() for job in planned.jobs] == results
 
 
 class Near:
