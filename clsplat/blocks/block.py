@@ -1,7 +1,7 @@
 """Training of a block: a function of files, whose result is a file that exists whole or not at all."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,13 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
-from clsplat.blocks.jobs import Job, digest_of, read_job
+from clsplat.blocks.jobs import Job, read_job
 from clsplat.blocks.partition import EVERYWHERE
+from clsplat.blocks.parts import Part, bounds_of, read_index, read_part
+from clsplat.blocks.sight import Bounds, may_see, seen
 from clsplat.blocks.survey import seen_by_block
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset import load_scene, read_depth_maps
-from clsplat.errors import ClsplatError, InputError
-from clsplat.formats import load_gaussians, save_gaussians
+from clsplat.errors import ClsplatError
+from clsplat.formats import save_gaussians
+from clsplat.formats.ply import with_coefficients
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import without_invisible
 from clsplat.renderer import Renderer
@@ -110,29 +113,37 @@ def _loaded(job: Job) -> list[View]:
     return read_depth_maps([view for view in views if view.name in job.photos], job.data, job.config.data)
 
 
-def _start(job_file: Path, job: Job) -> Gaussians:
-    """The Gaussians from which a block starts and those around it."""
-    scene = read_scene(job_file.with_name(job.scene), job.config)
-    scene = scene.take(job.near.contains(scene.means))
-    if job.near == EVERYWHERE:
-        return scene
-    far = read_scene(job_file.with_name(job.far), job.config)
-    return Gaussians.concatenate([scene, far.take(~job.near.contains(far.means))])
-
-
-def read_scene(path: Path, config: TrainConfig) -> Gaussians:
-    """Read a scene, whose file has its digest as its name, with all bands of the spherical harmonics.
+def needed_parts(job_file: Path, job: Job) -> Iterator[tuple[bool, Part]]:
+    """Yield the parts of scenes that a block trains or its photos may show, and whether the part's Gaussians are used
+    in the surroundings that are drawn as they were trained, or beyond them; in their order.
 
     Raises
     ------
     InputError
-        If the file cannot be read or has been changed.
+        If an index cannot be read or has been changed.
     """
-    gaussians = load_gaussians(path)[0]
-    if digest_of(path.read_bytes()) != path.stem:
-        raise InputError(f"{path}: expected a scene as it was written, found a changed file")
-    missing = (config.init.sh_degree + 1) ** 2 - gaussians.sh.shape[1]
-    return replace(gaussians, sh=np.pad(gaussians.sh, ((0, 0), (0, max(0, missing)), (0, 0))))
+    for near in (True,) if job.near == EVERYWHERE else (True, False):
+        parts = read_index(job_file.with_name(job.scene if near else job.far))
+        bounds = bounds_of(parts)
+        wanted = job.wide.meets(bounds.low, bounds.high) | seen(job.posed(), bounds, _along_rays(job))
+        if near:
+            wanted &= job.near.meets(bounds.low, bounds.high)
+        yield from ((near, part) for part, needed in zip(parts, wanted, strict=True) if needed)
+
+
+def _along_rays(job: Job) -> bool:
+    return job.config.render.projection == "ray"
+
+
+def _start(job_file: Path, job: Job) -> Gaussians:
+    """The Gaussians from which a block starts, and those around it that its photos may show, in their order."""
+    cameras, coefficients, found = job.posed(), (job.config.init.sh_degree + 1) ** 2, []
+    for near, part in needed_parts(job_file, job):
+        gaussians = with_coefficients(read_part(job_file.parent, part), coefficients)
+        here = gaussians.take(job.near.contains(gaussians.means) == near)
+        looking = [camera for camera in cameras if may_see(camera, bounds_of([part]), _along_rays(job))[0]]
+        found.append(here.take(job.wide.contains(here.means) | seen(looking, Bounds.of(here), _along_rays(job))))
+    return Gaussians.concatenate(found)
 
 
 def _seen(

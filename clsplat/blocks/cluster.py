@@ -5,7 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.blocks.block import result_of, train_block
+from clsplat.blocks.jobs import read_job
+from clsplat.blocks.transport import Desk, train_from
 from clsplat.errors import InputError
+from clsplat.scene import View
 
 RESOURCE = "CL"
 """Resource that a worker declares for each of its OpenCL devices, as in ``dask worker --resources "CL=1"``."""
@@ -14,26 +17,32 @@ RETRIES = 3
 """Times that a block is trained again elsewhere when its worker dies or raises an error; it continues from its last
 checkpoint."""
 
+CACHE = "clsplat"
+"""Folder of a worker that shares none, in its own one (``dask worker --local-directory``), which dask removes."""
 
-def run_on_cluster(address: str, jobs: list[Path], tell: Callable[[str], None]) -> None:
+
+def run_on_cluster(address: str, jobs: list[Path], views: list[View], tell: Callable[[str], None]) -> None:
     """Train the blocks that have no result on the workers of a scheduler.
 
     A task is named by the job's digest and its result is a file, so that it does not matter who trains a block, when,
-    and how often it was tried.
+    and how often it was tried. A worker that sees the job and the dataset under their paths works there. Another one
+    gets its data through the scheduler (`clsplat.blocks.transport`).
 
     Parameters
     ----------
     address : str
         Such as tcp://host:8786.
     jobs : list of Path
-        In a folder that the workers see under the same path, as they do the dataset.
+        All in one folder.
+    views : list of View
+        The training photos, for workers without a shared folder.
     tell : callable
         Called with a sentence when a block is done.
 
     Raises
     ------
     InputError
-        If dask.distributed is not installed, there is no scheduler, or the workers do not share the folder.
+        If dask.distributed is not installed, there is no scheduler, or a worker has another folder of the same path.
     ClsplatError
         Those of `train_block`, from a worker.
     """
@@ -48,28 +57,35 @@ def run_on_cluster(address: str, jobs: list[Path], tell: Callable[[str], None]) 
     except (OSError, ValueError) as error:  # TimeoutError is an OSError
         raise InputError(f"--scheduler: expected a scheduler of dask at {address}, found none: {error}") from error
     waiting = [job.resolve() for job in jobs if not result_of(job).exists()]
-    with client:
+    with client, Desk(client, jobs[0].parent, views) as desk:
         _tell_missing(client, tell)
-        tasks = {
-            client.submit(_train, str(job), key=f"clsplat-{job.stem}", resources={RESOURCE: 1}, retries=RETRIES): job
-            for job in waiting
-        }
+        how: dict[str, Any] = {"resources": {RESOURCE: 1}, "retries": RETRIES}
+        tasks = {client.submit(_train, str(job), desk.name, key=f"clsplat-{job.stem}", **how): job for job in waiting}
         for number, task in enumerate(as_completed(list(tasks)), 1):
             worker = task.result()
             if not result_of(tasks[task]).exists():
                 raise InputError(
-                    f"{tasks[task].parent}: expected a folder that this machine shares with the workers, found no "
-                    f"result after {worker} had written one; choose a shared folder with -o"
+                    f"{tasks[task].parent}: expected a folder that workers share or do not have, found no result "
+                    f"after {worker} had written one; choose another folder with -o"
                 )
             tell(f"blocks: {number} of {len(tasks)} done, the last by {worker}")
 
 
-def _train(job: str) -> str:
+def _train(job: str, desk: str) -> str:
     """Train a block on a worker; return the name of the worker."""
     from distributed import get_worker
 
-    train_block(job)
-    return str(get_worker().name)
+    worker = get_worker()
+    if _is_here(Path(job)):
+        train_block(job)
+    else:
+        train_from(desk, Path(job).name, Path(worker.local_directory) / CACHE)
+    return str(worker.name)
+
+
+def _is_here(job: Path) -> bool:
+    """Whether the worker sees a job and its dataset: it shares the folders."""
+    return job.exists() and Path(read_job(job).data).exists()
 
 
 def _tell_missing(client: Any, tell: Callable[[str], None]) -> None:

@@ -25,7 +25,7 @@ BOXES = ("near", "box", "wide")
 FIT = ("inverse", "scale", "shift")
 """Fields of a depth map that its fit to the scene's points determines."""
 
-FORMAT = 1
+FORMAT = 2
 """Version of the files of jobs."""
 
 
@@ -33,8 +33,8 @@ FORMAT = 1
 class Job:
     """How a block is trained.
 
-    data: folder of the dataset; scene: name of the file, beside that of the job, of the Gaussians from which the
-    block starts and that surround it, named by its digest; near: where these are used; far: the file of those
+    data: folder of the dataset; scene: name of the index (`clsplat.blocks.parts`), beside the job's file, of the
+    Gaussians from which the block starts and that surround it; near: where these are used; far: the index of those
     elsewhere; box, wide: what the block keeps and trains; photos: digests of pixels and mask, by name; cameras: as
     the scene has them, by name; depths: for photos with a depth map, by name, the digest of its values and its fit to
     the points; config: settings of the block.
@@ -82,6 +82,10 @@ class Job:
         with replacing(path) as file:
             file.write((json.dumps(self.content(), indent=1) + "\n").encode())
         return path
+
+    def posed(self) -> list[Camera]:
+        """The cameras of the photos, in their order."""
+        return [_camera(self.cameras[name]) for name in self.photos]
 
     def views(self, loaded: list[View]) -> list[View]:
         """The photos of the block with its cameras, of those that have been loaded.

@@ -26,6 +26,10 @@ class Box(NamedTuple):
         """Whether points (N, 3) are in the box, (N,)."""
         return np.asarray(((points >= self.low) & (points < self.high)).all(axis=1))
 
+    def meets(self, low: Array, high: Array) -> NDArray[np.bool_]:
+        """Whether boxes from `low` to `high` (N, 3), which contain both, may share a point with this one, (N,)."""
+        return np.asarray(((high >= self.low) & (low < self.high)).all(axis=1))
+
     def widened(self, points: Array, by: float) -> "Box":
         """The box with a margin of the width `by`, in extents of those of the points (N, 3) that are in it."""
         inside = points[self.contains(points)]

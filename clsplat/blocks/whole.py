@@ -6,14 +6,15 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
-from clsplat.blocks.block import Progress, log_of, read_scene, result_of, train_block
+from clsplat.blocks.block import Progress, log_of, result_of, train_block
 from clsplat.blocks.jobs import digest_of, make_job, read_job
+from clsplat.blocks.parts import read_index, read_part, read_scene, write_index
 from clsplat.blocks.plan import (
     COARSE_FACTOR,
     Block,
@@ -26,8 +27,9 @@ from clsplat.blocks.plan import (
 )
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
-from clsplat.formats import load_gaussians, save_gaussians
-from clsplat.gaussians import Gaussians
+from clsplat.formats import save_gaussians
+from clsplat.formats.ply import save_ply_parts
+from clsplat.formats.ply_parts import PlyParts
 from clsplat.renderer import Renderer
 from clsplat.run_log import LOG
 from clsplat.scene import Scene, in_turn
@@ -92,7 +94,7 @@ def plan_blocks(
     folder.mkdir(parents=True, exist_ok=True)
     file, seconds = _coarse(scene, config, device, folder, watch)
     photos = _read_photos(scene)
-    coarse = read_scene(file, config)
+    coarse = read_scene(file, (config.init.sh_degree + 1) ** 2)
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     plan = make_plan(coarse, scene, config, renderer)
     if len(plan.blocks) == 1:
@@ -125,23 +127,17 @@ def plan_refinement(jobs: list[Path], blocks: list[Block]) -> list[Path]:
     list of Path
         The files of the jobs, in the order of the blocks.
     """
-    scene, first = merge(jobs), [read_job(job) for job in jobs]
-    name = _save(scene, jobs[0].parent, first[0].config)
+    folder, first = jobs[0].parent, [read_job(job) for job in jobs]
+    index = write_index([result_of(job) for job in jobs])
+    counts = np.zeros(len(blocks), int)
+    for part in read_index(index):
+        means = read_part(folder, part).means
+        counts += [block.wide.contains(means).sum() for block in blocks]
     refined = []
-    for job, block in zip(first, blocks, strict=True):
-        settings = refining_config(job.config, int(block.wide.contains(scene.means).sum()))
-        refined.append(replace(job, scene=name, near=block.near, config=settings).write(jobs[0].parent))
+    for job, block, count in zip(first, blocks, counts.tolist(), strict=True):
+        settings = refining_config(job.config, count)
+        refined.append(replace(job, scene=index.name, near=block.near, config=settings).write(folder))
     return refined
-
-
-def _save(gaussians: Gaussians, folder: Path, config: TrainConfig) -> str:
-    """Write a scene to a file that is named by its digest; return the name."""
-    with TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as beside:
-        file = Path(beside) / "scene.ply"
-        save_gaussians(file, gaussians, config.render.mode)
-        name = f"{digest_of(file.read_bytes())}.ply"
-        file.replace(folder / name)
-    return name
 
 
 def _read_photos(scene: Scene) -> dict[str, Photo]:
@@ -155,7 +151,7 @@ def _read_photos(scene: Scene) -> dict[str, Photo]:
 
 
 def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, watch: Watch) -> tuple[Path, float]:
-    """Train the coarse scene, unless it exists. Returns its file and the seconds that an iteration took.
+    """Train the coarse scene, unless it exists. Returns its index and the seconds that an iteration took.
 
     Photos that stream have not been read before. The run is then named by their names and cameras alone, and the
     record holds a digest of their pixels.
@@ -171,7 +167,9 @@ def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, w
             gaussians = train(scene, settings, work, device, resume=resume, progress=progress)
         seconds = read_log(work / LOG)[-1]["seconds"] / settings.iterations
         with replacing(done) as file:
-            record = {"scene": _save(gaussians, folder, settings), "seconds": seconds, "photos": _digest(scene)}
+            save_gaussians(done.with_suffix(".ply"), gaussians, settings.render.mode)
+            index = write_index([done.with_suffix(".ply")])
+            record = {"scene": index.name, "seconds": seconds, "photos": _digest(scene)}
             file.write(json.dumps(record).encode())
         shutil.rmtree(work, ignore_errors=True)
     record = json.loads(done.read_text())
@@ -200,24 +198,35 @@ def run_here(jobs: list[Path], scene: Scene, device: "Device", watch: Watch) -> 
                 train_block(job, scene.train, device, progress)
 
 
-def merge(jobs: list[Path]) -> Gaussians:
-    """Join the results of blocks in their order, whoever computed them.
+def merge(jobs: list[Path], path: Path, offset: NDArray[np.float64] | None = None) -> int:
+    """Join the results of blocks in their order, whoever computed them, into a PLY.
+
+    A part of a result is in memory at a time, so that the memory does not grow with the scene.
+
+    Parameters
+    ----------
+    jobs : list of Path
+    path : Path
+        The file to write, whole or not at all: in the scene's coordinates, with the highest degree of spherical
+        harmonics that a block has.
+    offset : (3,) array, optional
+        What was subtracted from the world's coordinates, in world units.
 
     Returns
     -------
-    Gaussians
-        In the scene's coordinates, on the host, with the highest degree of spherical harmonics that a block has.
+    int
+        The number of Gaussians.
 
     Raises
     ------
     InputError
-        If a result cannot be read.
+        If a result cannot be read, or the file cannot be written.
     """
-    parts = [load_gaussians(result_of(job))[0] for job in jobs]
-    most = max(part.sh.shape[1] for part in parts)
-    for part in parts:
-        part.sh = np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))
-    return Gaussians.concatenate(parts)
+    results = [PlyParts(result_of(job)) for job in jobs]
+    count, most = sum(rows.count for rows in results), max(rows.coefficients for rows in results)
+    parts = (part for rows in results for _, part in rows.chunks())
+    save_ply_parts(path, parts, count, most, results[0].mode, offset)
+    return count
 
 
 def write_log(out: Path, jobs: list[Path], last: dict[str, Any]) -> None:

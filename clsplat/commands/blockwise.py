@@ -12,6 +12,7 @@ import tyro
 from clsplat.commands.console import say
 from clsplat.commands.options import ClusterOptions
 from clsplat.commands.progress import Progress
+from clsplat.commands.run_folders import SCENE
 from clsplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 def train_in_blocks(
     scene: "Scene", config: "TrainConfig", renderer: "Renderer", data: Path, out: Path, where: ClusterOptions
 ) -> "Gaussians | None":
-    """Train the blocks of a scene and merge them; None if one block is enough.
+    """Train the blocks of a scene and merge them into the file of a run; None if one block is enough.
 
     Raises
     ------
@@ -35,6 +36,7 @@ def train_in_blocks(
     """
     from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
     from clsplat.evaluate import mean_metrics
+    from clsplat.formats import load_gaussians
 
     @contextmanager
     def watch(name: str, settings: "TrainConfig") -> Iterator[Callable[[dict[str, Any]], None]]:
@@ -50,7 +52,8 @@ def train_in_blocks(
     _run(first, scene, renderer.device, watch, where)
     second = plan_refinement(first, blocks)
     _run(second, scene, renderer.device, watch, where)
-    gaussians = merge(second)
+    merge(second, out / SCENE, scene.offset)
+    gaussians = load_gaussians(out / SCENE)[0]
     scores = mean_metrics(gaussians, scene.test, renderer) if scene.test else {}
     write_log(out, [*first, *second], {"num_gaussians": len(gaussians)} | scores)
     return gaussians
@@ -72,7 +75,7 @@ def _run(jobs: list[Path], scene: "Scene", device: "Device", watch: "Watch", whe
     if where.scheduler is not None:
         from clsplat.blocks.cluster import run_on_cluster
 
-        run_on_cluster(where.scheduler, jobs, say)
+        run_on_cluster(where.scheduler, jobs, scene.train, say)
     elif len(alike := devices_like(device)) > 1:
         say(f"blocks: {len(alike)} devices of this name train one each")
         run_on_devices(jobs, alike, say)

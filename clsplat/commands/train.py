@@ -27,7 +27,7 @@ from clsplat.commands.console import (
 )
 from clsplat.commands.options import ClusterOptions, ServerOptions
 from clsplat.commands.progress import train_with_progress
-from clsplat.commands.run_folders import CONFIG, FRAMES
+from clsplat.commands.run_folders import CONFIG, FRAMES, SCENE
 from clsplat.commands.viewing import open_viewer
 from clsplat.config import BACKGROUNDS, UINT32_MAX, TrainConfig
 from clsplat.errors import InputError
@@ -246,22 +246,22 @@ def train_and_report(
 
     `began` is called after the first step.
     """
+    from clsplat.formats import save_gaussians
     from clsplat.renderer import Renderer
 
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     gaussians = train_with_progress(scene, config, renderer, out, resume, viewer, began)
+    save_gaussians(out / SCENE, gaussians, config.render.mode, scene.offset)
     report(gaussians, scene, config, renderer, out)
     return gaussians
 
 
 def report(gaussians: "Gaussians", scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path) -> None:
-    """Write scene.ply, the evaluation and the training curve of a training that has ended to `out`."""
-    from clsplat.formats import save_gaussians
+    """Write the evaluation and the training curve of a training that has ended to `out`, which has its scene."""
     from clsplat.show.training_curve import training_curve
     from clsplat.training.outcome import failure
 
-    save_gaussians(out / "scene.ply", gaussians, config.render.mode, scene.offset)
-    say(f"{out / 'scene.ply'}: {len(gaussians)} Gaussians")
+    say(f"{out / SCENE}: {len(gaussians)} Gaussians")
     failed = failure(gaussians, scene.train, renderer)
     if failed:
         warn(failed)

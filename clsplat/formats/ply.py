@@ -8,6 +8,8 @@ world.
 """
 
 import re
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,14 +93,61 @@ def save_ply(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
     InputError
         If there is no Gaussian, a value is not finite as float32, or the file cannot be written.
     """
-    from plyfile import PlyData, PlyElement
+    check_storable(path, gaussians)
+    save_ply_parts(path, [gaussians], len(gaussians), gaussians.sh.shape[1], mode, offset)
 
-    names, table = table_of(path, gaussians)
-    comments = comments_of(mode, offset)
-    vertices = table.view([(name, "<f4") for name in names])[:, 0]
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
+
+def save_ply_parts(
+    path: str | Path,
+    parts: Iterable[Gaussians],
+    count: int,
+    coefficients: int,
+    mode: Mode = "classic",
+    offset: ArrayLike | None = None,
+) -> None:
+    """Write Gaussians that come in parts, of which one at a time is in memory, as `save_ply` writes them together.
+
+    Parameters
+    ----------
+    path, mode, offset
+        As in `save_ply`.
+    parts : iterable of Gaussians
+        Parts without Gaussians are left out.
+    count : int
+        Number of all Gaussians, which the header has.
+    coefficients : int
+        Number K of the spherical harmonics' coefficients in the file. Parts with fewer are filled up with zeros.
+
+    Raises
+    ------
+    InputError
+        If a value is not finite as float32, the file cannot be written, or there are more or fewer Gaussians than
+        `count`.
+    """
+    names, written = names_of(coefficients), 0
+    properties = "".join(f"property float {name}\n" for name in names)
+    comments = "".join(f"comment {comment}\n" for comment in comments_of(mode, offset))
+    header = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n"
     with replacing(path) as out:
-        ply.write(out)
+        out.write(header.encode())
+        for part in parts:
+            if len(part):
+                out.write(table_of(path, with_coefficients(part, coefficients))[1].data)
+            written += len(part)
+        if written != count:
+            raise InputError(f"{path}: expected {count} Gaussians to write, found {written}")
+
+
+def with_coefficients(gaussians: Gaussians, count: int) -> Gaussians:
+    """The Gaussians with at least `count` coefficients of the spherical harmonics; those that they lack are zero."""
+    missing = count - gaussians.sh.shape[1]
+    return gaussians if missing <= 0 else replace(gaussians, sh=np.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0))))
+
+
+def names_of(coefficients: int) -> tuple[str, ...]:
+    """Names of the properties, in their order, of Gaussians with a number K of coefficients."""
+    rest = tuple(f"f_rest_{i}" for i in range(3 * (coefficients - 1)))
+    return (*MEANS, *NORMALS, *SH0, *rest, "opacity", *LOG_SCALES, *QUATS)
 
 
 def table_of(path: str | Path, gaussians: Gaussians) -> tuple[tuple[str, ...], Array]:
@@ -111,8 +160,8 @@ def table_of(path: str | Path, gaussians: Gaussians) -> tuple[tuple[str, ...], A
     """
     check_storable(path, gaussians)
     n, k = gaussians.sh.shape[:2]
-    rest = tuple(f"f_rest_{i}" for i in range(3 * (k - 1)))
-    names = (*MEANS, *NORMALS, *SH0, *rest, "opacity", *LOG_SCALES, *QUATS)
+    names = names_of(k)
+    rest = names[len((*MEANS, *NORMALS, *SH0)) : names.index("opacity")]
     table = np.zeros((n, len(names)), dtype="<f4")
     columns = {
         MEANS: gaussians.means,

@@ -6,7 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from clsplat.formats.ply import properties, read_comments, to_gaussians
+from clsplat.formats.ply import REQUIRED, properties, read_comments, to_gaussians
 from clsplat.formats.ply_container import bytes_before, check_size, read_header
 from clsplat.formats.validity import read_rows, reading
 from clsplat.gaussians import Gaussians
@@ -28,6 +28,10 @@ class PlyParts:
         Whether rows can be read. Those of an ASCII file have no known places.
     dtype : np.dtype
         Of the rows as they are stored.
+    begin : int
+        Byte of the file at which the rows of a binary one begin.
+    coefficients : int
+        Number K of the spherical harmonics' coefficients of a Gaussian.
     mode, offset
         As in `clsplat.formats.load_gaussians`.
 
@@ -46,7 +50,8 @@ class PlyParts:
         self.count = header.rows["vertex"]
         self.binary = header.order != "="
         self.dtype = header.elements["vertex"].dtype(header.order if self.binary else "<")
-        self._first = header.length + (bytes_before(header) if self.binary else 0)
+        self.coefficients = (len(self._wanted) - len(REQUIRED)) // 3 + 1
+        self.begin = header.length + (bytes_before(header) if self.binary else 0)
         self.mode, self.offset = read_comments(header.comments)
 
     def chunks(self) -> Iterator[tuple[Array, Gaussians]]:
@@ -59,7 +64,7 @@ class PlyParts:
         """
         for first in range(0, self.count, CHUNK):
             with reading(self._path), open(self._path, "rb") as file:
-                file.seek(self._first + first * self.dtype.itemsize)
+                file.seek(self.begin + first * self.dtype.itemsize)
                 rows = read_rows(self._path, file, self.dtype, min(CHUNK, self.count - first))
             yield rows, self.gaussians(rows, first)
 

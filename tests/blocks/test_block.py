@@ -11,9 +11,10 @@ import pytest
 from PIL import Image
 from small_plan import Planned, plan, unseen
 
-from clsplat.blocks.block import _start, read_scene, result_of, train_block
+from clsplat.blocks.block import _start, result_of, train_block
 from clsplat.blocks.jobs import read_job
 from clsplat.blocks.partition import EVERYWHERE
+from clsplat.blocks.parts import read_index, read_scene
 from clsplat.blocks.survey import seen_by_block
 from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
 from clsplat.device import Device
@@ -39,14 +40,14 @@ def test_results_merge_to_the_same_bits_in_any_order(planned: Planned, device: D
         train_block(job)
     assert [result_of(j).read_bytes() for j in others] == [result_of(j).read_bytes() for j in planned.jobs]
 
-    scene = merge(planned.jobs)
+    count = merge(planned.jobs, tmp_path / "scene.ply")
     means = [load_gaussians(result_of(job))[0].means for job in planned.jobs]
-    np.testing.assert_array_equal(scene.means, np.concatenate(means))
+    np.testing.assert_array_equal(load_gaussians(tmp_path / "scene.ply")[0].means, np.concatenate(means))
     for job, inside in zip(planned.jobs, means, strict=True):
         assert len(inside) > 40 and read_job(job).box.contains(inside).all()
         assert not job.with_suffix("").exists(), "its folder is removed"
 
-    write_log(tmp_path, planned.jobs, {"num_gaussians": len(scene), "psnr": 20.0})
+    write_log(tmp_path, planned.jobs, {"num_gaussians": count, "psnr": 20.0})
     log = read_log(tmp_path / "log.jsonl")
     assert [log[0]["block"], log[-2]["block"], log[-1].get("psnr")] == [1, 2, 20.0]
     assert [record["iteration"] for record in log] == [10, 20, 30, 40, 50, 60, 70, 80, 80]
@@ -129,7 +130,7 @@ def test_other_photos(planned: Planned, device: Device, tmp_path: Path) -> None:
 
 DAMAGE = {
     "changed": (lambda c: c | {"wide": c["box"]}, "expected a job as it was written, found a changed one"),
-    "format": (lambda c: c | {"format": 9}, "expected a job of format 1, found 9"),
+    "format": (lambda c: c | {"format": 9}, "expected a job of format 2, found 9"),
     "no photos": (lambda c: {k: v for k, v in c.items() if k != "photos"}, "found KeyError"),
     "setting": (lambda c: c | {"config": {"nonsense": 1}}, "found no such setting"),
     "list": (lambda c: [c], "found TypeError"),
@@ -146,13 +147,13 @@ def test_a_damaged_job_is_one_sentence(planned: Planned, case: str) -> None:
 
 
 def test_another_coarse_scene(planned: Planned, device: Device) -> None:
-    coarse = planned.jobs[0].with_name(read_job(planned.jobs[0]).scene)
-    first, second = (bytearray(coarse.read_bytes()) for _ in range(2))
-    second[-1] ^= 1
-    coarse.write_bytes(second)
-    with pytest.raises(InputError, match="expected a scene as it was written, found a changed file"):
-        train_block(planned.jobs[0], planned.scene.train, device)
-    assert first != second
+    index = planned.jobs[0].with_name(read_job(planned.jobs[0]).scene)
+    for path in (index.with_name(read_index(index)[0].file), index):
+        content = bytearray(path.read_bytes())
+        content[-3] ^= 1
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=f"{path.name}: expected a scene as it was written, found a changed"):
+            train_block(planned.jobs[0], planned.scene.train, device)
 
 
 def test_one_block_that_fits_needs_no_coarse_run(planned: Planned, device: Device, tmp_path: Path) -> None:
@@ -162,14 +163,17 @@ def test_one_block_that_fits_needs_no_coarse_run(planned: Planned, device: Devic
     assert told == ["blocks: one is enough for 240 Gaussians"] and not (tmp_path / "new").exists()
 
 
-def test_a_second_training_is_surrounded_by_the_first_ones(planned: Planned, device: Device) -> None:
+def test_a_second_training_is_surrounded_by_the_first_ones(
+    planned: Planned, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for job in planned.jobs:
         train_block(job, planned.scene.train, device)
     second = plan_refinement(planned.jobs, planned.blocks)
     assert second == plan_refinement(planned.jobs, planned.blocks) and not set(second) & set(planned.jobs)
-    first = merge(planned.jobs)
+    merge(planned.jobs, tmp_path / "first.ply")
+    first = load_gaussians(tmp_path / "first.ply")[0]
     job = read_job(second[0])
-    np.testing.assert_array_equal(read_scene(second[0].with_name(job.scene), job.config).means, first.means)
+    np.testing.assert_array_equal(read_scene(second[0].with_name(job.scene), 1).means, first.means)
     assert job.near == EVERYWHERE, "all fits"
     counts = [len(load_gaussians(train_block(path, planned.scene.train, device))[0]) for path in second]
     assert abs(sum(counts) - len(first)) <= 0.05 * len(first), "none are added; some move across the border"
@@ -177,7 +181,8 @@ def test_a_second_training_is_surrounded_by_the_first_ones(planned: Planned, dev
     # Where memory is small, what is farther away is coarse.
     near = planned.blocks[0].wide
     path = plan_refinement(planned.jobs, [block._replace(near=near) for block in planned.blocks])[0]
-    far = read_scene(path.with_name(job.far), job.config)
+    far = read_scene(path.with_name(job.far), 1)
+    monkeypatch.setattr("clsplat.blocks.block.seen", lambda cameras, bounds, rays: bounds.radius > 0)
     start = _start(path, read_job(path))
     inside = near.contains(first.means)
     np.testing.assert_array_equal(

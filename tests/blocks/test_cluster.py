@@ -39,7 +39,7 @@ def test_two_workers_give_the_bytes_of_this_process(
 ) -> None:
     jobs, told = plan(dataset, device, tmp_path / "cluster", 3).jobs, []
     with workers(2) as cluster:
-        run_on_cluster(cluster.scheduler_address, jobs, told.append)
+        run_on_cluster(cluster.scheduler_address, jobs, [], told.append)
     assert [result_of(job).read_bytes() for job in jobs] == expected
     assert [text.split(",")[0] for text in told] == [f"blocks: {n} of 3 done" for n in (1, 2, 3)]
 
@@ -49,13 +49,13 @@ def test_there_is_no_scheduler(planned: Planned) -> None:
         with pytest.raises(
             InputError, match=r"^--scheduler: expected a scheduler of dask at tcp://127.0.0.1:9, found"
         ):
-            run_on_cluster("tcp://127.0.0.1:9", planned.jobs, print)
+            run_on_cluster("tcp://127.0.0.1:9", planned.jobs, [], print)
 
 
 def test_the_extra_is_missing(planned: Planned, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'clsplat\[cluster\]'"):
-        run_on_cluster("tcp://127.0.0.1:9", planned.jobs, print)
+        run_on_cluster("tcp://127.0.0.1:9", planned.jobs, [], print)
 
 
 @pytest.mark.slow
@@ -65,7 +65,7 @@ def test_any_number_of_workers(
 ) -> None:
     jobs = plan(dataset, device, tmp_path / "cluster", 3).jobs
     with workers(count) as cluster:
-        run_on_cluster(cluster.scheduler_address, jobs, lambda text: None)
+        run_on_cluster(cluster.scheduler_address, jobs, [], lambda text: None)
     assert [result_of(job).read_bytes() for job in jobs] == expected
 
 
@@ -95,7 +95,7 @@ def test_a_worker_is_killed(dataset: Path, device: Device, tmp_path: Path, expec
         hunter = threading.Thread(target=hunt, args=[cluster])
         hunter.start()
         try:
-            run_on_cluster(cluster.scheduler_address, jobs, lambda text: None)
+            run_on_cluster(cluster.scheduler_address, jobs, [], lambda text: None)
         finally:
             ends.set()
             hunter.join()

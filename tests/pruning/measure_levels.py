@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ply_written import save_ply_parts
 
 from clsplat.atomic import replacing
 from clsplat.commands.files import Export
 from clsplat.formats import load_gaussians, streamed_sog, tiles_3d
+from clsplat.formats.ply import save_ply_parts
 from clsplat.gaussians import Gaussians
 from clsplat.pruning import levels
 
@@ -91,7 +91,7 @@ def export(ply: Path, out: Path) -> dict[str, Any]:
 def measure(scene: Gaussians, count: int, folder: Path) -> dict[str, Any]:
     """Make a scene of a size, and export it in another process."""
     ply, out = folder / f"{count}.ply", folder / f"levels-{count}"
-    save_ply_parts(ply, tiled(scene, count), count, "classic", None)
+    save_ply_parts(ply, tiled(scene, count), count, scene.sh.shape[1])
     try:
         command = [sys.executable, "-P", __file__, str(ply), str(out), "--export"]
         found = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)

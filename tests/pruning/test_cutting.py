@@ -4,10 +4,10 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from ply_written import save_ply_parts
 
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians, save_gaussians
+from clsplat.formats.ply import save_ply_parts
 from clsplat.formats.ply_parts import PlyParts
 from clsplat.pruning import cutting, levels
 from clsplat.pruning.cutting import cut_on_disk, leaves
@@ -87,7 +87,7 @@ def test_a_folder_that_cannot_be_written_is_named(scene, tmp_path):
 def test_parts_are_written_to_the_bytes_of_the_whole(scene, tmp_path):
     save_gaussians(tmp_path / "whole.ply", scene, "antialiased", [1.0, 2.0, 3.0])
     parts = (scene.take(np.arange(first, first + 1000)) for first in (0, 1000, 2000))
-    save_ply_parts(tmp_path / "parts.ply", parts, 3000, "antialiased", [1.0, 2.0, 3.0])
+    save_ply_parts(tmp_path / "parts.ply", parts, 3000, scene.sh.shape[1], "antialiased", [1.0, 2.0, 3.0])
     assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
     rows = PlyParts(tmp_path / "parts.ply")
     assert rows.mode == "antialiased" and rows.offset.tolist() == [1, 2, 3] and rows.binary
