@@ -102,7 +102,10 @@ def _exposure(device: Device, data: Path) -> Found:
             *(Figure(label, unchanged - (dict(points)[0.2] or 0.0), "dB") for label, points in series.items()),
             Figure("--exposure, photos that agree", unchanged - (dict(series["--exposure"])[0.0] or 0.0), "dB"),
             *(Figure(f"{label}, after an affine fit", lost, "dB") for label, lost in after.items()),
-            *(Figure(f"{label}, curves on fox_pinhole, after an affine fit", lost, "dB") for label, lost in curves.items()),
+            *(
+                Figure(f"{label}, curves on fox_pinhole, after an affine fit", lost, "dB")
+                for label, lost in curves.items()
+            ),
         ],
         Plot("largest change of a photo's gain", "PSNR of held-out photos, dB", series),
     )
