@@ -1,10 +1,11 @@
 // Stage march: samples of rays in the occupied cells of a grid.
 //
-//   t_0 = t_near + offset step(t_near),  t_{k+1} = t_k + step(t_k),  step(t) = max(step, cone t),  while t_k < t_far
-//   A sample stands for step(t_k). It is kept if the cell of its position is occupied  (Müller et al. 2022, appendix E)
-//   CONTRACTED=0: positions o + t d; t_near and t_far are where the ray enters and leaves the unit cube
-//   CONTRACTED=1: positions x/4 + 1/2 of x = o + t d, and of (2 - 1/|x|) x/|x| where |x| > 1
-//                                                                            (Barron et al. 2022, equation 10)
+//   t_0 = t_near + offset step(t_near),  t_{k+1} = t_k + step(t_k),  while t_k < t_far
+//   A sample stands for a length. It is kept if the cell of its position is occupied   (Müller et al. 2022, appendix E)
+//   CONTRACTED=0: positions p(t) = o + t d, step(t) = max(step, cone t), which is the length; t_near and t_far are where
+//     the ray enters and leaves the unit cube
+//   CONTRACTED=1: positions p(t) = x/4 + 1/2 of x = o + t d, and of (2 - 1/|x|) x/|x| where |x| > 1 (Barron et al. 2022,
+//     equation 10); step(t) = max(step, cone t max(t, 1)); the length is 4 |p(t + step) - p(t)|
 // See docs/stages/march.md; clsplat/reference/march.py is the twin.
 //
 // Mapping: one work-item per ray. march_count counts the samples; march_samples writes them to the places that a scan
@@ -41,7 +42,12 @@ static inline Ray ray_at(const __global real *origins, const __global real *dire
 }
 
 static inline real step_at(const Ray *ray, real t) {
-    return GREATER(ray->step, ray->cone * t);
+    const real wide = ray->cone * t;
+#if CONTRACTED
+    return GREATER(ray->step, wide * GREATER(t, (real)1));
+#else
+    return GREATER(ray->step, wide);
+#endif
 }
 
 static inline real3 position_at(const Ray *ray, real t) {
@@ -53,6 +59,15 @@ static inline real3 position_at(const Ray *ray, real t) {
     x = (real)0.25 * x + (real)0.5;
 #endif
     return x;
+}
+
+// Length of a step from t, at position x, in the field's coordinates.
+static inline real length_of(const Ray *ray, real t, real step, real3 x) {
+#if CONTRACTED
+    return 4 * length(position_at(ray, t + step) - x); // the unit cube is the contracted space, which is four wide
+#else
+    return step;
+#endif
 }
 
 static inline int cell_of(real x, int cells) {
@@ -94,7 +109,7 @@ static inline uint samples_of(const Ray ray, real offset, int cells, const __glo
         const real step = step_at(&ray, t);
         if (write) {
             store3(positions, place + count, x);
-            deltas[place + count] = step;
+            deltas[place + count] = length_of(&ray, t, step, x);
             rays_of[place + count] = r;
         }
         ++count;

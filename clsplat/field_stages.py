@@ -77,7 +77,8 @@ class RayColors(NamedTuple):
 class Marching(NamedTuple):
     """How rays are sampled: every max(step, cone t) from t = near to t = far, lengths in the field's coordinates.
 
-    Without `contracted`, rays begin and end at the unit cube; with it, space is contracted to a ball of radius 2.
+    Without `contracted`, rays begin and end at the unit cube. With it, space is contracted to a ball of radius 2, and
+    steps beyond t = 1 are as much longer as the contraction shortens them: max(step, cone t^2).
     """
 
     step: float
@@ -102,9 +103,9 @@ class Span(NamedTuple):
 class Samples(NamedTuple):
     """Samples of R rays, S in all.
 
-    positions (S, 3) in the unit cube; deltas (S,), lengths that they stand for; rays_of (S,) uint32; first (R + 1,)
-    uint32: ray r has the samples first[r] to first[r + 1], front to back; total: S. Where
-    that is 0, arrays of the device have one entry, of no length, which belongs to no ray.
+    positions (S, 3) in the unit cube; deltas (S,), lengths that they stand for, of the contracted ray if space is
+    contracted; rays_of (S,) uint32; first (R + 1,) uint32: ray r has the samples first[r] to first[r + 1], front to
+    back; total: S. Where that is 0, arrays of the device have one entry, of no length, which belongs to no ray.
     """
 
     positions: Any

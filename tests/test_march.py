@@ -88,10 +88,24 @@ def test_no_samples_are_one_that_no_ray_has(any_device):
         assert len(array) == 1 and not array.get().any()
 
 
-def test_a_homogeneous_ball_in_contracted_space(device64):
-    """Steps add up to the ray's length, whatever the contraction does to positions."""
-    given = rays(SPACE, share=1.0)
-    found = by_kernel(device64, *given, SPACE)
+def test_lengths_are_those_of_the_contracted_ray(device64):
+    """They add up to the length of the curve that the contraction makes of the ray, less than 4 for any ray."""
+    origins, directions, offsets, _ = rays(SPACE)
+    found = by_kernel(device64, origins, directions, 0 * offsets, np.ones((8, 8, 8), np.uint8), SPACE)
     assert (found.positions >= 0).all() and (found.positions <= 1).all()
+    t = np.geomspace(SPACE.near, SPACE.far, 4000)
+    curves = contract(origins[:, None] + t[:, None] * directions[:, None])
+    expected = np.linalg.norm(np.diff(curves, axis=1), axis=2).sum(axis=1)
     lengths = np.add.reduceat(found.deltas, found.first[:-1].astype(int))
-    np.testing.assert_allclose(lengths, SPACE.far - SPACE.near, rtol=0.05)  # the last step ends behind `far`
+    # Chords are shorter than the curve, and the last step ends behind `far`.
+    np.testing.assert_allclose(lengths, expected, rtol=0.01)
+    assert expected.max() < 4
+
+
+def test_steps_are_equal_far_away(device64):
+    """A ray from the origin: steps of `cone` in contracted space, so that few samples lie where little is seen."""
+    given = np.zeros((1, 3)), np.array([[0.0, 0, 1]]), np.zeros(1), np.ones((1, 1, 1), np.uint8)
+    found = by_kernel(device64, *given, Marching(step=0.01, cone=0.02, near=1.0, far=1e4, contracted=True))
+    near = found.deltas[found.positions[:, 2] < 0.9]  # up to t = 2.5: 1/t falls by cone / (1 + cone t) in a step
+    assert ((near < 0.02) & (near > 0.018)).all() and len(near) > 25
+    assert found.total < 90

@@ -17,8 +17,9 @@ STEP = 3**0.5 / 1024
 """Length of a step in the unit cube: 1024 along its diagonal (Müller et al. 2022, appendix E)."""
 
 CONE = 1 / 64
-"""Length of a step per distance, where there is a background. The paper has 1/256 (Müller et al. 2022, appendix E),
-with three times as many samples on a ray."""
+"""Length of a step per distance up to a distance of 1, where there is a background, and its contracted length beyond.
+The paper has 1/256 per distance everywhere (Müller et al. 2022, appendix E), with seven times as many samples on a
+ray."""
 
 FAR = 100.0
 """Distance at which rays end where there is a background, in distances of the farthest camera from the centre. The

@@ -27,17 +27,24 @@ def march(origins: Array, directions: Array, offsets: Array, occupied: Array, ma
                     near, far = max(near, min(-o / d, (1 - o) / d)), min(far, max(-o / d, (1 - o) / d))
                 elif not 0 <= o <= 1:
                     far = near
-        t, own = near + offset * max(marching.step, marching.cone * near), []
+        t, own = near + offset * _step(near, marching), []
         while t < far:
             own.append(t)
-            t += max(marching.step, marching.cone * t)
-        x = origin + np.array(own)[:, None] * direction
-        x = contract(x) / 4 + 0.5 if marching.contracted else x
+            t += _step(t, marching)
+        steps = [_step(t, marching) for t in own]
+        x, ends = (origin + np.array(at)[:, None] * direction for at in (own, np.add(own, steps)))
+        if marching.contracted:
+            steps = np.linalg.norm(contract(ends) - contract(x), axis=1)
+            x = contract(x) / 4 + 0.5
         cells = np.clip((x * len(occupied)).astype(int), 0, len(occupied) - 1)
         kept = occupied[cells[:, 2], cells[:, 1], cells[:, 0]] != 0
         positions.append(x[kept])
-        deltas += [max(marching.step, marching.cone * t) for t, keep in zip(own, kept, strict=True) if keep]
+        deltas += [step for step, keep in zip(steps, kept, strict=True) if keep]
         counts.append(int(kept.sum()))
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.uint32)
     rays_of = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
     return Samples(np.concatenate(positions), np.array(deltas), rays_of, first, int(first[-1]))
+
+
+def _step(t: float, marching: Marching) -> float:
+    return max(marching.step, marching.cone * t * (max(t, 1) if marching.contracted else 1))
