@@ -93,16 +93,16 @@ bench:
 	$(PYTHON) -m clsplat bench kernels --workloads $(WORKLOADS) -o docs/results/kernels.json \
 	  --scaling docs/results/kernels.svg
 
-# Measure the charts of docs/benchmarks.md: make bench-quality DATA=folder of real scenes. This takes an hour and a half
-# on two cores. Finished trainings are not repeated (make bench-quality METHODS=paper-30k adds four hours).
+# Measure the charts of docs/benchmarks.md: make bench-quality DATA=folder of real scenes. This takes an hour on two
+# cores. Finished trainings are not repeated (make bench-quality METHODS=paper-30k adds hours).
 QUALITY_SCENES = fox_pinhole:downscale=4 lego:background=white:downscale=2 fern:downscale=4 castle_p30:downscale=4
-METHODS = paper-7k auto mcmc
+METHODS = auto paper-7k
 bench-quality:
 	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-quality DATA=..."; exit 2; }
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods $(METHODS) \
 	  $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/quality
 	cp build/quality/results.jsonl docs/results/quality.jsonl
-	cp build/quality/time-psnr.svg docs/results/quality.svg
+	cp build/quality/processor-time-psnr.svg docs/results/quality.svg
 
 # Measure the charts of docs/howto/fields.md: make bench-fields DATA=folder of real scenes. The lengths of trainings of
 # fields are chosen for one to three minutes of two cores each. Finished trainings are not repeated.
