@@ -69,9 +69,8 @@ class Desk:
         return self
 
     def __exit__(self, *error: object) -> None:
-        with suppress(
-            Exception
-        ):  # without a scheduler there are no queues to close; the thread ends with the process
+        # Without a scheduler there are no queues to close; the thread ends with the process.
+        with suppress(Exception):
             self._requests.put(None)
             self._thread.join()
             self._requests.close()

@@ -235,6 +235,11 @@ def test_the_search_has_as_many_rounds_in_short_runs(size: Literal["auto", "fixe
     assert (due(3000), due(1500)) == (21, rounds)
 
 
+def test_in_short_runs_too_gaussians_are_shrunk_until_an_interval_before_the_end() -> None:
+    strategy = STRATEGIES["error"](replace(CONFIG, strategy="error", size="auto", iterations=1500), 1.0, N)
+    assert [strategy.due(iteration) for iteration in (1400, 1450, 1500)] == [True, True, False]
+
+
 @pytest.mark.parametrize("strategy", ["mcmc", "error"])
 def test_growth_needs_a_cap(strategy: str) -> None:
     with pytest.raises(InputError, match=f"--max-gaussians: expected with --strategy {strategy}"):
