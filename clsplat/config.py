@@ -175,12 +175,12 @@ class OptimConfig:
 
 @dataclass(frozen=True)
 class CoarseConfig:
-    """Coarse to fine: the first iterations train on smaller photos, in less time (Chen et al. 2025,
-    "DashGaussian")."""
+    """Coarse to fine: the first iterations train on smaller photos (Chen et al. 2025, "DashGaussian")."""
 
-    factor: Literal[1, 2, 4, 8] = 1
-    """Divisor of the photos' edges at the start; it is halved at equal intervals. 1: no smaller photos."""
-    until: Fraction = 0.5
+    factor: Literal[0, 1, 2, 4, 8] = 0
+    """Divisor of the photos' edges at the start, halved at equal intervals. 0: 4 with --size auto and photos of more
+    than 90 000 pixels, otherwise 1."""
+    until: Fraction = 0.3
     """Fraction of the iterations after which photos have their full size."""
 
 
@@ -287,9 +287,9 @@ class TrainConfig:
     """Settings of a training; saved as ``config.json``, from which it can be repeated."""
 
     iterations: Annotated[int, within(least=0, most=UINT32_MAX)] = 0
-    """Optimisation steps. 0: 30 for each training photo, but at least 3000 and at most 30 000. In runs shorter than
-    7000, the paper's shorter setting, the first densification and the bands of spherical harmonics come earlier in
-    proportion."""
+    """Optimisation steps. 0: 30 for each training photo, but at least 3000, with photos of over 90 000 pixels more in
+    proportion to their edges, and at most 30 000. In runs shorter than 7000, the paper's shorter setting, the first
+    densification and the bands of spherical harmonics come earlier in proportion."""
     seed: Annotated[int, within(least=0, most=UINT64_MAX)] = 0
     """Seed of the random start, of the order of the photos and of the strategy's random numbers."""
     optimizer: Literal["device", "numpy"] = "device"

@@ -17,7 +17,7 @@ from clsplat.training.autosize.validation import FEWEST_PHOTOS
 from clsplat.training.memory import Footprint, bytes_text
 from clsplat.training.outcome import FEWEST_GAUSSIANS
 from clsplat.training.preparation import of_fixed_size
-from clsplat.training.run_length import with_iterations
+from clsplat.training.run_length import with_length
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -122,10 +122,11 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
     """The configuration of a block.
 
     It trains for as many iterations as its photos alone would, at most those of the whole configuration. Its first
-    Gaussians have been trained, so that all bands of their spherical harmonics train from the start.
+    Gaussians have been trained, so that all bands of their spherical harmonics train from the start, and photos have
+    their full size.
     """
     photos = len(block.photos)
-    alone = with_iterations(replace(config, iterations=0), replace(scene, train=scene.train[:photos])).iterations
+    alone = with_length(replace(config, iterations=0), replace(scene, train=scene.train[:photos])).iterations
     visits = round(config.iterations * photos / len(scene.train))
     return replace(
         config,
@@ -133,6 +134,7 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
         iterations=min(config.iterations, max(alone, visits)),
         max_gaussians=None if config.max_gaussians is None else block.gaussians,
         optim=replace(config.optim, sh_degree_every=1),
+        coarse=CoarseConfig(factor=1),
         eval_every=0,
     )
 

@@ -13,10 +13,11 @@ from clsplat.scene import View
 def factor_at(iteration: int, config: TrainConfig) -> int:
     """Divisor of the photos' edges in an iteration, counted from 1. It is halved at equal intervals down to 1.
 
+    It is 1 where the configuration leaves the first one open (`clsplat.training.run_length.with_length` chooses it).
     Chen et al. 2025, "DashGaussian", derive the schedule of the resolution from the photos' spectra instead.
     """
     span = config.coarse.until * config.iterations
-    if iteration > span:
+    if iteration > span or not config.coarse.factor:
         return 1
     halvings = config.coarse.factor.bit_length() - 1
     return config.coarse.factor >> int((iteration - 1) / span * halvings)

@@ -15,7 +15,7 @@ from clsplat.renderer import Renderer, fetch
 from clsplat.scene import Scene, View, in_turn
 from clsplat.training.coarse_to_fine import shrunk
 from clsplat.training.preparation import of_fixed_size
-from clsplat.training.run_length import with_iterations
+from clsplat.training.run_length import with_length
 from clsplat.training.session import Training
 from clsplat.training.state import initial_state
 
@@ -59,7 +59,7 @@ def refined(
     small = replace(
         scene, train=[shrunk(v, FACTOR) for v in scene.train], test=[shrunk(v, FACTOR) for v in scene.test]
     )
-    config = with_iterations(config, scene)
+    config = with_length(config, scene)
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     for height in range(1, max(node.height for node in nodes) + 1):
         places = [i for i, node in enumerate(nodes) if node.height == height]

@@ -23,7 +23,7 @@ from clsplat.training.inputs import Inputs
 from clsplat.training.preparation import open_device
 from clsplat.training.recorder import Recorder
 from clsplat.training.run_folder import held
-from clsplat.training.run_length import with_iterations
+from clsplat.training.run_length import with_length
 from clsplat.training.session import Training
 from clsplat.training.state import initial_state
 
@@ -89,7 +89,7 @@ def train(
         device or driver, where its bits differ.
     """
     check(scene, config)
-    scene, config = with_near_planes(scene), with_iterations(config, scene)
+    scene, config = with_near_planes(scene), with_length(config, scene)
     out, device = Path(out), device or open_device(config)
     with held(out):
         inputs = Inputs.of(scene, device)

@@ -17,7 +17,7 @@ from clsplat.training.densify import STRATEGIES
 from clsplat.training.few_views import adapted
 from clsplat.training.initialize import start_count
 from clsplat.training.memory import Footprint
-from clsplat.training.run_length import with_iterations
+from clsplat.training.run_length import with_length
 from clsplat.training.state import start_config
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ def prepare(
     """Load a dataset and adapt the configuration to it.
 
     Where the dataset has poses but no points, points are triangulated from its photos (`config.init.triangulate`).
-    The number of iterations follows that of the photos, unless it is given. With few photos the configuration is
-    adapted to them (`config.few`). `clsplat.training.loop.train` on the result
-    does what ``clsplat train`` does.
+    The number of iterations and the size of the first photos follow the photos, unless they are given. With few
+    photos the configuration is adapted to them (`config.few`). `clsplat.training.loop.train` on the result does what
+    ``clsplat train`` does.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def prepare(
         tell(f"start: {found} (--init.no-triangulate: random)")
     if config.data.depth is not None:
         scene = with_depth_maps(scene, path, config.data, tell)
-    config = with_iterations(config, scene)
+    config = with_length(config, scene)
     few = adapted(config, scene)
     if few != config:
         tell(
@@ -131,7 +131,7 @@ def of_fixed_size(config: TrainConfig, gaussians: int, rate: float) -> TrainConf
         size="fixed",
         max_gaussians=gaussians,
         optim=replace(config.optim, means_lr=rate * config.optim.means_lr, sh_degree_every=1),
-        coarse=CoarseConfig(),
+        coarse=CoarseConfig(factor=1),
     )
 
 

@@ -1,6 +1,8 @@
-"""Length of a training by the number of its photos."""
+"""Length of a training, and size of its first photos, by the number and the size of the photos."""
 
 from dataclasses import replace
+from math import sqrt
+from typing import Final, Literal
 
 from clsplat.config import TrainConfig
 from clsplat.scene import Scene
@@ -9,15 +11,39 @@ VISITS = 30
 """Iterations for each training photo (measured: docs/benchmarks.md)."""
 
 FEWEST_ITERATIONS = 3000
-"""Fewest iterations: few photos, too, need time for growth."""
+"""Fewest iterations with photos of at most `SMALL_PHOTO` pixels: few photos, too, need time for growth."""
+
+SMALL_PHOTO = 90_000
+"""Pixels up to which photos count as small. With larger ones the fewest iterations grow in proportion to their edges:
+they show more detail, which takes more rounds of growth and longer training (measured: docs/benchmarks.md)."""
 
 MOST_ITERATIONS = 30_000
 """Most iterations, those of the paper's longer setting."""
 
+FIRST_FACTOR: Final = 4
+"""Divisor of the edges of larger photos at the start (measured: docs/howto/strategies.md)."""
 
-def with_iterations(config: TrainConfig, scene: Scene) -> TrainConfig:
-    """Choose the number of iterations by the number of training photos, if the configuration leaves it open."""
-    if config.iterations:
-        return config
-    wanted = VISITS * len(scene.train)
-    return replace(config, iterations=min(MOST_ITERATIONS, max(FEWEST_ITERATIONS, wanted)))
+
+def with_length(config: TrainConfig, scene: Scene) -> TrainConfig:
+    """Choose what the configuration leaves to the training photos.
+
+    Parameters
+    ----------
+    config : TrainConfig
+    scene : Scene
+
+    Returns
+    -------
+    TrainConfig
+        With a number of iterations, and a divisor of the photos' edges at the start: 1 for small photos and where the
+        size is fixed.
+    """
+    pixels = max(view.camera.width * view.camera.height for view in scene.train)
+    if not config.iterations:
+        fewest = round(FEWEST_ITERATIONS * sqrt(max(1.0, pixels / SMALL_PHOTO)))
+        wanted = max(fewest, VISITS * len(scene.train))
+        config = replace(config, iterations=min(MOST_ITERATIONS, wanted))
+    if not config.coarse.factor:
+        factor: Literal[1, 4] = FIRST_FACTOR if config.size == "auto" and pixels > SMALL_PHOTO else 1
+        config = replace(config, coarse=replace(config.coarse, factor=factor))
+    return config

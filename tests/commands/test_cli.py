@@ -18,7 +18,7 @@ from cli_runs import SIZE, TRAIN, fails, read_image, run
 from plyfile import PlyData
 
 from clsplat.cli import main
-from clsplat.config import DataConfig, FewViewsConfig, TrainConfig
+from clsplat.config import CoarseConfig, DataConfig, FewViewsConfig, TrainConfig
 from clsplat.dataset import load_scene
 from clsplat.formats import FORMATS, load_gaussians
 from clsplat.training.presets import load_preset
@@ -135,7 +135,8 @@ def test_flags_count_more_than_a_preset(
     seen: list[TrainConfig] = []
     monkeypatch.setattr("clsplat.commands.train.train_and_report", lambda scene, config, *_: seen.append(config))
     run("train", dataset, "-o", tmp_path / "a", "--preset", "paper-30k", "--iterations", 7000, "--few.below", 0)
-    assert seen == [replace(load_preset("paper-30k"), iterations=7000, few=FewViewsConfig(below=0))]
+    expected = replace(load_preset("paper-30k"), iterations=7000, few=FewViewsConfig(below=0))
+    assert seen == [replace(expected, coarse=CoarseConfig(factor=1))]
     assert load_preset("paper-30k").iterations != 7000
     assert "expected one of " in fails(capsys, "train", dataset, "-o", tmp_path / "b", "--preset", "nothing")
     both = ("--preset", "fast", "--config", "x.json")

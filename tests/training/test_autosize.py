@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config import AdcConfig, ErrorConfig, InitConfig, OptimConfig, TrainConfig
+from clsplat.config import AdcConfig, CoarseConfig, ErrorConfig, InitConfig, OptimConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, ssim, to_uint8
@@ -131,6 +131,18 @@ def test_what_has_paid_is_what_later_growth_is_compared_with(device: Device, gai
     search = _compared(training, Search(1800, small_side=side, validated=[[30 + gain] * 2]), 900)
     assert search.small_side and search.small_side.candidate.n == paid
     assert [trial.takes_smaller for trial in search.trials] == [paid == 500]
+
+
+@pytest.mark.parametrize(("paid", "compared"), [(600, False), (900, True)])
+def test_sizes_trained_on_photos_of_other_sizes_are_not_compared(device: Device, paid: int, compared: bool) -> None:
+    """Larger photos since the last size would decide, not more Gaussians; the present one is taken."""
+    scene = known_scene(20, device, copies=90, views=10)
+    config = replace(CONFIG, iterations=3000, coarse=CoarseConfig(factor=2, until=0.2))
+    training = Training(scene, config, device, initial_state(scene, config))
+    side = SmallSide(None, candidate(paid, 500, 3, [[30.0, 30.0]], config))  # type: ignore[arg-type]
+    search = _compared(training, Search(1800, small_side=side, validated=[[20.0, 20.0]]), 1200)
+    assert len(search.trials) == compared
+    assert search.small_side and search.small_side.candidate.n == (500 if compared else 1800)
 
 
 def test_growth_has_a_pace(device: Device) -> None:

@@ -14,6 +14,7 @@ from clsplat.errors import InputError
 from clsplat.scene import Scene
 from clsplat.training.checkpoint import load_state, save_state
 from clsplat.training.loop import train
+from clsplat.training.run_length import with_length
 from clsplat.training.state import initial_state
 
 
@@ -58,7 +59,7 @@ def test_an_interrupted_run_loses_nothing(scene: Scene, device: Device, tmp_path
 
     with pytest.raises(KeyboardInterrupt):
         train(scene, CONFIG, tmp_path, device, progress=interrupt)
-    assert load_state(tmp_path / "checkpoint.npz", scene.extent, CONFIG).iteration == 33
+    assert load_state(tmp_path / "checkpoint.npz", scene.extent, with_length(CONFIG, scene)).iteration == 33
     assert same(train(scene, CONFIG, tmp_path, device, resume=True), expected)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from clsplat.config import TrainConfig
 from clsplat.renderer import fetch
 from clsplat.training.autosize.reduction import costliest_rows
 from clsplat.training.autosize.rule import (
@@ -23,6 +24,7 @@ from clsplat.training.autosize.rule import (
     window_bounds,
 )
 from clsplat.training.autosize.validation import split, validate
+from clsplat.training.coarse_to_fine import factor_at
 from clsplat.training.session import Training
 from clsplat.training.smoothing_filter import SmoothingFilter
 from clsplat.training.state import State
@@ -76,16 +78,24 @@ def _grown(training: Training, search: Search, iteration: int) -> tuple[State, S
 
 
 def _compared(training: Training, search: Search, iteration: int) -> Search:
-    """The search after a comparison of the present Gaussians with the last candidate that paid."""
+    """The search after a comparison of the present Gaussians with the last candidate that paid.
+
+    One that was trained on smaller photos is not compared: larger photos would decide, not more Gaussians.
+    """
     if not search.validated:  # the run is too short
         return search
     present, paid = _candidate(training, iteration, search.validated), search.small_side
-    if paid and paid.candidate.n < present.n:
+    if paid and paid.candidate.n < present.n and _same_photos(paid.candidate, present, training.config):
         trial = Trial(True, paid.candidate, present)
         search = replace(search, trials=[*search.trials, trial])
         if trial.takes_smaller:
             return search
     return replace(search, small_side=SmallSide(training.state.rows.take(np.arange(present.n)), present))
+
+
+def _same_photos(first: Candidate, second: Candidate, config: TrainConfig) -> bool:
+    """Whether two candidates were last trained on photos of the same size."""
+    return factor_at(first.iteration - 1, config) == factor_at(second.iteration - 1, config)
 
 
 def _pruned(training: Training, search: Search, iteration: int, after_fork: After) -> State:
