@@ -24,6 +24,11 @@ FIRST_FACTOR: Final = 4
 """Divisor of the edges of larger photos at the start (measured: docs/howto/strategies.md)."""
 
 
+def largest_photo(scene: Scene) -> int:
+    """Pixels of the largest training photo."""
+    return max(view.camera.width * view.camera.height for view in scene.train)
+
+
 def with_length(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Choose what the configuration leaves to the training photos.
 
@@ -38,7 +43,7 @@ def with_length(config: TrainConfig, scene: Scene) -> TrainConfig:
         With a number of iterations, and a divisor of the photos' edges at the start: 1 for small photos and where the
         size is fixed.
     """
-    pixels = max(view.camera.width * view.camera.height for view in scene.train)
+    pixels = largest_photo(scene)
     if not config.iterations:
         fewest = round(FEWEST_ITERATIONS * sqrt(max(1.0, pixels / SMALL_PHOTO)))
         wanted = max(fewest, VISITS * len(scene.train))

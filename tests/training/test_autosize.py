@@ -146,13 +146,16 @@ def test_sizes_trained_on_photos_of_other_sizes_are_not_compared(device: Device,
 
 
 def test_growth_has_a_pace(device: Device) -> None:
-    """To three times the first Gaussians within two fifths of the run, or to one per pixel."""
+    """To three times the first Gaussians within two fifths of the run, or to one per pixel of a small photo."""
     scene = known_scene(20, device, copies=1, views=10)
     growing = len(growth_bounds(CONFIG)) - 1  # the first window has the first Gaussians
     assert growing == 3
     search = start(scene, 1000, CONFIG)
     assert search.most == 1000 and search.pace**growing == pytest.approx(96 * 80 / 1000)
     assert start(scene, 5000, CONFIG).pace ** growing == pytest.approx(3)
+    camera = Camera.look_at((0, 0, -5), (0, 0, 0), (0, 1, 0), 900, 900, 400)
+    large = replace(scene, train=[View("large", camera, np.zeros((400, 900, 3), np.uint8))])
+    assert start(large, 1000, CONFIG).pace ** growing == pytest.approx(180), "half of one per pixel"
     assert most_grown(search, CONFIG) == np.ceil(1000 * search.pace)
     assert most_grown(search, replace(CONFIG, max_gaussians=1100)) == 1100
     assert most_grown(replace(search, grows=False), CONFIG) == 1000

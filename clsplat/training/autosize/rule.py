@@ -20,6 +20,7 @@ from clsplat.ranges import checked
 from clsplat.scene import Scene
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.rows import Rows
+from clsplat.training.run_length import SMALL_PHOTO, largest_photo
 
 GROWTH_END = 0.4
 """Fraction of the iterations at which growth ends. The paper's densification ends at 0.5; the photos that are held
@@ -54,7 +55,8 @@ PACE = 3.0
 worse (measured: docs/size.md)."""
 
 PER_PIXEL = 1.0
-"""Gaussians per pixel of a photo that growth reaches by its end, unless `PACE` allows more."""
+"""Gaussians per pixel of a small photo that growth reaches by its end, unless `PACE` allows more. Larger photos allow
+more in proportion to their edges (measured: docs/size.md)."""
 
 VALIDATIONS = 3
 """Validations in the second half of a window, which are averaged: quality fluctuates while the learning rates are
@@ -228,9 +230,10 @@ def growth_window(config: TrainConfig) -> int:
 
 def start(scene: Scene, n: int, config: TrainConfig) -> "Search":
     """The search before the first iteration, with n Gaussians."""
-    pixels = max(view.camera.width * view.camera.height for view in scene.train)
+    pixels = largest_photo(scene)
+    reach = PER_PIXEL * min(pixels, sqrt(pixels * SMALL_PHOTO))
     growing = max(1, len(growth_bounds(config)) - 1)  # the first window has the first Gaussians
-    return Search(n, max(PACE, PER_PIXEL * pixels / n) ** (1 / growing))
+    return Search(n, max(PACE, reach / n) ** (1 / growing))
 
 
 def validation_times(config: TrainConfig) -> set[int]:
