@@ -5,9 +5,10 @@ own under names that are digests. Its results go back in the same way. Requests 
 the scheduler, so that a worker needs a connection to nothing else.
 """
 
+import asyncio
 import io
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from threading import Thread
 from typing import Any, BinaryIO
@@ -61,7 +62,8 @@ class Desk:
         self._client, self._folder = client, folder
         self._views = {view.name: view for view in views}
         self._layer: tuple[tuple[str, str] | None, memoryview] = (None, memoryview(b""))
-        self._incoming: dict[tuple[str, str], tuple[AbstractContextManager[BinaryIO], BinaryIO]] = {}
+        self._incoming: dict[tuple[str, str], tuple[ExitStack, BinaryIO]] = {}
+        self._answers: dict[str, Any] = {}
         self._thread = Thread(target=self._serve, daemon=True)
 
     def __enter__(self) -> "Desk":
@@ -76,21 +78,27 @@ class Desk:
         with suppress(Exception):
             self._requests.put(None)
             self._thread.join()
-            self._requests.close()
+            for queue in (self._requests, *self._answers.values()):
+                queue.close()
         for key in list(self._incoming):
             self._given_up(key)
 
     def _serve(self) -> None:
         from distributed import Queue
 
-        while request := self._requests.get():
-            sender, what, *about = request
-            answers: dict[str, Callable[..., Any]] = {"file": self._file, "photo": self._photo}
-            try:
-                answer = self._received(sender, *about) if what == "result" else answers[what](*about)
-            except Exception as error:  # any: the worker tells it, and others still need answers
-                answer = str(error) if isinstance(error, ClsplatError) else f"{what}: {error!r}"
-            Queue(sender, client=self._client).put(message(answer))
+        # Without a scheduler nobody asks; `run_on_cluster` says so.
+        with suppress(Exception):
+            while request := self._requests.get():
+                if request[0] not in self._answers:
+                    self._answers[request[0]] = Queue(request[0], client=self._client)
+                self._answers[request[0]].put(message(self._answer(*request)))
+
+    def _answer(self, sender: str, what: str, *about: Any) -> Any:
+        answers: dict[str, Callable[..., Any]] = {"file": self._file, "photo": self._photo}
+        try:
+            return self._received(sender, *about) if what == "result" else answers[what](*about)
+        except Exception as error:  # any: the worker tells it, and others still need answers
+            return str(error) if isinstance(error, ClsplatError) else f"{what}: {error!r}"
 
     def _file(self, name: str, begin: int, size: int) -> tuple[int, int, Chunk]:
         """Bytes of a file beside the jobs, with its size and their checksum."""
@@ -118,21 +126,20 @@ class Desk:
         check(name, data, expected)
         if begin == 0:
             self._given_up(key)
-            begun = replacing(self._folder / key[1])
-            self._incoming[key] = begun, begun.__enter__()
-        opened, file = self._incoming[key]
-        file.write(data)
-        if file.tell() == total:
-            del self._incoming[key]
-            opened.__exit__(None, None, None)
+            begun = ExitStack()
+            self._incoming[key] = begun, begun.enter_context(replacing(self._folder / key[1]))
+        opened, file = self._incoming.pop(key)
+        with opened:
+            file.write(data)
+            if file.tell() < total:
+                self._incoming[key] = opened.pop_all(), file
         return True
 
     def _given_up(self, key: tuple[str, str]) -> None:
         """Remove what has arrived of a result whose sender began again, or is gone."""
         if key in self._incoming:
-            error = InputError(f"{key[1]}: incomplete")
-            with suppress(InputError):
-                self._incoming.pop(key)[0].__exit__(InputError, error, None)
+            with suppress(InputError), self._incoming.pop(key)[0]:
+                raise InputError(f"{key[1]}: incomplete")
 
 
 class Cache:
@@ -156,8 +163,14 @@ class Cache:
         self._answers.close()
 
     def _ask(self, *request: Any) -> Any:
-        self._requests.put(message((self._answers.name, *request)), timeout=PATIENCE)
-        answer = self._answers.get(timeout=PATIENCE)
+        try:
+            self._requests.put(message((self._answers.name, *request)), timeout=PATIENCE)
+            answer = self._answers.get(timeout=PATIENCE)
+        except (OSError, asyncio.TimeoutError) as error:
+            raise InputError(
+                f"expected an answer from the command that trains the blocks within {PATIENCE} seconds, found "
+                f"{error!r}"
+            ) from error
         if isinstance(answer, str):
             raise InputError(answer)
         return answer
