@@ -17,7 +17,7 @@ from clsplat.atomic import replacing
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, psnr_fitted, ssim, to_uint8
-from clsplat.render import renderings
+from clsplat.render import Stored, renderings
 from clsplat.renderer import Renderer
 from clsplat.scene import View, in_turn
 from clsplat.show.comparisons import save_difference, save_png
@@ -34,7 +34,7 @@ PENDING = os.cpu_count() or 1
 
 
 def mean_metrics(
-    gaussians: Gaussians,
+    gaussians: Gaussians | Stored,
     views: Iterable[View],
     renderer: Renderer | None = None,
     metrics: Iterable[Metric] = (psnr, ssim),
@@ -70,7 +70,7 @@ def mean_metrics_of(
 
 
 def evaluate(
-    gaussians: Gaussians,
+    gaussians: Gaussians | Stored,
     views: Iterable[View],
     out: Path | str,
     renderer: Renderer | None = None,
@@ -80,7 +80,7 @@ def evaluate(
 
     Parameters
     ----------
-    gaussians : Gaussians
+    gaussians : Gaussians or Stored
         In the coordinates of the views, on the host or on the renderer's device.
     views : iterable of View
         At least one; usually a scene's held-out views.
@@ -168,10 +168,10 @@ def evaluate_images(
     return result
 
 
-def rendered(gaussians: Gaussians, views: list[View], renderer: Renderer) -> Iterator[NDArray[np.uint8]]:
+def rendered(gaussians: Gaussians | Stored, views: list[View], renderer: Renderer) -> Iterator[NDArray[np.uint8]]:
     """Render views in 8 bits, one after the other."""
-    for rendering in renderings(renderer, gaussians, [view.camera for view in views]):
-        yield to_uint8(rendering.rgb)
+    # A loop's variable would keep the last Gaussians in memory while the next ones are read.
+    return map(lambda each: to_uint8(each.rgb), renderings(renderer, gaussians, [view.camera for view in views]))
 
 
 def compared(

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,24 @@ if TYPE_CHECKING:
     from clsplat.device import Device
 
 Array = NDArray[Any]
+
+
+class Stored(Protocol):
+    """Gaussians that are not in memory together: those that some cameras may show are, at a time."""
+
+    def __len__(self) -> int: ...
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics."""
+        ...
+
+    def shown(self, renderer: Renderer, cameras: Iterable[Camera]) -> Iterator[tuple[list[Camera], Gaussians]]:
+        """Yield the cameras, some at a time, and the Gaussians that these may show; both in their order.
+
+        What is left out would not be drawn. Each camera has a near plane: no default follows from some Gaussians.
+        """
+        ...
 
 
 class Rendering:
@@ -220,7 +239,7 @@ def render_views(
 
 def renderings(
     renderer: Renderer,
-    gaussians: Gaussians,
+    gaussians: Gaussians | Stored,
     cameras: Iterable[Camera],
     sh_degree: int | None = None,
     *,
@@ -231,9 +250,14 @@ def renderings(
 
     Parameters
     ----------
-    gaussians : Gaussians
-        On the host or on the renderer's device.
+    gaussians : Gaussians or Stored
+        Gaussians on the host or on the renderer's device.
     """
+    if not isinstance(gaussians, Gaussians):
+        return chain.from_iterable(
+            renderings(renderer, some, looking, sh_degree, depth=depth, gradients=gradients)
+            for looking, some in gaussians.shown(renderer, cameras)
+        )
     if isinstance(gaussians.means, np.ndarray):
         gaussians.validate()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree

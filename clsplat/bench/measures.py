@@ -13,7 +13,7 @@ from clsplat.evaluate import compared, mean_metrics, rendered
 from clsplat.formats import save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, ssim
-from clsplat.render import renderings
+from clsplat.render import Stored, renderings
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View, evenly_spaced
 
@@ -120,7 +120,7 @@ def rare_share(views: list[View], rare: Masks | None) -> float | None:
     return sum(int(_counted(view, mask).sum()) for view, mask in zip(views, rare, strict=True)) / pixels
 
 
-def training_psnr(gaussians: Gaussians, views: list[View], renderer: Renderer) -> Record:
+def training_psnr(gaussians: Gaussians | Stored, views: list[View], renderer: Renderer) -> Record:
     """Mean PSNR of at most `TRAINING_PHOTOS` training photos, evenly spaced, as the entry `train_psnr`."""
     figures = mean_metrics(gaussians, evenly_spaced(views, TRAINING_PHOTOS), renderer, metrics=(psnr,))
     return _finite({"train_psnr": figures["psnr"]})

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from clsplat.atomic import replacing
 from clsplat.blocks.jobs import Job, read_job
 from clsplat.blocks.partition import EVERYWHERE
-from clsplat.blocks.parts import Part, bounds_of, read_index, read_part
-from clsplat.blocks.sight import Bounds, may_see, seen
+from clsplat.blocks.parts import Part, bounds_of, read_index, read_part, seen_in
+from clsplat.blocks.sight import seen
 from clsplat.blocks.survey import seen_by_block
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset import load_scene, read_depth_maps
@@ -125,14 +125,10 @@ def needed_parts(job_file: Path, job: Job) -> Iterator[tuple[bool, Part]]:
     for near in (True,) if job.near == EVERYWHERE else (True, False):
         parts = read_index(job_file.with_name(job.scene if near else job.far))
         bounds = bounds_of(parts)
-        wanted = job.wide.meets(bounds.low, bounds.high) | seen(job.posed(), bounds, _along_rays(job))
+        wanted = job.wide.meets(bounds.low, bounds.high) | seen(job.posed(), bounds, job.config.render)
         if near:
             wanted &= job.near.meets(bounds.low, bounds.high)
         yield from ((near, part) for part, needed in zip(parts, wanted, strict=True) if needed)
-
-
-def _along_rays(job: Job) -> bool:
-    return job.config.render.projection == "ray"
 
 
 def _start(job_file: Path, job: Job) -> Gaussians:
@@ -141,8 +137,7 @@ def _start(job_file: Path, job: Job) -> Gaussians:
     for near, part in needed_parts(job_file, job):
         gaussians = with_coefficients(read_part(job_file.parent, part), coefficients)
         here = gaussians.take(job.near.contains(gaussians.means) == near)
-        looking = [camera for camera in cameras if may_see(camera, bounds_of([part]), _along_rays(job))[0]]
-        found.append(here.take(job.wide.contains(here.means) | seen(looking, Bounds.of(here), _along_rays(job))))
+        found.append(here.take(job.wide.contains(here.means) | seen_in(part, here, cameras, job.config.render)))
     return Gaussians.concatenate(found)
 
 

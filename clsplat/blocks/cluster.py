@@ -7,7 +7,7 @@ from typing import Any
 from clsplat.blocks.block import result_of, train_block
 from clsplat.blocks.jobs import read_job
 from clsplat.blocks.transport import Desk, train_from
-from clsplat.errors import InputError
+from clsplat.errors import ClsplatError, InputError, driver_errors
 from clsplat.scene import View
 
 RESOURCE = "CL"
@@ -42,12 +42,13 @@ def run_on_cluster(address: str, jobs: list[Path], views: list[View], tell: Call
     Raises
     ------
     InputError
-        If dask.distributed is not installed, there is no scheduler, or a worker has another folder of the same path.
+        If dask.distributed is not installed, there is no scheduler or it is lost, or a worker has another folder of
+        the same path.
     ClsplatError
-        Those of `train_block`, from a worker.
+        If the training of a block fails on a worker, or its workers die; when all others have ended.
     """
     try:
-        from distributed import Client, as_completed
+        from distributed import CancelledError, Client, KilledWorker, as_completed
     except ImportError as error:
         raise InputError(
             "--scheduler: expected the package distributed, found none; pip install 'clsplat[cluster]'"
@@ -61,14 +62,38 @@ def run_on_cluster(address: str, jobs: list[Path], views: list[View], tell: Call
         _tell_missing(client, tell)
         how: dict[str, Any] = {"resources": {RESOURCE: 1}, "retries": RETRIES}
         tasks = {client.submit(_train, str(job), desk.name, key=f"clsplat-{job.stem}", **how): job for job in waiting}
-        for number, task in enumerate(as_completed(list(tasks)), 1):
-            worker = task.result()
+        failures: list[str] = []
+        done = 0
+        for task in as_completed(list(tasks)):
+            try:
+                worker = task.result()
+            except CancelledError as error:
+                raise InputError(
+                    f"--scheduler: lost the scheduler at {address}; finished blocks are kept: start it and its "
+                    "workers again, and use --resume"
+                ) from error
+            except (ClsplatError, KilledWorker) as error:  # the others go on
+                failures.append(_why(tasks[task], error))
+                continue
             if not result_of(tasks[task]).exists():
                 raise InputError(
                     f"{tasks[task].parent}: expected a folder that workers share or do not have, found no result "
                     f"after {worker} had written one; choose another folder with -o"
                 )
-            tell(f"blocks: {number} of {len(tasks)} done, the last by {worker}")
+            done += 1
+            tell(f"blocks: {done} of {len(tasks)} done, the last by {worker}")
+    if failures:
+        raise ClsplatError(
+            f"{failures[0]}; {len(failures)} of {len(tasks)} blocks have failed, the others are kept: --resume "
+            "trains what is missing"
+        )
+
+
+def _why(job: Path, error: Exception) -> str:
+    """Why a block has failed."""
+    if isinstance(error, ClsplatError):
+        return f"block {job.stem}: {error}"
+    return f"block {job.stem}: expected a worker that trains it, found that each one has died meanwhile"
 
 
 def _train(job: str, desk: str) -> str:
@@ -76,11 +101,23 @@ def _train(job: str, desk: str) -> str:
     from distributed import get_worker
 
     worker = get_worker()
-    if _is_here(Path(job)):
-        train_block(job)
-    else:
-        train_from(desk, Path(job).name, Path(worker.local_directory) / CACHE)
+    try:
+        with driver_errors():
+            if _is_here(Path(job)):
+                train_block(job)
+            else:
+                train_from(desk, Path(job).name, Path(worker.local_directory) / CACHE)
+    except Exception as error:  # any: errors of drivers and of other packages cannot always be sent
+        raise ClsplatError(f"worker {worker.name}: {_sentence(error)}") from None
     return str(worker.name)
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, ClsplatError):
+        return str(error)
+    if isinstance(error, OSError):  # one that no function has translated, such as a full disk while a log is written
+        return f"cannot read or write {error.filename or 'a file'}: {error.strerror or error}"
+    return repr(error)
 
 
 def _is_here(job: Path) -> bool:

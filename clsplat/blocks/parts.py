@@ -5,15 +5,18 @@ checked when it is read, and the others need not be read. The rows stay in the f
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
 from clsplat.blocks.jobs import digest_of
-from clsplat.blocks.sight import Bounds
+from clsplat.blocks.sight import Bounds, may_see, seen
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.formats.ply import REQUIRED, names_of, to_gaussians, with_coefficients
 from clsplat.formats.ply_parts import PlyParts
@@ -58,7 +61,7 @@ def write_index(files: list[Path]) -> Path:
     InputError
         If a file cannot be read, or the index cannot be written.
     """
-    parts = [part for file in files for part in _parts(file)]
+    parts = [part for file in files for part in parts_of(file)]
     path = files[0].with_name(_name(parts) + INDEX)
     with replacing(path) as out:
         out.write(json.dumps(parts).encode())
@@ -69,7 +72,14 @@ def _name(parts: list[Part]) -> str:
     return digest_of(json.dumps([part[1:] for part in parts]).encode())
 
 
-def _parts(file: Path) -> Iterator[Part]:
+def parts_of(file: Path) -> Iterator[Part]:
+    """Read a PLY and yield its parts, with their bounds and digests.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a value is not finite.
+    """
     rows = PlyParts(file)
     begin = rows.begin
     for stored, gaussians in rows.chunks():
@@ -104,6 +114,12 @@ def read_index(path: Path) -> list[Part]:
 def bounds_of(parts: list[Part]) -> Bounds:
     """Bounds of parts."""
     return Bounds(*(np.array([part[k] for part in parts], np.float64) for k in (-3, -2, -1)))
+
+
+def seen_in(part: Part, gaussians: Gaussians, cameras: Iterable[Camera], config: RenderConfig) -> NDArray[np.bool_]:
+    """Whether a photo of any camera may show each of the Gaussians (N,) of a part, or of some of them."""
+    looking = [camera for camera in cameras if may_see(camera, bounds_of([part]), config)[0]]
+    return seen(looking, Bounds.of(gaussians), config)
 
 
 def read_part(folder: Path, part: Part) -> Gaussians:

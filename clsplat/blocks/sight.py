@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.config import RenderConfig
 from clsplat.constants import ALPHA_MIN, BLUR, EXTENT_SLACK, FRUSTUM_MARGIN
 from clsplat.gaussians import Gaussians
+from clsplat.renderer import along_rays
 
 Array = NDArray[np.float64]
 
@@ -46,16 +48,16 @@ class Bounds(NamedTuple):
         return Bounds(self.low[rows], self.high[rows], self.radius[rows])
 
 
-def seen(cameras: Iterable[Camera], bounds: Bounds, along_rays: bool) -> NDArray[np.bool_]:
+def seen(cameras: Iterable[Camera], bounds: Bounds, config: RenderConfig) -> NDArray[np.bool_]:
     """Whether a photo of any camera may show something in each box, (N,)."""
     found = np.zeros(len(bounds.radius), bool)
     for camera in cameras:
         left = ~found
-        found[left] = may_see(camera, bounds.take(left), along_rays)
+        found[left] = may_see(camera, bounds.take(left), config)
     return found
 
 
-def may_see(camera: Camera, bounds: Bounds, along_rays: bool = False) -> NDArray[np.bool_]:
+def may_see(camera: Camera, bounds: Bounds, config: RenderConfig) -> NDArray[np.bool_]:
     """Whether a camera may show something in each box.
 
     Parameters
@@ -63,29 +65,36 @@ def may_see(camera: Camera, bounds: Bounds, along_rays: bool = False) -> NDArray
     camera : Camera
     bounds : Bounds
         N boxes.
-    along_rays : bool
-        Whether Gaussians are evaluated along rays (`clsplat.renderer.along_rays`). Pinholes then show everything, as
-        do orthographic and equirectangular cameras always: their bounds have not been derived.
+    config : RenderConfig
+        How they are drawn.
 
     Returns
     -------
     (N,) bool
-        False only where nothing in the box is drawn, whatever its shape, opacity and near plane.
+        False only where nothing in the box is drawn, whatever its shape, opacity and near plane. An equirectangular
+        camera looks in all directions, and may show everything.
     """
     with np.errstate(invalid="ignore"):  # infinite boxes; comparisons with NaN must not cull
         if camera.model == "fisheye":
             return _in_cone(camera, bounds)
-        if camera.model == "pinhole" and not along_rays:
-            return _in_frustum(camera, bounds)
-    return np.ones(len(bounds.radius), bool)
+        if camera.model == "equirectangular":
+            return np.ones(len(bounds.radius), bool)
+        return _in_frustum(camera, bounds, along_rays(config, camera))
 
 
-def _in_frustum(camera: Camera, bounds: Bounds) -> NDArray[np.bool_]:
-    """Whether boxes reach over the four planes through a pinhole's image borders, and before the camera.
+def _in_frustum(camera: Camera, bounds: Bounds, rays: bool) -> NDArray[np.bool_]:
+    """Whether boxes reach over the four planes through the image borders, and before the camera.
 
-    With X the position across the image and Z the depth, an affine splat reaches over the border at slope m only if
-    f X <= f m Z + k (f sqrt(1 + c^2) s + sqrt(BLUR) Z), where s is the largest standard deviation, k `DEVIATIONS`,
-    and c the slope of the Jacobian, which is clamped at FRUSTUM_MARGIN beyond the border (cl/lens.h).
+    X is the position across the image, Z the depth, s the largest standard deviation, k `DEVIATIONS`. A Gaussian
+    reaches over the border at slope m of a pinhole only if
+
+        f X <= f m Z + k (f sqrt(1 + c^2) s + sqrt(BLUR) Z)             for an affine splat
+        X <= m Z + k sqrt(1 + m^2) (s + sqrt(BLUR / (fx fy)) Z)         along rays
+
+    and over the border of an orthographic image of half the width w only if f X <= w + k (f s + sqrt(BLUR)). c is the
+    slope of the Jacobian, which is clamped at FRUSTUM_MARGIN beyond the border (cl/lens.h). Along rays, the point in
+    front of the camera where the density is largest is on a ray through the image, and at most k of the deviations
+    from the centre, whose squares the blur increases by BLUR Z^2 / (fx fy) (cl/gaussian_rays.h).
     """
     view, moved = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     error = ROUNDING * (np.maximum(-bounds.low, bounds.high).max(axis=1) + np.abs(moved).max())
@@ -93,13 +102,21 @@ def _in_frustum(camera: Camera, bounds: Bounds) -> NDArray[np.bool_]:
     intrinsics = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
     for axis, (focal, centre, size) in enumerate(intrinsics):
         for sign, room in ((1, size - centre), (-1, centre)):
-            slope = (room + PIXEL + DEVIATIONS * sqrt(BLUR)) / focal
-            steepest = max(abs(slope), abs(room + FRUSTUM_MARGIN * 0.5 * size) / focal)
+            slope, shift, length = (room + PIXEL + DEVIATIONS * sqrt(BLUR)) / focal, 0.0, 1.0
+            if camera.model == "orthographic":
+                slope, shift = 0.0, slope
+            elif rays:
+                border = (room + PIXEL) / focal
+                length = sqrt(1 + border**2)
+                slope = border + DEVIATIONS * length * sqrt(BLUR / (camera.fx * camera.fy))
+            else:
+                steepest = max(abs(slope), abs(room + FRUSTUM_MARGIN * 0.5 * size) / focal)
+                length = sqrt(1 + steepest**2)
             normal = np.array([0.0, 0.0, -slope])
             normal[axis] = sign
             # The box already reaches DEVIATIONS radii over the mean along any direction.
-            more = DEVIATIONS * max(0.0, sqrt(1 + steepest**2) - sqrt(1 + slope**2)) * bounds.radius
-            distance = _least(normal @ view, bounds) + normal @ moved
+            more = DEVIATIONS * max(0.0, length - sqrt(1 + slope**2)) * bounds.radius
+            distance = _least(normal @ view, bounds) + normal @ moved - shift
             result &= ~(distance > more + (1 + abs(slope)) * error)
     return result
 

@@ -1,23 +1,25 @@
 """Data of blocks through a scheduler of dask, for workers that share no folder with the one who started the run.
 
-A worker asks for what a block needs, in chunks that come with their digests, and stores it whole in a folder of its
+A worker asks for what a block needs, in chunks that come with their checksums, and stores it whole in a folder of its
 own under names that are digests. Its results go back in the same way. Requests and answers are elements of queues of
 the scheduler, so that a worker needs a connection to nothing else.
 """
 
+import asyncio
 import io
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from threading import Thread
 from typing import Any, BinaryIO
 from uuid import uuid4
+from zlib import crc32
 
 import numpy as np
 
 from clsplat.atomic import replacing
 from clsplat.blocks.block import log_of, needed_parts, train_block
-from clsplat.blocks.jobs import Job, digest_of, read_job
+from clsplat.blocks.jobs import Job, read_job
 from clsplat.blocks.parts import ROWS, Part
 from clsplat.camera import Camera
 from clsplat.errors import ClsplatError, InputError
@@ -25,6 +27,8 @@ from clsplat.formats.validity import reading
 from clsplat.scene import DepthMap, View
 from clsplat.streaming import PhotoStream, Source, photo_budget
 from clsplat.training.preparation import photo_memory
+
+Chunk = bytes | memoryview
 
 CHUNK = 16 << 20
 """Bytes of a request or an answer, at most: it passes through the scheduler's memory."""
@@ -58,7 +62,8 @@ class Desk:
         self._client, self._folder = client, folder
         self._views = {view.name: view for view in views}
         self._layer: tuple[tuple[str, str] | None, memoryview] = (None, memoryview(b""))
-        self._incoming: dict[tuple[str, str], tuple[AbstractContextManager[BinaryIO], BinaryIO]] = {}
+        self._incoming: dict[tuple[str, str], tuple[ExitStack, BinaryIO]] = {}
+        self._answers: dict[str, Any] = {}
         self._thread = Thread(target=self._serve, daemon=True)
 
     def __enter__(self) -> "Desk":
@@ -73,31 +78,37 @@ class Desk:
         with suppress(Exception):
             self._requests.put(None)
             self._thread.join()
-            self._requests.close()
+            for queue in (self._requests, *self._answers.values()):
+                queue.close()
         for key in list(self._incoming):
             self._given_up(key)
 
     def _serve(self) -> None:
         from distributed import Queue
 
-        while request := self._requests.get():
-            sender, what, *about = request
-            answers: dict[str, Callable[..., Any]] = {"file": self._file, "photo": self._photo}
-            try:
-                answer = self._received(sender, *about) if what == "result" else answers[what](*about)
-            except Exception as error:  # any: the worker tells it, and others still need answers
-                answer = str(error) if isinstance(error, ClsplatError) else f"{what}: {error!r}"
-            Queue(sender, client=self._client).put(answer)
+        # Without a scheduler nobody asks; `run_on_cluster` says so.
+        with suppress(Exception):
+            while request := self._requests.get():
+                if request[0] not in self._answers:
+                    self._answers[request[0]] = Queue(request[0], client=self._client)
+                self._answers[request[0]].put(message(self._answer(*request)))
 
-    def _file(self, name: str, begin: int, size: int) -> tuple[int, str, bytes]:
-        """Bytes of a file beside the jobs, with its size and their digest."""
+    def _answer(self, sender: str, what: str, *about: Any) -> Any:
+        answers: dict[str, Callable[..., Any]] = {"file": self._file, "photo": self._photo}
+        try:
+            return self._received(sender, *about) if what == "result" else answers[what](*about)
+        except Exception as error:  # any: the worker tells it, and others still need answers
+            return str(error) if isinstance(error, ClsplatError) else f"{what}: {error!r}"
+
+    def _file(self, name: str, begin: int, size: int) -> tuple[int, int, Chunk]:
+        """Bytes of a file beside the jobs, with its size and their checksum."""
         path = self._folder / Path(name).name
         with reading(path), open(path, "rb") as file:
             file.seek(begin)
             data = file.read(min(size, CHUNK))
-        return path.stat().st_size, digest_of(data), data
+        return path.stat().st_size, crc32(data), data
 
-    def _photo(self, name: str, layer: str, begin: int, size: int) -> tuple[int, str, bytes]:
+    def _photo(self, name: str, layer: str, begin: int, size: int) -> tuple[int, int, Chunk]:
         """Bytes of an array of a photo as .npy. The last array stays in memory: its next chunk follows."""
         if self._layer[0] != (name, layer):
             view = self._views[name].loaded()
@@ -106,31 +117,29 @@ class Desk:
             if array is not None:
                 np.lib.format.write_array(stored, array, allow_pickle=False)
             self._layer = (name, layer), stored.getbuffer()
-        data = bytes(self._layer[1][begin : begin + min(size, CHUNK)])
-        return len(self._layer[1]) or ABSENT, digest_of(data), data
+        data = self._layer[1][begin : begin + min(size, CHUNK)]
+        return len(self._layer[1]) or ABSENT, crc32(data), data
 
-    def _received(self, sender: str, name: str, begin: int, total: int, found: str, data: bytes) -> bool:
+    def _received(self, sender: str, name: str, begin: int, total: int, expected: int, data: Chunk) -> bool:
         """Append bytes of a result to its file, which appears when it is whole."""
         key = sender, Path(name).name
-        if digest_of(data) != found:
-            raise InputError(f"{name}: expected bytes with the digest {found}, found others")
+        check(name, data, expected)
         if begin == 0:
             self._given_up(key)
-            begun = replacing(self._folder / key[1])
-            self._incoming[key] = begun, begun.__enter__()
-        opened, file = self._incoming[key]
-        file.write(data)
-        if file.tell() == total:
-            del self._incoming[key]
-            opened.__exit__(None, None, None)
+            begun = ExitStack()
+            self._incoming[key] = begun, begun.enter_context(replacing(self._folder / key[1]))
+        opened, file = self._incoming.pop(key)
+        with opened:
+            file.write(data)
+            if file.tell() < total:
+                self._incoming[key] = opened.pop_all(), file
         return True
 
     def _given_up(self, key: tuple[str, str]) -> None:
         """Remove what has arrived of a result whose sender began again, or is gone."""
         if key in self._incoming:
-            error = InputError(f"{key[1]}: incomplete")
-            with suppress(InputError):
-                self._incoming.pop(key)[0].__exit__(InputError, error, None)
+            with suppress(InputError), self._incoming.pop(key)[0]:
+                raise InputError(f"{key[1]}: incomplete")
 
 
 class Cache:
@@ -154,8 +163,14 @@ class Cache:
         self._answers.close()
 
     def _ask(self, *request: Any) -> Any:
-        self._requests.put((self._answers.name, *request), timeout=PATIENCE)
-        answer = self._answers.get(timeout=PATIENCE)
+        try:
+            self._requests.put(message((self._answers.name, *request)), timeout=PATIENCE)
+            answer = self._answers.get(timeout=PATIENCE)
+        except (OSError, asyncio.TimeoutError) as error:
+            raise InputError(
+                f"expected an answer from the command that trains the blocks within {PATIENCE} seconds, found "
+                f"{error!r}"
+            ) from error
         if isinstance(answer, str):
             raise InputError(answer)
         return answer
@@ -165,19 +180,18 @@ class Cache:
         if path.exists():
             return True
         done = 0
-        total, found, data = self._ask(*what, begin, CHUNK if size is None else size)
+        total, expected, data = self._ask(*what, begin, CHUNK if size is None else size)
         if total == ABSENT:
             return False
         size = total if size is None else size
         with replacing(path) as file:
             while True:
-                if digest_of(data) != found or not data:
-                    raise InputError(f"{path.name}: expected bytes with the digest {found}, found others")
+                check(path.name, data, expected)
                 file.write(data)
                 done += len(data)
                 if done == size:
                     return True
-                _, found, data = self._ask(*what, begin + done, size - done)
+                _, expected, data = self._ask(*what, begin + done, size - done)
 
     def file(self, name: str) -> Path:
         """A file beside the jobs."""
@@ -226,7 +240,22 @@ class Cache:
         total = path.stat().st_size
         with reading(path), open(path, "rb") as file:
             while data := file.read(CHUNK):
-                self._ask("result", path.name, file.tell() - len(data), total, digest_of(data), data)
+                self._ask("result", path.name, file.tell() - len(data), total, crc32(data), data)
+
+
+def message(parts: Any) -> Any:
+    """A request or an answer for a queue, whose chunk goes beside it: neither msgpack nor the scheduler copies it."""
+    from distributed.protocol import Serialize
+
+    if not isinstance(parts, tuple):
+        return parts
+    return tuple(Serialize(memoryview(part)) if isinstance(part, bytes | memoryview) else part for part in parts)
+
+
+def check(name: str, data: Chunk, expected: int) -> None:
+    """Raise an InputError if a chunk is empty or has another checksum than the one that came with it."""
+    if not data or crc32(data) != expected:
+        raise InputError(f"{name}: expected bytes with the checksum {expected}, found others")
 
 
 def read_array(path: Path) -> Any:

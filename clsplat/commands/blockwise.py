@@ -16,17 +16,17 @@ from clsplat.commands.run_folders import SCENE
 from clsplat.errors import InputError
 
 if TYPE_CHECKING:
+    from clsplat.blocks.stored import StoredScene
     from clsplat.blocks.whole import Watch
     from clsplat.config import TrainConfig
     from clsplat.device import Device
-    from clsplat.gaussians import Gaussians
     from clsplat.renderer import Renderer
     from clsplat.scene import Scene
 
 
 def train_in_blocks(
     scene: "Scene", config: "TrainConfig", renderer: "Renderer", data: Path, out: Path, where: ClusterOptions
-) -> "Gaussians | None":
+) -> "StoredScene | None":
     """Train the blocks of a scene and merge them into the file of a run; None if one block is enough.
 
     Raises
@@ -34,9 +34,9 @@ def train_in_blocks(
     JobsPrinted
         If `where` asks for commands, and blocks have to be trained.
     """
+    from clsplat.blocks.stored import StoredScene
     from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
     from clsplat.evaluate import mean_metrics
-    from clsplat.formats import load_gaussians
 
     @contextmanager
     def watch(name: str, settings: "TrainConfig") -> Iterator[Callable[[dict[str, Any]], None]]:
@@ -53,7 +53,7 @@ def train_in_blocks(
     second = plan_refinement(first, blocks)
     _run(second, scene, renderer.device, watch, where)
     merge(second, out / SCENE, scene.offset)
-    gaussians = load_gaussians(out / SCENE)[0]
+    gaussians = StoredScene(out / SCENE)
     scores = mean_metrics(gaussians, scene.test, renderer) if scene.test else {}
     write_log(out, [*first, *second], {"num_gaussians": len(gaussians)} | scores)
     return gaussians

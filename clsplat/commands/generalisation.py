@@ -11,6 +11,7 @@ from clsplat.dataset.coverage import VIEWS_MIN, rare_pixels
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
+    from clsplat.render import Stored
     from clsplat.renderer import Renderer
     from clsplat.scene import Scene
 
@@ -21,12 +22,14 @@ EXPOSURE_GAIN = 1.0
 """Gain of PSNR, dB, by a fit of the held-out photos' colours from which their exposures are said to differ."""
 
 
-def generalisation(gaussians: "Gaussians", scene: "Scene", report: dict[str, Any], renderer: "Renderer") -> str:
+def generalisation(
+    gaussians: "Gaussians | Stored", scene: "Scene", report: dict[str, Any], renderer: "Renderer"
+) -> str:
     """Say how well a scene holds in its held-out photos.
 
     Parameters
     ----------
-    gaussians : Gaussians
+    gaussians : Gaussians or Stored
     scene : Scene
         With training and held-out photos.
     report : dict

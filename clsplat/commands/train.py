@@ -37,6 +37,7 @@ from clsplat.training.presets import DATA_PATH, PRESETS, load_config, load_prese
 if TYPE_CHECKING:
     from clsplat.device import Device
     from clsplat.gaussians import Gaussians
+    from clsplat.render import Stored
     from clsplat.renderer import Renderer
     from clsplat.scene import Scene
     from clsplat.show.viewer import Viewer
@@ -96,15 +97,15 @@ class Train:
             except JobsPrinted:
                 say("when these commands have run, go on with the same one and --resume")
                 return
-        if viewer:
+        if viewer and gaussians is not None:
             say(f"viewer: {viewer.address} stays open; Ctrl-C ends it")
             with suppress(KeyboardInterrupt):
                 viewer.hold(gaussians)
             viewer.close()
 
-    def trained(self, out: Path, suffix: str) -> "tuple[Gaussians, Viewer | None]":
+    def trained(self, out: Path, suffix: str) -> "tuple[Gaussians | None, Viewer | None]":
         """Train in a folder that is held, and write the file of Gaussians that a suffix asks for."""
-        from clsplat.formats import save_gaussians
+        from clsplat.formats import load_gaussians, save_gaussians
 
         check_new(out, self.resume)
         try_folder(out)
@@ -121,14 +122,15 @@ class Train:
                 warn(f"to continue: {shlex.join(['clsplat', *again])}")
             raise
         if suffix:
+            gaussians = load_gaussians(out / SCENE)[0] if gaussians is None else gaussians
             save_gaussians(self.out, gaussians, config.render.mode, scene.offset)
             say(f"{self.out}: {self.out.stat().st_size / 1e6:.3g} MB")
         return gaussians, viewer
 
     def _trained(
         self, scene: "Scene", config: TrainConfig, device: "Device", out: Path, viewer: "Viewer | None"
-    ) -> "Gaussians":
-        """Train in blocks, if the configuration asks for them and one is not enough; otherwise all at once."""
+    ) -> "Gaussians | None":
+        """Train all at once; or in blocks, if they are asked for and one is not enough: the result is then None."""
         from clsplat.renderer import Renderer
         from clsplat.training.checkpoint import CHECKPOINT
 
@@ -140,11 +142,10 @@ class Train:
                     "--viewer: expected not with --blocks, which train apart from each other; leave out one"
                 )
             renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
-            gaussians = train_in_blocks(scene, config, renderer, self._photos(out), out, self.cluster)
-            if gaussians is not None:
+            if stored := train_in_blocks(scene, config, renderer, self._photos(out), out, self.cluster):
                 self._began(out)()
-                report(gaussians, scene, config, renderer, out)
-                return gaussians
+                report(stored, scene, config, renderer, out)
+                return None
             config = replace(config, blocks=1)
         resume = self.resume and (out / CHECKPOINT).exists()
         return train_and_report(scene, config, device, out, resume, viewer, self._began(out))
@@ -256,7 +257,9 @@ def train_and_report(
     return gaussians
 
 
-def report(gaussians: "Gaussians", scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path) -> None:
+def report(
+    gaussians: "Gaussians | Stored", scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path
+) -> None:
     """Write the evaluation and the training curve of a training that has ended to `out`, which has its scene."""
     from clsplat.show.training_curve import training_curve
     from clsplat.training.outcome import failure
@@ -285,16 +288,17 @@ def say_size(scene: "Scene", out: Path) -> None:
 
 
 def evaluate_held_out(
-    gaussians: "Gaussians", scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path
+    gaussians: "Gaussians | Stored", scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path
 ) -> None:
     """Evaluate the held-out photos, twice where poses were refined: as posed, and with their cameras aligned."""
     from clsplat.commands.generalisation import generalisation
     from clsplat.evaluate import evaluate
+    from clsplat.gaussians import Gaussians
     from clsplat.training.photo_poses import aligned
 
     report = evaluate(gaussians, scene.test, out / "eval", renderer)
     say_scores(report, out / "eval")
-    if config.poses:
+    if config.poses and isinstance(gaussians, Gaussians):  # blocks refuse --poses
         say("aligning the held-out photos' cameras with the scene")
         posed = [aligned(gaussians, view, scene.extent, config.optim, renderer) for view in scene.test]
         report = evaluate(gaussians, posed, out / "eval_aligned", renderer)

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from clsplat.config import AdcConfig
 from clsplat.gaussians import Gaussians
-from clsplat.render import renderings
+from clsplat.render import Stored, renderings
 from clsplat.renderer import Renderer
 from clsplat.scene import View, evenly_spaced, in_turn
 
@@ -25,12 +25,12 @@ NOTHING_SHOWN = (
 """Reason of a failure where no photo shows anything."""
 
 
-def failure(gaussians: Gaussians, views: list[View], renderer: Renderer) -> str | None:
+def failure(gaussians: Gaussians | Stored, views: list[View], renderer: Renderer) -> str | None:
     """Say why a scene is a failure, if it has almost no Gaussians, or a constant colour is closer to its photos.
 
     Parameters
     ----------
-    gaussians : Gaussians
+    gaussians : Gaussians or Stored
         The trained scene.
     views : list of View
         The training photos.

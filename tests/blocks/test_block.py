@@ -182,7 +182,8 @@ def test_a_second_training_is_surrounded_by_the_first_ones(
     near = planned.blocks[0].wide
     path = plan_refinement(planned.jobs, [block._replace(near=near) for block in planned.blocks])[0]
     far = read_scene(path.with_name(job.far), 1)
-    monkeypatch.setattr("clsplat.blocks.block.seen", lambda cameras, bounds, rays: bounds.radius > 0)
+    for module in ("block", "parts"):
+        monkeypatch.setattr(f"clsplat.blocks.{module}.seen", lambda cameras, bounds, config: bounds.radius > 0)
     start = _start(path, read_job(path))
     inside = near.contains(first.means)
     np.testing.assert_array_equal(

@@ -45,7 +45,8 @@ def test_a_run_is_like_any_other_and_printed_jobs_make_the_same(
 
     before = (out / "scene.ply").read_bytes()
     capsys.readouterr()
-    run("train", dataset, "-o", out, *TRAIN, "--blocks", 2, "--resume")
+    run("train", dataset, "-o", tmp_path / "here.spz", *TRAIN, "--blocks", 2, "--resume")
+    assert len(load_gaussians(tmp_path / "here.spz")[0]) == last["num_gaussians"]
     assert "block 1" not in capsys.readouterr().err and (out / "scene.ply").read_bytes() == before
     text = fails(capsys, "train", dataset, "-o", out, *TRAIN, "--blocks", 2, "--resume", "--seed", 1)
     assert "expected the configuration that the run began with" in text

@@ -74,13 +74,15 @@ def test_a_second_training_reads_what_its_photos_show(
     hidden.means[:] = [0, -300, 0]  # far above the cameras, which look down
     shared = np.isfinite(job.wide.high)
     hidden.means[:, shared] = np.asarray(job.wide.high)[shared] + 100
-    assert not seen(job.posed(), Bounds.of(hidden), False).any() and not job.wide.contains(hidden.means).any()
+    assert not seen(job.posed(), Bounds.of(hidden), job.config.render).any()
+    assert not job.wide.contains(hidden.means).any()
     save_gaussians(folder / "hidden.ply", hidden)
     both = write_index([folder / "hidden.ply", *map(result_of, planned.jobs)])
 
     second = replace(job, scene=both.name).write(folder)
     with monkeypatch.context() as everything:
-        everything.setattr("clsplat.blocks.block.seen", lambda cameras, bounds, rays: bounds.radius > 0)
+        for module in ("block", "parts"):
+            everything.setattr(f"clsplat.blocks.{module}.seen", lambda cameras, bounds, config: bounds.radius > 0)
         expected = train_block(second, planned.scene.train, device).read_bytes()
     result_of(second).unlink()
     (folder / "hidden.ply").unlink()

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, ClassVar
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from small_plan import CONFIG, Planned, plan
 from clsplat.blocks import cluster, transport
 from clsplat.blocks.block import log_of, result_of, train_block
 from clsplat.blocks.cluster import run_on_cluster
-from clsplat.blocks.jobs import digest_of, make_job
+from clsplat.blocks.jobs import make_job
 from clsplat.blocks.transport import Cache, Desk
 from clsplat.device import Device
 from clsplat.errors import InputError
@@ -59,7 +60,7 @@ def test_workers_without_a_shared_folder_give_the_same_bytes(
     planned = plan(dataset, device, tmp_path / "run", 3)
     monkeypatch.setattr(transport, "CHUNK", SMALL)
     sizes: list[int] = []
-    monkeypatch.setattr(transport, "digest_of", lambda data: sizes.append(len(data)) or digest_of(data))
+    monkeypatch.setattr(transport, "crc32", lambda data: sizes.append(len(data)) or crc32(data))
     with two_workers() as started, distributed.Client(started) as client:
         client.run(apart)
         run_on_cluster(started.scheduler_address, planned.jobs, planned.scene.train, lambda text: None)
@@ -118,7 +119,10 @@ class Near:
         self.name, self._queue = name, self.all.setdefault(name, SimpleQueue())
 
     def put(self, value: Any, timeout: float | None = None) -> None:
-        self._queue.put(value)
+        def unpacked(part: Any) -> Any:
+            return part.data if isinstance(part, distributed.protocol.Serialize) else part
+
+        self._queue.put(tuple(map(unpacked, value)) if isinstance(value, tuple) else value)
 
     def get(self, timeout: float | None = None) -> Any:
         return self._queue.get(timeout=20 if timeout is None else timeout)
@@ -166,7 +170,7 @@ def test_other_bytes_are_not_stored(planned: Planned, tmp_path: Path, near: None
     """The second chunk of a file has lost a bit."""
     read = Desk._file
 
-    def damaged(self: Desk, name: str, begin: int, size: int) -> tuple[int, str, bytes]:
+    def damaged(self: Desk, name: str, begin: int, size: int) -> tuple[int, int, bytes]:
         total, found, data = read(self, name, begin, size)
         return total, found, data if begin == 0 else bytes([data[0] ^ 1]) + data[1:]
 
@@ -175,7 +179,7 @@ def test_other_bytes_are_not_stored(planned: Planned, tmp_path: Path, near: None
     assert job.stat().st_size > SMALL
     with Desk(None, job.parent, []) as desk:
         cache = Cache(tmp_path / "cache", desk.name)
-        with pytest.raises(InputError, match=f"{job.name}: expected bytes with the digest .*, found others"):
+        with pytest.raises(InputError, match=f"{job.name}: expected bytes with the checksum .*, found others"):
             cache.file(job.name)
         with pytest.raises(InputError, match=r"cannot read .*nothing: No such file"):
             cache.file("nothing")
@@ -194,10 +198,10 @@ def test_a_result_appears_when_it_is_whole(tmp_path: Path, near: None) -> None:
             dies = Cache(tmp_path / "worker", desk.name)
             for begin in range(0, sent * SMALL, SMALL):
                 data = result.read_bytes()[begin : begin + SMALL]
-                dies._ask("result", "one.ply", begin, 2 * SMALL + 1, digest_of(data), data)
+                dies._ask("result", "one.ply", begin, 2 * SMALL + 1, crc32(data), data)
             assert not (tmp_path / "jobs" / "one.ply").exists()
-        with pytest.raises(InputError, match=r"one\.ply: expected bytes with the digest"):
-            dies._ask("result", "one.ply", 0, 3, digest_of(b"abc"), b"abd")
+        with pytest.raises(InputError, match=r"one\.ply: expected bytes with the checksum"):
+            dies._ask("result", "one.ply", 0, 3, crc32(b"abc"), b"abd")
         Cache(tmp_path / "worker", desk.name).send(result)
         assert (tmp_path / "jobs" / "one.ply").read_bytes() == result.read_bytes()
     assert [path.name for path in (tmp_path / "jobs").iterdir()] == ["one.ply"], "what is incomplete is removed"
