@@ -7,7 +7,7 @@ import pytest
 from every_strategy import with_rounds
 
 from clsplat.camera import Camera
-from clsplat.config import AdcConfig, InitConfig, OptimConfig, TrainConfig
+from clsplat.config import AdcConfig, CoarseConfig, InitConfig, OptimConfig, TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.render import render
@@ -25,6 +25,7 @@ CONFIG = with_rounds(
         checkpoint_every=25,
         init=InitConfig(sh_degree=1),
         optim=OptimConfig(sh_degree_every=2333),
+        coarse=CoarseConfig(factor=1),  # what `with_length` would choose: checkpoints have it
         # Small enough to see a clone, a split and a reset within 60 iterations.
         adc=AdcConfig(reset_every=30, grad_threshold=1e-5),
     ),

@@ -23,6 +23,7 @@ from clsplat.training.checkpoint import load_state
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.loop import complete, train
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
+from clsplat.training.run_length import with_length
 from clsplat.training.session import Training
 from clsplat.training.state import initial_state
 
@@ -82,7 +83,7 @@ def test_what_is_predicted_is_allocated(
 
     cameras = [view.camera for view in scene.train]
     train(scene, config, tmp_path, device, evaluate=evaluate)
-    met = load_state(tmp_path / "checkpoint.npz", scene.extent, config).intersections
+    met = load_state(tmp_path / "checkpoint.npz", scene.extent, with_length(config, scene)).intersections
     photos = sum(view.image.nbytes for view in scene.train)
     predicted = Footprint.of(scene, config, device).total(n, met) + photos
     assert device.memory_peak <= predicted <= 1.2 * device.memory_peak
@@ -237,7 +238,7 @@ def test_running_out_of_memory_leaves_the_checkpoint(tmp_path: Path, monkeypatch
             DeviceError, match=r"^iteration 8: .*: no memory left; the last checkpoint in .* is intact"
         ):
             train(scene, config, tmp_path, device, progress=lambda record: done.append(record["iteration"]))
-    assert load_state(tmp_path / "checkpoint.npz", scene.extent, config).iteration == 5
+    assert load_state(tmp_path / "checkpoint.npz", scene.extent, with_length(config, scene)).iteration == 5
     resumed = train(scene, replace(config, memory_limit="1GB"), tmp_path, device, resume=True)
     expected = train(scene, config, tmp_path, device)
     assert all((a == b).all() for a, b in zip(resumed.arrays().values(), expected.arrays().values(), strict=True))

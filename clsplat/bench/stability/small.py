@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.config import AdcConfig, InitConfig, TrainConfig
+from clsplat.config import AdcConfig, CoarseConfig, InitConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
@@ -28,6 +28,7 @@ CONFIG = TrainConfig(
     init=InitConfig(sh_degree=1),
     # The original's rates, but for the means: the points are off by 0.05, which is 600 times the original's step.
     optim=replace(load_preset("paper-7k").optim, means_lr=1.6e-3, means_lr_final=1e-4, sh_degree_every=2333),
+    coarse=CoarseConfig(factor=1),
     adc=AdcConfig(every=50, reset_every=1000, grad_threshold=1e-5),
 )
 
