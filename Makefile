@@ -43,11 +43,11 @@ faults-below:
 	  --per-group $(PER_GROUP) $(if $(COMMANDS),--commands $(COMMANDS)) -o build/faults
 
 # Change the mathematics in COUNT places, one at a time, and list which changes the tests see: build/mutants.jsonl. It
-# takes hours, and goes on where it was interrupted.
+# takes hours, and goes on where it was interrupted. ONLY names files, without their suffix.
 COUNT = 320
 mutants:
 	mkdir -p build
-	$(PYTHON) -u tests/mutants/measure_mutants.py --count $(COUNT) -o build/mutants.jsonl
+	$(PYTHON) -u tests/mutants/measure_mutants.py --count $(COUNT) $(if $(ONLY),--only $(ONLY)) -o build/mutants.jsonl
 
 # Train for MINUTES under a viewer whose clients come and go, and check that the memory does not grow and that the bits
 # stay: build/soak/soak.png and soak.json. Linux only.

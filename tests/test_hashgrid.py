@@ -13,18 +13,22 @@ from clsplat.testing import assert_matches, gradcheck
 LEVELS = HashLevels.geometric(5, 4, 40, 512)
 
 
-def inputs(points=777, seed=0):
+ONE_LEVEL = HashLevels.geometric(1, 6, 6, 512)
+
+
+def inputs(points=777, seed=0, levels=LEVELS):
     rng = np.random.default_rng(seed)
     positions = rng.uniform(size=(points, 3))
     positions[:4] = [[0, 0, 0], [1, 1, 1], [0.5, 1, 0], [-0.1, 0.3, 1.2]]
-    arrays = positions, rng.normal(size=(LEVELS.offsets[-1], 2)), rng.normal(size=(points, 10))
+    table, v_features = (levels.offsets[-1], 2), (points, 2 * len(levels.resolutions))
+    arrays = positions, rng.normal(size=table), rng.normal(size=v_features)
     return [a.astype(np.float32).astype(np.float64) for a in arrays]
 
 
-def by_kernel(device, positions, table, v_features):
+def by_kernel(device, positions, table, v_features, levels=LEVELS):
     x = device.upload("positions", positions)
-    features = ops.hashgrid_fwd(device, x, device.upload("table", table), LEVELS)
-    return features.get(), ops.hashgrid_bwd(device, x, device.upload("v", v_features), LEVELS).get()
+    features = ops.hashgrid_fwd(device, x, device.upload("table", table), levels)
+    return features.get(), ops.hashgrid_bwd(device, x, device.upload("v", v_features), levels).get()
 
 
 def test_levels_follow_the_paper():
@@ -47,11 +51,10 @@ def test_the_hash_in_numbers():
 
 def test_a_linear_field_is_interpolated_exactly(device64):
     """On a level with an entry per corner, a table that is linear in the corner's place gives a linear function."""
-    levels = HashLevels.geometric(1, 6, 6, 512)
     z, y, x = np.mgrid[:7, :7, :7] / 6
     table = np.stack([1 + 2 * x - y, 3 * z], axis=-1).reshape(-1, 2)
     p = np.random.default_rng(0).uniform(size=(50, 3))
-    found = ops.hashgrid_fwd(device64, device64.upload("p", p), device64.upload("t", table), levels).get()
+    found = ops.hashgrid_fwd(device64, device64.upload("p", p), device64.upload("t", table), ONE_LEVEL).get()
     np.testing.assert_allclose(found, np.stack([1 + 2 * p[:, 0] - p[:, 1], 3 * p[:, 2]], axis=1), atol=1e-13)
 
 
@@ -65,13 +68,18 @@ def test_matches_twin_as_cpu_and_gpu(configured_device, points):
     check(configured_device, points)
 
 
-def check(device, points):
-    positions, table, v_features = inputs(max(points, 4))
+def test_several_units_share_a_level(device):
+    """There are fewer levels than compute units, on a machine of two or more."""
+    check(device, 777, ONE_LEVEL)
+
+
+def check(device, points, levels=LEVELS):
+    positions, table, v_features = inputs(max(points, 4), levels=levels)
     positions, v_features = positions[-points:], v_features[-points:]
     tolerances = DOUBLE if device.real == np.float64 else FLOAT
-    features, v_table = by_kernel(device, positions, table, v_features)
-    assert_matches("features", features, reference.hashgrid_fwd(positions, table, LEVELS), tolerances)
-    assert_matches("v_table", v_table, reference.hashgrid_bwd(positions, v_features, LEVELS), tolerances)
+    features, v_table = by_kernel(device, positions, table, v_features, levels)
+    assert_matches("features", features, reference.hashgrid_fwd(positions, table, levels), tolerances)
+    assert_matches("v_table", v_table, reference.hashgrid_bwd(positions, v_features, levels), tolerances)
 
 
 def test_gradients_by_central_differences(device64):

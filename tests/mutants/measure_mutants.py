@@ -1,10 +1,12 @@
 """Measure which changes of the mathematics the tests see: one operator, constant or index at a time.
 
-Mutants are drawn at random from the kernels, their launches, the densification and the choice of the size. Each is
-applied to a copy of the project, in which the tests of that file run until one fails. The results are one JSON object
-per line; mutants that are in them already are not repeated. Requires a system that can fork a process.
+Mutants are drawn at random from the kernels, their launches, the densification, the choice of the size and other
+rules of the training, or only from the files that are named. Each is applied to a copy of the project, in which the
+tests of that file run until one fails. The results are one JSON object per line; mutants that are in them already are
+not repeated. Requires a system that can fork a process.
 
     $ make mutants COUNT=320
+    $ make mutants COUNT=60 ONLY='hashgrid heads'
 """
 
 import argparse
@@ -42,6 +44,15 @@ WHOLE = (
 )
 """Tests of the whole renderer and of training, for mutants that the tests of their file do not see."""
 
+FIELDS = ("tests/fields/test_layers.py", "tests/fields/test_fields.py")
+"""Tests of the training of radiance fields, in the place of those of the renderer."""
+
+FIELD_STAGES = (
+    *("encode", "frustums", "hashgrid", "heads", "histograms", "intervals", "march", "mlp", "mlp_cpu", "mlp_gpu"),
+    *("mlp_sums", "rays", "spans", "voxels", "weights"),
+)
+"""Stems of files that only radiance fields use."""
+
 PROJECT = ("tests/test_project.py", "tests/test_lens.py", "tests/test_project_degenerate.py")
 LIMITS = "tests/test_composite_limits.py"
 COMPOSITE = ("tests/test_composite.py", "tests/test_composite_gpu.py", "tests/test_composite_sorted.py", LIMITS)
@@ -70,14 +81,21 @@ TESTS: dict[str, tuple[str, ...]] = {
     "sh": PROJECT,
     "spans": ("tests/test_intervals.py", "tests/test_frustums.py"),
     "structs": PROJECT,
+    "absgrad": ("tests/test_absgrad.py", "tests/training/test_densify.py"),
+    "gaussian_rays": ("tests/test_gaussian_rays.py", "tests/test_median.py"),
     "mlp_cpu": ("tests/test_mlp.py",),
     "mlp_gpu": ("tests/test_mlp.py",),
     "mlp_sums": ("tests/test_mlp.py",),
+    "take": ("tests/test_take.py", "tests/training/test_round_transfers.py"),
     "philox": ("tests/test_noise.py", "tests/test_dropout.py"),
 }
 """Tests by the stem of the file. Those of other stages are named after it."""
 
 TRAINING = {
+    **{
+        f"clsplat/training/{name}.py": tuple(f"tests/training/test_{test}.py" for test in (name, "loop"))
+        for name in ("camera_room", "coarse_to_fine", "run_length")
+    },
     "clsplat/training/densify": tuple(
         f"tests/training/test_{name}.py" for name in ("densify", "mcmc", "error_guided", "loop")
     ),
@@ -86,13 +104,14 @@ TRAINING = {
         "tests/commands/test_cli.py",
     ),
 }
-"""Tests of folders of the training."""
+"""Tests of files and folders of the training."""
 
 
 def measured_files() -> list[Path]:
     """Files with the mathematics of the method."""
-    folders = [("cl", "*.cl"), ("cl", "*.h"), ("clsplat/ops", "*.py")] + [(folder, "*.py") for folder in TRAINING]
-    found = [path for folder, pattern in folders for path in sorted((ROOT / folder).glob(pattern))]
+    patterns = ["cl/*.cl", "cl/*.h", "clsplat/ops/*.py"]
+    patterns += [name if name.endswith(".py") else f"{name}/*.py" for name in TRAINING]
+    found = [path for pattern in patterns for path in sorted(ROOT.glob(pattern))]
     return [path for path in found if path.relative_to(ROOT).as_posix() not in NOT_MEASURED]
 
 
@@ -102,7 +121,8 @@ def tests_of(path: str) -> tuple[str, ...]:
         if path.startswith(folder):
             return tests
     stem = Path(path).stem
-    return tuple(dict.fromkeys((*TESTS.get(stem, (f"tests/test_{stem}.py",)), *WHOLE)))
+    whole = FIELDS if stem in FIELD_STAGES else WHOLE
+    return tuple(dict.fromkeys((*TESTS.get(stem, (f"tests/test_{stem}.py",)), *whole)))
 
 
 def run_tests(copy: Path, tests: tuple[str, ...], seconds: int) -> tuple[bool, str]:
@@ -170,6 +190,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=320, help="number of mutants that are drawn")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="+", help="names of files without their suffix: all of them by default")
     parser.add_argument("-o", "--out", type=Path, required=True, help="results, JSON lines")
     arguments = parser.parse_args()
     import numpy  # noqa: F401
@@ -185,7 +206,8 @@ def main() -> None:
         ignore = shutil.ignore_patterns(".git", "docs", "notebooks", "build", "__pycache__", "*.egg-info")
         shutil.copytree(ROOT, copy, ignore=ignore)
         os.environ |= {"POCL_CACHE_DIR": str(Path(folder) / "kernels"), "PYTHONDONTWRITEBYTECODE": "1"}
-        chosen = drawn(measured_files(), ROOT, arguments.count, arguments.seed)
+        files = [path for path in measured_files() if not arguments.only or path.stem in arguments.only]
+        chosen = drawn(files, ROOT, arguments.count, arguments.seed)
         tests = tuple(dict.fromkeys(test for mutant in chosen for test in tests_of(mutant.path)))
         passed, by = run_tests(copy, tests, resource.RLIM_INFINITY)
         if not passed:

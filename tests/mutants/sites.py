@@ -74,11 +74,12 @@ def mutants(path: Path, root: Path) -> list[Mutant]:
 
 
 def drawn(files: list[Path], root: Path, count: int, seed: int) -> list[Mutant]:
-    """Draw mutants at random, of each file as large a fraction as of the others, in random order."""
+    """Draw mutants at random, in random order: at least one of each file, and of all files the same fraction."""
     by_file = [mutants(path, root) for path in files]
     share = min(1.0, count / sum(map(len, by_file)))
     rng = random.Random(seed)
-    result = [mutant for found in by_file for mutant in rng.sample(found, round(share * len(found)))]
+    counts = [min(len(found), max(1, round(share * len(found)))) for found in by_file]
+    result = [mutant for found, n in zip(by_file, counts, strict=True) for mutant in rng.sample(found, n)]
     rng.shuffle(result)
     return result
 
