@@ -9,7 +9,7 @@ import traceback
 import warnings
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Annotated, get_args
+from typing import Annotated, NoReturn, get_args
 
 import tyro
 
@@ -99,12 +99,18 @@ def main(arguments: list[str] | None = None) -> None:
         reason = f" ({error})" if str(error) else ""
         warn(f"clsplat: this machine has not enough memory{reason}; use smaller photos or fewer Gaussians")
         sys.stdout.flush()
-        # A driver that met the end of the memory may still hold its locks, and its own clean-up then waits for ever.
-        atexit.register(os._exit, 2)
+        # A driver that met the end of the memory may still hold its locks, for which its own clean-up then waits for
+        # ever, and the release of an array as well: the error, whose traceback refers to arrays, is kept.
+        atexit.register(end, error)
         sys.exit(2)
     except KeyboardInterrupt:
         warn("clsplat: interrupted")
         sys.exit(130)
+
+
+def end(kept: MemoryError) -> NoReturn:
+    """End the process without its clean-up; `kept` is not released before."""
+    os._exit(2)
 
 
 def terminate(*_: object) -> None:
