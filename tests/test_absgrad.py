@@ -94,6 +94,20 @@ def test_values_that_are_not_finite_have_none(any_device: Device) -> None:
         assert np.isfinite(found).all() and (found > 0).any()
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_sum_that_overflows_in_one_axis_has_none(device: Device, axis: int) -> None:
+    """A splat that is narrow along one axis: the sum is beyond single precision along this axis alone."""
+    conic = np.array([1e-6, 0, 1e-6])
+    conic[2 * axis] = 0.05
+    arrays = ([[18.5, 14.5]], [conic], [1.0], [[60.0, 60.0]], [0.5], [[1.0, 0.0, 0.0]])
+    splats = Splats(*map(np.array, arrays))
+    image = reference.composite_fwd(splats, reference.bin_splats(splats, 37, 29, 16), (0.0, 0.0, 0.0))
+    v_image = Image(np.full(image.rgb.shape, 3e37), np.zeros(image.alpha.shape))
+    expected = reference.absgrad(splats, reference.bin_splats(splats, 37, 29, 16), image, v_image)[0]
+    assert expected[axis] > np.finfo(np.float32).max > 10 * expected[1 - axis] > 0
+    np.testing.assert_array_equal(by_kernel(device, splats, 16, image, v_image), [[0, 0]])
+
+
 def test_what_it_refuses(device: Device) -> None:
     splats, image, v_image = inputs(5, 16, np.float32)
     placed: AnySplats = Splats(*(device.upload("splats", a) for a in splats))

@@ -6,10 +6,15 @@ from functools import partial
 import numpy as np
 import pyopencl as cl
 import pytest
+from ball_photos import ball
+from small_fields import SmallIngp, SmallMipNerf360, SmallNerf, SmallPlenoxels
 
 from clsplat.bench.stability.small import CONFIG, small_scene
+from clsplat.config import DataConfig, TrainConfig
 from clsplat.device import Device
+from clsplat.fields.field_training import train_field
 from clsplat.renderer import Renderer
+from clsplat.scene import DepthMap
 from clsplat.testing import synthetic_scene
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.loop import train
@@ -65,12 +70,22 @@ def test_the_guard_sees_a_write_beyond_the_end():
 def test_training_stays_within_its_arrays(guarded, tmp_path, strategy):
     """With everything that has a stage of its own; the sizes are no multiples of anything."""
     scene = small_scene(Device())
+    depth = DepthMap(np.full(scene.train[0].image.shape[:2], 3, np.float32))
+    scene = replace(scene, train=[replace(view, depth=depth) for view in scene.train])
     options = {"exposure": True, "poses": True, "filter_3d": strategy == "adc", "dropout": 0.2}
     render = replace(CONFIG.render, mode="antialiased" if strategy == "adc" else "classic")
     config = replace(CONFIG, strategy=strategy, iterations=24, max_gaussians=331, render=render, **options)
     edits = {name: replace(getattr(config, name), start=1, every=10) for name in STRATEGIES}
     train(scene, replace(config, **edits), tmp_path, guarded)
     assert len(guarded.guarded) > 100 and guarded.overwritten() == set()
+
+
+@pytest.mark.parametrize("method", [SmallIngp, SmallPlenoxels, SmallNerf, SmallMipNerf360], ids=lambda m: m.name)
+def test_training_of_fields_stays_within_its_arrays(guarded, tmp_path, method, monkeypatch):
+    monkeypatch.setattr("clsplat.fields.space.STEP", 3**0.5 / 128)  # few samples, as the photos are small
+    config = TrainConfig(iterations=3, data=DataConfig(background="white"))
+    train_field(ball(photos=5, held_out=1, edge=23), method, config, tmp_path, guarded)
+    assert len(guarded.guarded) > 20 and guarded.overwritten() == set()
 
 
 @pytest.mark.parametrize("n", [1, 7, 63, 65])

@@ -9,7 +9,7 @@ from clsplat.field_stages import HashLevels
 from clsplat.reference.hashgrid import corners
 from clsplat.testing import assert_matches, gradcheck
 
-# Levels with an entry per corner, and levels with collisions; one size that is no power of two.
+# Levels with an entry per corner, and levels with collisions.
 LEVELS = HashLevels.geometric(5, 4, 40, 512)
 
 
@@ -71,6 +71,10 @@ def test_matches_twin_as_cpu_and_gpu(configured_device, points):
 def test_several_units_share_a_level(device):
     """There are fewer levels than compute units, on a machine of two or more."""
     check(device, 777, ONE_LEVEL)
+
+
+def test_a_hash_of_a_number_of_entries_that_is_no_power_of_two(configured_device):
+    check(configured_device, 777, HashLevels.geometric(2, 16, 40, 500))
 
 
 def check(device, points, levels=LEVELS):

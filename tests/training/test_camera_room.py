@@ -38,7 +38,7 @@ def test_a_splat_beside_a_viewpoint_does_not_reach_the_image() -> None:
     slope = steepest_slope([camera_at(0, 0.1)])
     assert slope == pytest.approx(1.3 * np.hypot(32 / 50, 24 / 50))
     factors = room_factors(found, np.zeros((1, 3)), slope)
-    assert 50 < (factors < 1).sum() < 200 and (factors >= LEAST).all()
+    assert 50 < (factors < 1).sum() < 200 and (factors >= LEAST).all() and (factors <= 1).all()
     reached = {True: 0, False: 0}
     for row in range(200):
         across = np.cross(means[row], rng.normal(size=3))
