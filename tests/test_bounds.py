@@ -10,11 +10,10 @@ from ball_photos import ball
 from small_fields import SmallIngp, SmallMipNerf360, SmallNerf, SmallPlenoxels
 
 from clsplat.bench.stability.small import CONFIG, small_scene
-from clsplat.config import DataConfig, TrainConfig
+from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.fields.field_training import train_field
 from clsplat.renderer import Renderer
-from clsplat.scene import DepthMap
 from clsplat.testing import synthetic_scene
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.loop import train
@@ -70,8 +69,6 @@ def test_the_guard_sees_a_write_beyond_the_end():
 def test_training_stays_within_its_arrays(guarded, tmp_path, strategy):
     """With everything that has a stage of its own; the sizes are no multiples of anything."""
     scene = small_scene(Device())
-    depth = DepthMap(np.full(scene.train[0].image.shape[:2], 3, np.float32))
-    scene = replace(scene, train=[replace(view, depth=depth) for view in scene.train])
     options = {"exposure": True, "poses": True, "filter_3d": strategy == "adc", "dropout": 0.2}
     render = replace(CONFIG.render, mode="antialiased" if strategy == "adc" else "classic")
     config = replace(CONFIG, strategy=strategy, iterations=24, max_gaussians=331, render=render, **options)
@@ -81,10 +78,12 @@ def test_training_stays_within_its_arrays(guarded, tmp_path, strategy):
 
 
 @pytest.mark.parametrize("method", [SmallIngp, SmallPlenoxels, SmallNerf, SmallMipNerf360], ids=lambda m: m.name)
-def test_training_of_fields_stays_within_its_arrays(guarded, tmp_path, method, monkeypatch):
+def test_fields_stay_within_their_arrays(guarded, tmp_path, method, monkeypatch):
+    """In training, and for an image whose number of pixels is no multiple of anything."""
     monkeypatch.setattr("clsplat.fields.space.STEP", 3**0.5 / 128)  # few samples, as the photos are small
     config = TrainConfig(iterations=3, data=DataConfig(background="white"))
-    train_field(ball(photos=5, held_out=1, edge=23), method, config, tmp_path, guarded)
+    scene = ball(photos=5, held_out=1, edge=23)
+    train_field(scene, method, config, tmp_path, guarded).image(scene.test[0].camera, BACKGROUNDS["white"])
     assert len(guarded.guarded) > 20 and guarded.overwritten() == set()
 
 
@@ -100,4 +99,9 @@ def test_rendering_stays_within_its_arrays(guarded, n, model):
         renderer.backward(run, v_image, camera_grad=degree == 3)
         renderer.stages.count_pairs(run.splats, run.bins)
     renderer.stages.removal(run.splats, run.bins, np.zeros(3))
+    far = renderer.forward(gaussians, replace(camera, model=model), depth="inverse")
+    known = guarded.upload("inverse depths", np.ones(far.image.alpha.shape))
+    v_rgb = guarded.upload("v", np.ones((*known.shape, 3)))
+    renderer.stages.disparity_loss(far.image.rgb, known, 1.0)
+    renderer.stages.disparity_grad(far.image.rgb, known, 1.0, v_rgb)
     assert guarded.overwritten() == set()
