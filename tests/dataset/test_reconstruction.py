@@ -17,6 +17,7 @@ from clsplat.config import DataConfig, SfmConfig
 from clsplat.dataset import load_scene
 from clsplat.dataset.colmap import read_model
 from clsplat.dataset.lenses import Intrinsics, is_pinhole, undistorted
+from clsplat.dataset.sfm import reconstruction
 from clsplat.dataset.sfm.reconstruction import RECORD, WORK, read_record, reconstruct
 from clsplat.errors import InputError
 
@@ -268,6 +269,24 @@ def test_a_record_leads_to_no_other_photos(copy, photos, tmp_path):
             load_scene(copy, DataConfig())
         with pytest.raises(InputError, match=rf"{RECORD}: expected photos inside"):
             dataset_lines(copy)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_model_that_the_disk_did_not_take_is_not_kept(copy, monkeypatch, name):
+    """COLMAP ends well where a write fails, and later runs would find the damaged model."""
+    shutil.move(copy / "sparse" / "0", copy.with_name("whole"))
+    shutil.rmtree(copy / "sparse")
+
+    def solved(work, *_):
+        model = work / "sparse" / "0"
+        shutil.copytree(copy.with_name("whole"), model)
+        os.truncate(model / name, (model / name).stat().st_size // 2)
+        return 4
+
+    monkeypatch.setattr(reconstruction, "_solved", solved)
+    with pytest.raises(InputError, match=r"cannot write the recovered cameras to .*: what was written is damaged"):
+        reconstruct(copy, CONFIG)
+    assert sorted(os.listdir(copy)) == [f"photo {k}.png" for k in range(4)]
 
 
 def test_a_limit_of_the_size_of_files_is_named(copy):

@@ -152,6 +152,7 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
         readable = _readable(folder, names, work, config.max_image_size)
         registered = _solved(work, readable, names, _matched(config, folder), verbose)
         _check_registered(registered, len(names), photos, config)
+        _check_written(work / "sparse" / "0", registered, output)
         where = "." if output.resolve() == photos.resolve() else str(photos.resolve())
         record = {"photos": where, "registered": registered, "options": asdict(config), "hashes": hashes}
         with replacing(work / "sparse" / RECORD) as file:
@@ -196,6 +197,21 @@ def _check_registered(registered: int, count: int, photos: Path, config: SfmConf
             f"cannot recover the cameras of {photos}: found the poses of {registered} of {count} photos, expected at "
             f"least {config.min_registered}; take more photos: sharp, overlapping by two thirds, from "
             "different positions, of a scene with texture"
+        )
+
+
+def _check_written(model: Path, registered: int, output: Path) -> None:
+    """Raise an InputError if the files of a model are not whole. COLMAP does not notice that a disk fails."""
+    from clsplat.dataset.colmap import read_model
+
+    try:
+        whole = len(read_model(model)[1]) == registered
+    except InputError:
+        whole = False
+    if not whole:
+        raise InputError(
+            f"cannot write the recovered cameras to {output}: what was written is damaged; check the disk, and start "
+            "again"
         )
 
 
