@@ -45,8 +45,8 @@ busy machine, a run of seconds takes minutes."""
 PROCESSOR_SECONDS = 150.0
 """Processor time after which a run hangs too, s. Without a fault, all take less than twenty."""
 
-DRIVER_ENDS = ("LLVM ERROR", "Final linking of kernel", "missing symbols in the kernel binary")
-"""What LLVM and PoCL print where they end the process by SIGABRT."""
+DRIVER_ENDS = ("LLVM ERROR", "terminate called", "Final linking of kernel", "missing symbols in the kernel")
+"""What LLVM, the library of C++ and PoCL print where they end the process by SIGABRT; COLMAP has one of its own."""
 
 SHORT = (*TRAIN[:5], "6", "--checkpoint-every", "3", "--eval-every", "3", *TRAIN[10:12])
 COMMANDS = {
