@@ -37,6 +37,12 @@ class Panel:
         """A button."""
         return self._added(self.gui.add_button(label, hint=hint), lambda value: isinstance(value, bool), clicked)
 
+    def buttons(self, label: str, options: Sequence[str], clicked: Changed) -> Any:
+        """A group of buttons; the value of the event's target is the option that was clicked."""
+        known = set(options)
+        handle = self.gui.add_button_group(label, tuple(options))
+        return self._added(handle, lambda value: isinstance(value, str) and value in known, clicked)
+
     def checkbox(self, label: str, value: bool, changed: Changed | None = None, hint: str | None = None) -> Any:
         """A box to check."""
         handle = self.gui.add_checkbox(label, value, hint=hint)
