@@ -4,7 +4,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from clsplat.show.viewer_server import Inputs
+Inputs = dict[str, Callable[[Any], bool]]
+"""The inputs of the panel by their identifiers: whether an input can have a value."""
 
 Changed = Callable[[Any], None]
 """Called with viser's event after a change, on a thread of viser."""
@@ -21,7 +22,7 @@ class Panel:
     ----------
     gui : viser.GuiApi
     inputs : dict
-        As of `clsplat.show.viewer_server.start_server`.
+        Those that messages of a page may change; the panel adds its own.
     """
 
     def __init__(self, gui: Any, inputs: Inputs):
