@@ -287,9 +287,9 @@ class TrainConfig:
     """Settings of a training; saved as ``config.json``, from which it can be repeated."""
 
     iterations: Annotated[int, within(least=0, most=UINT32_MAX)] = 0
-    """Optimisation steps. 0: 30 for each training photo, but at least 3000, with photos of over 90 000 pixels more in
-    proportion to their edges, and at most 30 000. In runs shorter than 7000, the paper's shorter setting, the first
-    densification and the bands of spherical harmonics come earlier in proportion."""
+    """Optimisation steps; 0: chosen by the photos. These are 30 for each training photo, at least 3000 (or more, by
+    the edges of photos over 90 000 pixels) and at most 30 000. In runs shorter than 7000, the paper's shorter
+    setting, the first densification and the bands of spherical harmonics come earlier in proportion."""
     seed: Annotated[int, within(least=0, most=UINT64_MAX)] = 0
     """Seed of the random start, of the order of the photos and of the strategy's random numbers."""
     optimizer: Literal["device", "numpy"] = "device"
