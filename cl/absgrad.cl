@@ -14,7 +14,7 @@
 //   in   image[H,W,C], alpha[H,W] as composited; v_image[H,W,C], v_alpha[H,W]
 //   out  records[M,2], sums of a splat and a tile; sums[N,2], px^-1
 // Local memory, in reals: TILE^2 (2 + CHANNELS).
-// -DTILE=8|16   edge of a tile, px
+// -DTILE=8|16|32   edge of a tile, px
 // -DCHANNELS    number of colour channels
 // -DBATCH       number of splats per batch, 1 or more; the work-group has BATCH work-items
 // -DSUBGROUPS=0|1   1: the device has the functions of subgroups, by cl_khr_subgroups or OpenCL 2.1 and later

@@ -75,7 +75,7 @@ static inline uint walk_tiles(const int task, uint g, Ellipse e, int width, int 
         const mask8 met = ellipse_ranges8(&e, first_row - e.y, last_row - e.y, &x_min, &x_max);
         int8 first, last;
         pixels_between8(e.x + x_min, e.x + x_max, width, &first, &last);
-        const int8 listed = INT8_OF(met) & (first <= last);
+        const int8 listed = TO_INT8(met) & (first <= last);
         const int8 begins = first / TILE, ends = listed ? last / TILE + 1 : 0;
         for (int k = 0; k < ROWS && ty + k < end; ++k) {
             for (int tx = ((const int *)&begins)[k]; tx < ((const int *)&ends)[k]; ++tx, ++count) {

@@ -59,10 +59,14 @@ typedef int16 mask16;
 #ifdef USE_DOUBLE
 #define OF8(f, x)  IN_HALVES(real8, f, x)
 #define OF16(f, x) ((real16)(f((x).lo.lo), f((x).lo.hi), f((x).hi.lo), f((x).hi.hi)))
+#define TO_INT8(x) IN_HALVES(int8, convert_int4, x)
 #else
 #define OF8(f, x)  f(x)
 #define OF16(f, x) IN_HALVES(real16, f, x)
+#define TO_INT8(x) convert_int8(x)
 #endif
+#define TO_INT4(x)  convert_int4(x)
+#define TO_INT16(x) ((int16)(TO_INT8((x).lo), TO_INT8((x).hi)))
 
 static inline real2 load2(const __global real *x, size_t i) {
     return (real2)(x[2 * i], x[2 * i + 1]);

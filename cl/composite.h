@@ -1,6 +1,6 @@
 // Compositing one splat over a group of pixels, and its gradients: the mathematics that all variants of the stage
 // composite share. REALV is real (one pixel) or a vector of reals (a block of pixels). MASKV is the result of
-// comparing two of them.
+// comparing two of them, and MINUS_ABSOLUTE(x) is -|x|.
 //
 //   sigma = (a dx^2 + c dy^2)/2 + b dx dy,   alpha = min(ALPHA_MAX, opacity exp(-sigma))    (paper, equation 4)
 //   C = sum_i c_i alpha_i T_i,   T_i = prod_{j<i} (1 - alpha_j)                             (paper, equation 3)
@@ -12,8 +12,8 @@
 #ifndef CLSPLAT_COMPOSITE_H
 #define CLSPLAT_COMPOSITE_H
 
-#if !defined(REALV) || !defined(MASKV)
-#error "define REALV and MASKV, the types of a group of pixels, before including composite.h"
+#if !defined(REALV) || !defined(MASKV) || !defined(MINUS_ABSOLUTE)
+#error "define REALV and MASKV, the types of a group of pixels, and MINUS_ABSOLUTE before including composite.h"
 #endif
 
 #if !defined(CHANNELS) || CHANNELS < 1
@@ -49,7 +49,7 @@ typedef struct {
 
 // t of the splat at an offset from its centre.
 static inline REALV splat_exponent(const Splat *s, const Offset *o, Bend *bend) {
-    return s->level + (o->dx * (s->a * o->dx + s->b * o->dy) + s->c * o->dy * o->dy);
+    return o->dx * (s->a * o->dx + s->b * o->dy) + (s->c * o->dy * o->dy + s->level);
 }
 
 // Sums over pixels of v_sigma, v_sigma dx, ..., from which all gradients of a splat follow (composite_splats.h).
@@ -88,7 +88,7 @@ static inline REALV splat_over(MASKV seen, real stop, REALV *alpha, MASKV *live,
     *alpha = seen ? clamped : (REALV)0;
     const REALV weight = *alpha * before, behind = before - weight;
     *live = behind > (REALV)stop;
-    *transmittance = *live ? behind : LESSER(before, -before);
+    *transmittance = *live ? behind : MINUS_ABSOLUTE(before);
     return *live ? weight : (REALV)0;
 }
 

@@ -1,21 +1,31 @@
 // Blocks of LANES pixels, and the splats that meet them, for kernels in which a work-item has a whole tile.
 //
-// A block is one vector, 4 pixels wide and LANES / 4 high. A splat visits only the blocks that its ellipse meets. To
-// find them, a second vector has the rows of blocks as its lanes: one evaluation yields the range of x that the
-// ellipse spans in each row (ellipse.h), and comparisons with the columns of blocks yield a set of bits.
+// A block is one vector, 4 pixels wide and LANES / 4 high. A splat visits only the blocks that its ellipse meets. They
+// are found for a batch of splats before the first of them is composited, with splats as the lanes of vectors: for each
+// row of blocks, the range of x that the ellipse spans (ellipse.h) yields the first and the last block, as bits.
 //
 // -DLANES=8|16   size of the device's vector registers: 16 floats if it has 512 bits, otherwise 8
 #ifndef CLSPLAT_COMPOSITE_BLOCKS_H
 #define CLSPLAT_COMPOSITE_BLOCKS_H
 
-#if TILE != 8 && TILE != 16
-#error "-DTILE must be 8 or 16: rows of blocks are the lanes of a vector"
+#if TILE != 8 && TILE != 16 && TILE != 32
+#error "-DTILE must be 8, 16 or 32"
 #endif
 #if LANES != 8 && LANES != 16
 #error "-DLANES must be 8 or 16, the pixels of a block"
 #endif
-#define REALV CONCATENATE(real, LANES)
-#define MASKV CONCATENATE(mask, LANES)
+#if TILE * TILE / LANES > 64
+#error "-DTILE must be 8 or 16 with -DLANES=8: a set of blocks has 64 bits"
+#endif
+#define REALV   CONCATENATE(real, LANES)
+#define MASKV   CONCATENATE(mask, LANES)
+#define INTV    CONCATENATE(int, LANES)
+#define TO_INTV CONCATENATE(TO_INT, LANES)
+#ifdef USE_DOUBLE
+#define MINUS_ABSOLUTE(x) LESSER(x, -(x))
+#else
+#define MINUS_ABSOLUTE(x) CONCATENATE(as_float, LANES)(CONCATENATE(as_uint, LANES)(x) | 0x80000000u)
+#endif
 #include "composite.h"
 #include "power.h"
 
@@ -24,7 +34,7 @@
 #define ROWS       (TILE / BLOCK_ROWS)
 #define BLOCKS     (ROWS * COLUMNS)
 
-// Pixels of a block, in lanes: centres relative to its corner.
+// BlockPixels of a block, in lanes: centres relative to its corner.
 #if LANES == 16
 #define PIXEL_X ((real16)(0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5))
 #define PIXEL_Y ((real16)(0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5))
@@ -33,26 +43,9 @@
 #define PIXEL_Y ((real8)(0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5))
 #endif
 
-// Rows of blocks, in lanes: their numbers, and the bit of the first block of each (0 if the tile has no such row).
-#if ROWS == 8
-#define ROWV      real8
-#define MASKR     mask8
-#define OF_ROWS   OF8
-#define ROW       ((real8)(0, 1, 2, 3, 4, 5, 6, 7))
-#define FIRST_BIT ((mask8)(1, 1 << 4, 1 << 8, 1 << 12, 1 << 16, 1 << 20, 1 << 24, 1 << 28))
-#else
-#define ROWV    real4
-#define MASKR   mask4
-#define OF_ROWS OF4
-#define ROW     ((real4)(0, 1, 2, 3))
-#if TILE == 16
-#define FIRST_BIT ((mask4)(1, 1 << 4, 1 << 8, 1 << 12))
-#elif ROWS == 4
-#define FIRST_BIT ((mask4)(1, 1 << 2, 1 << 4, 1 << 6))
-#else
-#define FIRST_BIT ((mask4)(1, 1 << 2, 0, 0))
-#endif
-#endif
+// A set of blocks: bit b is that of block b. In halves of 32 bits, a row of blocks lies within one.
+typedef ulong Blocks;
+#define HALVES ((BLOCKS + 31) / 32)
 
 static inline real4 quarters(REALV v) {
 #if LANES == 16
@@ -69,19 +62,29 @@ static inline real sum_lanes(REALV v) {
     return b.x + b.y;
 }
 
-static inline real4 sum_lanes4(REALV v0, REALV v1, REALV v2, REALV v3) {
-    const real4 a = quarters(v0), b = quarters(v1), c = quarters(v2), d = quarters(v3);
-    return (real4)(a.x, b.x, c.x, d.x) + (real4)(a.y, b.y, c.y, d.y) + (real4)(a.z, b.z, c.z, d.z) +
-           (real4)(a.w, b.w, c.w, d.w);
+static inline real8 half_sums(REALV v) {
+#if LANES == 16
+    return v.lo + v.hi;
+#else
+    return v;
+#endif
 }
 
-static inline uint bits_of(MASKR bits) {
-#if ROWS == 8
-    const mask4 b4 = bits.lo | bits.hi;
-#else
-    const mask4 b4 = bits;
-#endif
-    return b4.x | b4.y | b4.z | b4.w;
+// The sums of a and b, in halves of four.
+static inline real8 pair_sums(REALV a, REALV b) {
+    const real8 x = half_sums(a), y = half_sums(b);
+    return (real8)(x.lo, y.lo) + (real8)(x.hi, y.hi);
+}
+
+// Adds neighbours, and puts those of each half of y behind those of x.
+static inline real8 neighbour_sums(real8 x, real8 y) {
+    return (real8)(x.s02, y.s02, x.s46, y.s46) + (real8)(x.s13, y.s13, x.s57, y.s57);
+}
+
+// The sums over the lanes of eight vectors. With a tree, a sum takes a third of the instructions.
+static inline real8 sum_lanes8(REALV v0, REALV v1, REALV v2, REALV v3, REALV v4, REALV v5, REALV v6, REALV v7) {
+    const real8 v0415 = neighbour_sums(pair_sums(v0, v4), pair_sums(v1, v5));
+    return neighbour_sums(v0415, neighbour_sums(pair_sums(v2, v6), pair_sums(v3, v7)));
 }
 
 static inline bool any_lane(MASKV mask) {
@@ -106,9 +109,9 @@ static inline int lane_of(int x, int y) {
     return y % BLOCK_ROWS * 4 + x % 4;
 }
 
-// Pixel centres in each column and in each row of blocks, relative to the tile's corner.
+// Corners of the blocks relative to the tile's, px.
 typedef struct {
-    REALV x[COLUMNS], y[ROWS];
+    real x[BLOCKS], y[BLOCKS];
 #if RAYS == 2
     REALV rays[BLOCKS][3]; // directions of the pixels' rays
 #endif
@@ -116,10 +119,10 @@ typedef struct {
 
 static inline Grid pixel_grid(void) {
     Grid grid;
-    for (int i = 0; i < COLUMNS; ++i)
-        grid.x[i] = PIXEL_X + 4 * i;
-    for (int i = 0; i < ROWS; ++i)
-        grid.y[i] = PIXEL_Y + BLOCK_ROWS * i;
+    for (int b = 0; b < BLOCKS; ++b) {
+        grid.x[b] = 4 * (b % COLUMNS);
+        grid.y[b] = BLOCK_ROWS * (b / COLUMNS);
+    }
     return grid;
 }
 
@@ -139,16 +142,16 @@ static inline Grid pixel_grid(void) {
 #define LOAD_DIRECTIONS(grid)
 #endif
 
-// The tile's corner as seen from a splat, px.
+// The pixels of the tile's first block as seen from a splat, px.
 typedef struct {
-    real x, y;
+    REALV x, y;
 } Corner;
 
 static inline Corner corner_from(const Splat *s, int x0, int y0) {
 #if RAYS == 2
     const Corner corner = {0, 0};
 #else
-    const Corner corner = {x0 - s->x, y0 - s->y};
+    const Corner corner = {PIXEL_X + (x0 - s->x), PIXEL_Y + (y0 - s->y)};
 #endif
     return corner;
 }
@@ -161,8 +164,8 @@ static inline Offset offset_in(const Grid *grid, uint b, const Splat *s, Corner 
                       s->axis2[0] * x + s->axis2[1] * y + s->axis2[2] * z};
 #else
     Offset o;
-    o.dx = grid->x[b % COLUMNS] + corner.x;
-    o.dy = grid->y[b / COLUMNS] + corner.y;
+    o.dx = corner.x + grid->x[b];
+    o.dy = corner.y + grid->y[b];
 #if RAYS
     o.along = 1;
 #endif
@@ -170,30 +173,7 @@ static inline Offset offset_in(const Grid *grid, uint b, const Splat *s, Corner 
     return o;
 }
 
-// The blocks of the tile with corner (x0, y0) whose pixel centres the splat's ellipse meets, as bits.
-static inline uint blocks_met(const Splat *s, int x0, int y0) {
-#if RAYS
-    const Outline *e = &s->outline;
-    const real inv_half_height = e->inv_half_height, slope = e->slope, half_sq = e->half_sq;
-#else
-    const Splat *e = s;
-    const real inv_a = 1 / s->a, inv_half_height = 1 / s->half_height, slope = (real)-0.5 * s->b * inv_a;
-    const real half_sq = ((real)(LOG2_ALPHA_MIN - LOG2_E * EXTENT_SLACK) - s->level) * inv_a;
-#endif
-    const ROWV top = BLOCK_ROWS * ROW + (y0 + (real)0.5 - e->y), bottom = top + (BLOCK_ROWS - 1), zero = 0;
-    const ROWV at_left = CLAMP((ROWV)-e->at_right, top, bottom), at_right = CLAMP((ROWV)e->at_right, top, bottom);
-    const ROWV t_left = at_left * inv_half_height, t_right = at_right * inv_half_height;
-    const ROWV rest_left = 1 - t_left * t_left, rest_right = 1 - t_right * t_right;
-    const ROWV sq_left = half_sq * GREATER(rest_left, zero), sq_right = half_sq * GREATER(rest_right, zero);
-    const ROWV x_min = e->x - x0 + slope * at_left - OF_ROWS(sqrt, sq_left);
-    const ROWV x_max = e->x - x0 + slope * at_right + OF_ROWS(sqrt, sq_right);
-    const MASKR met = (top <= (ROWV)e->half_height) & (bottom >= (ROWV)-e->half_height) & (x_min <= x_max);
-    MASKR bits = 0;
-    _Pragma("unroll") for (int i = 0; i < COLUMNS; ++i) bits |=
-        (x_min <= (ROWV)(4 * i + (real)3.5)) & (x_max >= (ROWV)(4 * i + (real)0.5)) & (FIRST_BIT << i);
-    return bits_of(bits & met);
-}
-
+#define SQRTV(x) CONCATENATE(OF, LANES)(sqrt, x)
 #if LANES == 16
 DEFINE_POWER(16)
 #define POWERV power16
@@ -202,37 +182,49 @@ DEFINE_POWER(8)
 #define POWERV power8
 #endif
 
-// Removes the next block from a set. Counting zeros in one instruction makes compositing a tenth faster. OpenCL C 1.2
-// has no function for it, and Oclgrind 21.10, which is based on Clang, cannot run the built-in (-DWITHOUT_CTZ).
-static inline uint take_block(uint *blocks) {
+// Counting zeros in one instruction makes compositing a tenth faster. OpenCL C 1.2 has no function for it, and Oclgrind
+// 21.10, which is based on Clang, cannot run the built-in (-DWITHOUT_CTZ).
+static inline uint lowest_bit(ulong bits) {
 #if defined(__clang__) && !defined(WITHOUT_CTZ)
-    const uint next = __builtin_ctz(*blocks);
+    return __builtin_ctzl(bits);
 #else
-    // The exponent of the lowest power of two in it.
-    const uint next = (as_uint((float)(*blocks & -*blocks)) >> 23) - 127;
+    return 63 - (uint)clz(bits & -bits);
 #endif
+}
+
+// Removes the next block from a set that is not empty.
+static inline uint take_block(Blocks *blocks) {
+    const uint next = lowest_bit(*blocks);
     *blocks &= *blocks - 1;
     return next;
 }
 
-// Bit b is set while block b has an unfinished pixel.
-static inline uint unfinished_blocks(const REALV *transmittance) {
-    uint blocks = 0;
+// The blocks with an unfinished pixel. The transmittances of neighbouring blocks are `stride` vectors apart.
+static inline Blocks unfinished_blocks(const REALV *transmittance, uint stride) {
+    Blocks blocks = 0;
     for (int b = 0; b < BLOCKS; ++b)
-        blocks |= any_lane(transmittance[b] > 0) ? 1u << b : 0;
+        blocks |= (Blocks)any_lane(transmittance[b * stride] > 0) << b;
     return blocks;
 }
 
-// A splat and the blocks of the tile that it meets.
-typedef struct {
-    Splat splat;
-    uint blocks;
-} Over;
-
 // Number of splats whose blocks are found before the first of them is composited. A processor cannot predict the end
 // of the loop over blocks; if the bits are available early, it knows the end early. Finished blocks are searched
-// between batches, which costs about as much as one splat.
-#define BATCH 32
+// between batches, which costs about as much as a few splats.
+#define BATCH 64
+
+// Splats, and the blocks of the tile that they meet.
+typedef struct {
+    Splat splats[BATCH];
+    INTV halves[HALVES][BATCH / LANES];
+} Batch;
+
+static inline Blocks blocks_of(const Batch *batch, uint j) {
+#if HALVES == 2
+    return ((const uint *)batch->halves[0])[j] | (Blocks)((const uint *)batch->halves[1])[j] << 32;
+#else
+    return ((const uint *)batch->halves[0])[j];
+#endif
+}
 
 // Prefetches memory to read or to write. Splats and records have random addresses, and a load that misses the nearest
 // caches takes as long as a block. Only for kernels on the host's processor, where addresses are ordinary pointers.
@@ -244,52 +236,126 @@ typedef struct {
 #define FETCH_TO_WRITE(p)
 #endif
 
+// Outlines of a batch of splats (ellipse.h), with splats in lanes.
+typedef struct {
+    REALV x[BATCH / LANES], y[BATCH / LANES]; // centre, px
+    REALV half_height[BATCH / LANES], at_right[BATCH / LANES];
+#if RAYS
+    REALV inv_half_height[BATCH / LANES], slope[BATCH / LANES], half_sq[BATCH / LANES];
+#else
+    REALV a[BATCH / LANES], b[BATCH / LANES], level[BATCH / LANES];
+#endif
+} Outlines;
+
+static inline void set_outline(Outlines *outlines, uint j, const Splat *s) {
+#if RAYS
+    const Outline *e = &s->outline;
+    ((real *)outlines->inv_half_height)[j] = e->inv_half_height;
+    ((real *)outlines->slope)[j] = e->slope;
+    ((real *)outlines->half_sq)[j] = e->half_sq;
+#else
+    const Splat *e = s;
+    ((real *)outlines->a)[j] = s->a;
+    ((real *)outlines->b)[j] = s->b;
+    ((real *)outlines->level)[j] = s->level;
+#endif
+    ((real *)outlines->x)[j] = e->x;
+    ((real *)outlines->y)[j] = e->y;
+    ((real *)outlines->half_height)[j] = e->half_height;
+    ((real *)outlines->at_right)[j] = e->at_right;
+}
+
+// Finds the blocks of the tile with corner (x0, y0) whose pixel centres the ellipses of LANES splats meet.
+static inline void find_blocks(const Outlines *outlines, uint g, int x0, int y0, Batch *batch) {
+    const REALV x = outlines->x[g] - (real)x0, y = outlines->y[g] - ((real)y0 + (real)0.5), zero = 0;
+    const REALV half_height = outlines->half_height[g], right = outlines->at_right[g], left = -right;
+#if RAYS
+    const REALV inv_half_height = outlines->inv_half_height[g], slope = outlines->slope[g];
+    const REALV half_sq = outlines->half_sq[g];
+#else
+    const REALV inv_a = 1 / outlines->a[g], inv_half_height = 1 / half_height;
+    const REALV slope = (real)-0.5 * outlines->b[g] * inv_a;
+    const REALV half_sq = ((real)(LOG2_ALPHA_MIN - LOG2_E * EXTENT_SLACK) - outlines->level[g]) * inv_a;
+#endif
+    INTV halves[HALVES];
+    _Pragma("unroll") for (int h = 0; h < HALVES; ++h) halves[h] = 0;
+    _Pragma("unroll") for (int r = 0; r < ROWS; ++r) {
+        const REALV top = BLOCK_ROWS * r - y, bottom = top + (BLOCK_ROWS - 1);
+        const REALV at_left = CLAMP(left, top, bottom), at_right = CLAMP(right, top, bottom);
+        const REALV t_left = at_left * inv_half_height, t_right = at_right * inv_half_height;
+        const REALV sq_left = half_sq * GREATER(1 - t_left * t_left, zero);
+        const REALV sq_right = half_sq * GREATER(1 - t_right * t_right, zero);
+        const REALV x_min = x + slope * at_left - SQRTV(sq_left), x_max = x + slope * at_right + SQRTV(sq_right);
+        const MASKV met = (top <= half_height) & (bottom >= -half_height) & (x_min <= x_max);
+        // The first pixel of block i is at 4 i + 0.5, its last one at 4 i + 3.5. Comparisons with NaN are false.
+        const REALV limit = COLUMNS;
+        REALV begin = (x_min + (real)0.5) / 4, end = (x_max + (real)3.5) / 4;
+        begin = LESSER(GREATER(begin, zero), limit);
+        end = met ? LESSER(GREATER(end, zero), limit) : begin;
+        const INTV bits = ((INTV)1 << TO_INTV(end)) - ((INTV)1 << TO_INTV(begin));
+        halves[r * COLUMNS / 32] |= bits << (r * COLUMNS % 32);
+    }
+    _Pragma("unroll") for (int h = 0; h < HALVES; ++h) batch->halves[h][g] = halves[h];
+}
+
 // Loads up to BATCH splats, beginning with the entry `first` of the list. Returns their number.
 static inline uint load_batch(const __global Splat *splats, const __global uint *gauss_ids, uint first, uint end,
-                              int x0, int y0, Over *batch) {
+                              int x0, int y0, Batch *batch) {
     const uint count = LESSER((uint)BATCH, end - first);
+    Outlines outlines;
     // All loads come first, so that cache misses overlap.
-    for (uint j = 0; j < count; ++j)
-        batch[j].splat = splats[gauss_ids[first + j]];
+    for (uint j = 0; j < count; ++j) {
+        batch->splats[j] = splats[gauss_ids[first + j]];
+        set_outline(&outlines, j, &batch->splats[j]);
+    }
     for (uint j = first + BATCH; j < LESSER(end, first + 2 * BATCH); ++j) {
         // Most of them span two cache lines.
         FETCH_TO_READ(&splats[gauss_ids[j]]);
         FETCH_TO_READ(&splats[gauss_ids[j]].color[CHANNELS - 1]);
     }
-    for (uint j = 0; j < count; ++j)
-        batch[j].blocks = blocks_met(&batch[j].splat, x0, y0);
+    for (uint g = 0; g * LANES < count; ++g)
+        find_blocks(&outlines, g, x0, y0, batch);
     return count;
 }
 
-// Transmittance 1 inside the image. Pixels outside count as finished.
+// Transmittance 1 inside the image. BlockPixels outside count as finished.
 static inline REALV transmittance_at_first(const Grid *grid, int b, int rows, int columns) {
-    const MASKV inside = (grid->x[b % COLUMNS] < (REALV)columns) & (grid->y[b / COLUMNS] < (REALV)rows);
+    const MASKV inside = (PIXEL_X < (REALV)(columns - grid->x[b])) & (PIXEL_Y < (REALV)(rows - grid->y[b]));
     return inside ? (REALV)1 : (REALV)-1;
 }
 
-// Composites the entries [begin, end) of a tile's list over its blocks, and adds the colours to `sums`. A pixel is
-// finished where the transmittance would fall to `stop` or below.
+// The pixels of a block in the forward pass. What a visit of the block needs lies together, so that it takes one index.
+typedef struct {
+    REALV transmittance, color[CHANNELS];
+} BlockPixels;
+
+static inline BlockPixels pixels_at_first(const Grid *grid, int b, int rows, int columns) {
+    BlockPixels pixels = {transmittance_at_first(grid, b, rows, columns), {0}};
+    return pixels;
+}
+
+// Composites the entries [begin, end) of a tile's list over its blocks. A pixel is finished where the transmittance
+// would fall to `stop` or below.
 static inline void composite_tile(const Grid *grid, const __global Splat *splats, const __global uint *gauss_ids,
-                                  uint begin, uint end, int x0, int y0, real stop, REALV *transmittance,
-                                  REALV (*sums)[CHANNELS]) {
-    Over batch[BATCH];
+                                  uint begin, uint end, int x0, int y0, real stop, BlockPixels *pixels) {
+    Batch batch;
     for (uint first = begin; first < end; first += BATCH) {
-        const uint unfinished = unfinished_blocks(transmittance);
+        const Blocks unfinished = unfinished_blocks(&pixels->transmittance, sizeof(BlockPixels) / sizeof(REALV));
         if (!unfinished)
             break;
-        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
+        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, &batch);
         for (uint j = 0; j < count; ++j) {
-            const Splat *s = &batch[j].splat;
+            const Splat *s = &batch.splats[j];
             const Corner corner = corner_from(s, x0, y0);
-            for (uint blocks = unfinished & batch[j].blocks; blocks;) {
+            for (Blocks blocks = unfinished & blocks_of(&batch, j); blocks;) {
                 const uint b = take_block(&blocks);
                 const Offset o = offset_in(grid, b, s, corner);
                 Bend bend;
                 const REALV t = splat_exponent(s, &o, &bend);
                 REALV alpha = POWERV(t);
                 MASKV live;
-                const REALV weight = splat_over(splat_seen(s, t), stop, &alpha, &live, &transmittance[b]);
-                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) sums[b][k] += weight * s->color[k];
+                const REALV weight = splat_over(splat_seen(s, t), stop, &alpha, &live, &pixels[b].transmittance);
+                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pixels[b].color[k] += weight * s->color[k];
             }
         }
     }

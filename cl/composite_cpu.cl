@@ -23,7 +23,7 @@
 //        rays[N,RAY_REALS] with RAYS, instead of conics in composite_sum
 //   out  image[H,W,C], alpha[H,W]; backward: records[M,RECORD], v_means2d[N,2], v_conics[N,3], v_slopes[N,3] with RAYS,
 //        v_opacities[N], v_colors[N,C]
-// -DTILE=8|16   edge of a tile, px
+// -DTILE=8|16|32   edge of a tile, px; 32 only with -DLANES=16
 // -DCHANNELS    number of colour channels, 1 or more
 // -DLANES=8|16  number of pixels of a block
 // -DRAYS=0|1|2  1, 2: along rays (composite_rays.h), in the image or in a chart of each splat; 2 reads directions[H,W,3],
@@ -42,26 +42,29 @@ __kernel void composite_fwd(const int width, const int height, const __global Sp
 
     Grid grid = pixel_grid();
     LOAD_DIRECTIONS(grid)
-    REALV transmittance[BLOCKS], sums[BLOCKS][CHANNELS];
-    for (int b = 0; b < BLOCKS; ++b) {
-        transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
-        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) sums[b][k] = 0;
-    }
+    BlockPixels pixels[BLOCKS];
+    for (int b = 0; b < BLOCKS; ++b)
+        pixels[b] = pixels_at_first(&grid, b, rows, columns);
 
     composite_tile(&grid, splats, gauss_ids, tile_ranges[2 * t], tile_ranges[2 * t + 1], x0, y0, TRANSMITTANCE_MIN,
-                   transmittance, sums);
+                   pixels);
 
     for (int r = 0; r < rows; ++r) {
         const size_t first = (size_t)(y0 + r) * width + x0;
         for (int x = 0; x < columns; ++x) {
             const int b = block_of(x, r), lane = lane_of(x, r);
-            const real left = ABSOLUTE(LANE(transmittance[b], lane));
+            const real left = ABSOLUTE(LANE(pixels[b].transmittance, lane));
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) image[CHANNELS * (first + x) + k] =
-                LANE(sums[b][k], lane) + left * background[k];
+                LANE(pixels[b].color[k], lane) + left * background[k];
             alpha_image[first + x] = 1 - left;
         }
     }
 }
+
+// The pixels of a block in the backward pass.
+typedef struct {
+    REALV transmittance, behind, v_color[CHANNELS];
+} GradPixels;
 
 __kernel void composite_bwd(const int width, const int height, const __global Splat *splats,
                             const __global uint *gauss_ids, const __global uint *tile_ranges,
@@ -75,11 +78,11 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
 
     Grid grid = pixel_grid();
     LOAD_DIRECTIONS(grid)
-    REALV transmittance[BLOCKS], behind[BLOCKS], v_pixels[BLOCKS][CHANNELS];
+    GradPixels pixels[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) {
-        transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
-        behind[b] = 0;
-        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) v_pixels[b][k] = 0;
+        pixels[b].transmittance = transmittance_at_first(&grid, b, rows, columns);
+        pixels[b].behind = 0;
+        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pixels[b].v_color[k] = 0;
     }
     for (int r = 0; r < rows; ++r) {
         const size_t first = (size_t)(y0 + r) * width + x0;
@@ -89,29 +92,29 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
                 const real v = v_image[CHANNELS * (first + x) + k];
                 sum += image[CHANNELS * (first + x) + k] * v;
-                ((real *)&v_pixels[b][k])[lane] = v;
+                ((real *)&pixels[b].v_color[k])[lane] = v;
             }
-            ((real *)&behind[b])[lane] = sum;
+            ((real *)&pixels[b].behind)[lane] = sum;
         }
     }
 
     const uint begin = tile_ranges[2 * t], end = tile_ranges[2 * t + 1];
-    Over batch[BATCH];
+    Batch batch;
     uint first = begin;
     for (; first < end; first += BATCH) {
-        const uint unfinished = unfinished_blocks(transmittance);
+        const Blocks unfinished = unfinished_blocks(&pixels->transmittance, sizeof(GradPixels) / sizeof(REALV));
         if (!unfinished)
             break;
-        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
+        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, &batch);
         for (uint j = 0; j < count; ++j)
             FETCH_TO_WRITE(&records[(size_t)RECORD * slots[first + j]]);
         for (uint j = 0; j < count; ++j) {
-            const Splat *s = &batch[j].splat;
+            const Splat *s = &batch.splats[j];
             const Corner corner = corner_from(s, x0, y0);
             Moments sums = NO_MOMENTS;
             REALV v_colors[CHANNELS];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) v_colors[k] = 0;
-            for (uint blocks = unfinished & batch[j].blocks; blocks;) {
+            for (Blocks blocks = unfinished & blocks_of(&batch, j); blocks;) {
                 const uint b = take_block(&blocks);
                 const Offset o = offset_in(&grid, b, s, corner);
                 Bend bend;
@@ -119,29 +122,29 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
                 REALV alpha = POWERV(t);
                 MASKV live;
                 const REALV weight =
-                    splat_over(splat_seen(s, t), TRANSMITTANCE_MIN, &alpha, &live, &transmittance[b]);
+                    splat_over(splat_seen(s, t), TRANSMITTANCE_MIN, &alpha, &live, &pixels[b].transmittance);
                 REALV u = 0;
                 _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
-                    u += s->color[k] * v_pixels[b][k];
-                    v_colors[k] += weight * v_pixels[b][k];
+                    u += s->color[k] * pixels[b].v_color[k];
+                    v_colors[k] += weight * pixels[b].v_color[k];
                 }
-                const REALV v_sigma = splat_over_vjp(alpha, live, weight, u, &behind[b]);
+                const REALV v_sigma = splat_over_vjp(alpha, live, weight, u, &pixels[b].behind);
                 add_moments(&o, &bend, v_sigma, &sums);
             }
             __global real *record = records + (size_t)RECORD * slots[first + j];
-            store4(record, 0, sum_lanes4(sums.m, sums.mx, sums.my, sums.mxx));
 #if RAYS
-            store4(record + 4, 0, sum_lanes4(sums.mxy, sums.myy, sums.ml, sums.mlx));
+            store8(record, sum_lanes8(sums.m, sums.mx, sums.my, sums.mxx, sums.mxy, sums.myy, sums.ml, sums.mlx));
             record[8] = sum_lanes(sums.mly);
             record[9] = sum_lanes(sums.mk);
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[MOMENTS + k] = sum_lanes(v_colors[k]);
-#elif CHANNELS == 3
-            store4(record + 4, 0, sum_lanes4(sums.mxy, sums.myy, v_colors[0], v_colors[1]));
-            record[8] = sum_lanes(v_colors[2]);
+#elif CHANNELS > 1
+            store8(record,
+                   sum_lanes8(sums.m, sums.mx, sums.my, sums.mxx, sums.mxy, sums.myy, v_colors[0], v_colors[1]));
+            _Pragma("unroll") for (int k = 2; k < CHANNELS; ++k) record[MOMENTS + k] = sum_lanes(v_colors[k]);
 #else
-            record[4] = sum_lanes(sums.mxy);
-            record[5] = sum_lanes(sums.myy);
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[MOMENTS + k] = sum_lanes(v_colors[k]);
+            for (int k = 0; k < MOMENTS; ++k)
+                record[k] = sum_lanes(((const REALV *)&sums)[k]);
+            record[MOMENTS] = sum_lanes(v_colors[0]);
 #endif
         }
     }

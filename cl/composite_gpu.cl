@@ -38,7 +38,7 @@
 // Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (11 + CHANNELS), with RAYS (26 + CHANNELS),
 // backward TILE^2 (2 + CHANNELS). With TILE 16, BATCH 64 and CHANNELS 4 this is 4 KiB (RAYS 7.5 KiB) and 6 KiB (double:
 // twice as much) of the 32 KiB that OpenCL 1.2 guarantees.
-// -DTILE=8|16   edge of a tile, px
+// -DTILE=8|16|32   edge of a tile, px
 // -DCHANNELS    number of colour channels, 1 or more
 // -DITEMS       number of work-items of the forward work-group, a divisor of TILE*TILE
 // -DBATCH       number of splats per batch, 1 or more; the backward work-group has BATCH work-items

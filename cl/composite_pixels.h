@@ -2,8 +2,9 @@
 #ifndef CLSPLAT_COMPOSITE_PIXELS_H
 #define CLSPLAT_COMPOSITE_PIXELS_H
 
-#define REALV real
-#define MASKV int
+#define REALV             real
+#define MASKV             int
+#define MINUS_ABSOLUTE(x) (-fabs(x))
 #include "composite.h"
 #include "power.h"
 

@@ -19,7 +19,7 @@
 //
 // Buffers: as in composite_cpu.cl, and
 //   in   disparities[N,3], as in project.cl
-// -DTILE=8|16   edge of a tile, px
+// -DTILE=8|16|32   edge of a tile, px
 // -DCHANNELS    number of colour channels, 1 or more
 // -DLANES=8|16  number of pixels of a block
 // -DWINDOW      number of entries of a pixel's window, 1 or more
@@ -113,7 +113,7 @@ static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, c
         ((real *)&u)[lane] = sum;
     }
     const REALV v_sigma = splat_over_vjp(e->alpha, live, weight, u, &pixels->behind[b]);
-    const REALV x = tile->grid->x[b % COLUMNS] + (real)tile->x0, y = tile->grid->y[b / COLUMNS] + (real)tile->y0;
+    const REALV x = PIXEL_X + (tile->x0 + tile->grid->x[b]), y = PIXEL_Y + (tile->y0 + tile->grid->y[b]);
     for (int lane = 0; lane < LANES; ++lane) {
         const real w = LANE(weight, lane), v = LANE(v_sigma, lane);
         if (!(w > 0))
@@ -177,31 +177,31 @@ static inline void composite_window(const Tile *tile, Pixels *pixels, int b) {
 
 // Composites all splats of a tile, in rounds.
 static inline void composite_list(const Tile *tile, uint begin, uint end, Pixels *pixels) {
-    uint open = begin < end ? unfinished_blocks(pixels->transmittance) : 0;
+    Blocks open = begin < end ? unfinished_blocks(pixels->transmittance, 1) : 0;
     for (int b = 0; b < BLOCKS; ++b) {
         pixels->last_disparity[b] = pixels->transmittance[b] > 0 ? (REALV)INFINITY : NOWHERE;
         pixels->counts[b] = 0;
         for (int j = 0; j < WINDOW; ++j)
             pixels->windows[b][j].disparity = NOWHERE;
     }
-    Over batch[BATCH];
+    Batch batch;
     while (open) {
         for (uint first = begin; first < end; first += BATCH) {
-            const uint count = load_batch(tile->splats, tile->gauss_ids, first, end, tile->x0, tile->y0, batch);
+            const uint count = load_batch(tile->splats, tile->gauss_ids, first, end, tile->x0, tile->y0, &batch);
             // One block after the other, so that its window stays in the nearest cache.
-            for (uint blocks = open; blocks;) {
+            for (Blocks blocks = open; blocks;) {
                 const int b = take_block(&blocks);
                 for (uint j = 0; j < count; ++j) {
-                    if (batch[j].blocks >> b & 1)
-                        gather_splat(tile, &batch[j].splat, load3(tile->disparities, tile->gauss_ids[first + j]),
+                    if (blocks_of(&batch, j) >> b & 1)
+                        gather_splat(tile, &batch.splats[j], load3(tile->disparities, tile->gauss_ids[first + j]),
                                      first + j, pixels, b);
                 }
             }
         }
-        for (uint blocks = open; blocks;) {
+        for (Blocks blocks = open; blocks;) {
             const int b = take_block(&blocks);
             composite_window(tile, pixels, b);
-            open ^= any_lane(pixels->last_disparity[b] > NOWHERE) ? 0 : 1u << b;
+            open ^= any_lane(pixels->last_disparity[b] > NOWHERE) ? 0 : (Blocks)1 << b;
         }
     }
 }

@@ -1,14 +1,14 @@
 // Tiles of which a work-group composites the pixels, for kernels for GPUs: the pixels' places, and the end of a step of
 // the diagonal scheme (composite_gpu.cl).
 //
-// -DTILE=8|16   edge of a tile, px
+// -DTILE=8|16|32   edge of a tile, px
 // -DBATCH       number of splats per batch of the diagonal scheme, its work-items
 // -DSUBGROUPS=0|1   1: the device has the functions of subgroups
 #ifndef CLSPLAT_COMPOSITE_TILES_H
 #define CLSPLAT_COMPOSITE_TILES_H
 
-#if TILE != 8 && TILE != 16
-#error "-DTILE must be 8 or 16: TILE*TILE work-items must fit the work-groups of every GPU"
+#if TILE != 8 && TILE != 16 && TILE != 32
+#error "-DTILE must be 8, 16 or 32"
 #endif
 #if !defined(BATCH) || BATCH < 1
 #error "-DBATCH must give the number of splats per batch, 1 or more"

@@ -8,12 +8,10 @@
 
 #ifdef USE_DOUBLE
 #define REAL8_OF(x)   IN_HALVES(real8, convert_double4, x)
-#define INT8_OF(x)    IN_HALVES(int8, convert_int4, x)
 #define MASK8_OF(x)   IN_HALVES(mask8, convert_long4, x)
 #define FMA8(a, b, c) ((real8)(fma((a).lo, (b).lo, (c).lo), fma((a).hi, (b).hi, (c).hi)))
 #else
 #define REAL8_OF    convert_float8
-#define INT8_OF     convert_int8
 #define MASK8_OF(x) (x)
 #define FMA8        fma
 #endif
@@ -96,12 +94,12 @@ static inline void pixels_between8(real8 lo, real8 hi, int size, int8 *first, in
     lo = CLAMP(lo, zero, end);
     hi = CLAMP(hi, zero - 1, end - 1);
     // Truncate, then correct the result: a vector comparison is -1 where it is true.
-    *first = INT8_OF(lo);
+    *first = TO_INT8(lo);
     const mask8 above = REAL8_OF(*first) < lo;
-    *first -= INT8_OF(above);
-    *last = INT8_OF(hi);
+    *first -= TO_INT8(above);
+    *last = TO_INT8(hi);
     const mask8 below = REAL8_OF(*last) > hi;
-    *last += INT8_OF(below);
+    *last += TO_INT8(below);
 }
 
 #endif

@@ -20,7 +20,7 @@
 //   in   splats[N], gauss_ids[M], tile_ranges[T,2], slots[M], background[C]; residuals[H,W,C], image - target;
 //        mask[H,W] uchar, 1 where pixels count
 //   out  records[M,4+C]; sums[N,4+C]: change of the squared error, sums of |D|^2, of w, of w^2, of w r
-// -DTILE=8|16   edge of a tile, px
+// -DTILE=8|16|32   edge of a tile, px; 32 only with -DLANES=16
 // -DCHANNELS    number of colour channels, 1 or more
 // -DLANES=8|16  number of pixels of a block
 // -DRAYS=0|1|2  as in composite_cpu.cl
@@ -41,11 +41,12 @@ __kernel void removal(const int width, const int height, const __global Splat *s
     // `counts` is 1 in pixels that count and 0 elsewhere.
     Grid grid = pixel_grid();
     LOAD_DIRECTIONS(grid)
-    REALV transmittance[BLOCKS], behind[BLOCKS][CHANNELS], residual[BLOCKS][CHANNELS], counts[BLOCKS];
+    BlockPixels pixels[BLOCKS]; // with the colour behind the present splat, after composite_tile
+    REALV residual[BLOCKS][CHANNELS], counts[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) {
-        transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
+        pixels[b] = pixels_at_first(&grid, b, rows, columns);
         counts[b] = 0;
-        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) behind[b][k] = residual[b][k] = 0;
+        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) residual[b][k] = 0;
     }
     for (int r = 0; r < rows; ++r) {
         const size_t first = (size_t)(y0 + r) * width + x0;
@@ -60,38 +61,39 @@ __kernel void removal(const int width, const int height, const __global Splat *s
     }
 
     const uint begin = tile_ranges[2 * t], end = tile_ranges[2 * t + 1];
-    composite_tile(&grid, splats, gauss_ids, begin, end, x0, y0, STOP, transmittance, behind);
+    composite_tile(&grid, splats, gauss_ids, begin, end, x0, y0, STOP, pixels);
     for (int b = 0; b < BLOCKS; ++b) {
-        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) behind[b][k] +=
-            ABSOLUTE(transmittance[b]) * background[k];
-        transmittance[b] = transmittance_at_first(&grid, b, rows, columns);
+        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pixels[b].color[k] +=
+            ABSOLUTE(pixels[b].transmittance) * background[k];
+        pixels[b].transmittance = transmittance_at_first(&grid, b, rows, columns);
     }
 
-    Over batch[BATCH];
+    Batch batch;
     uint first = begin;
     for (; first < end; first += BATCH) {
-        const uint unfinished = unfinished_blocks(transmittance);
+        const Blocks unfinished = unfinished_blocks(&pixels->transmittance, sizeof(BlockPixels) / sizeof(REALV));
         if (!unfinished)
             break;
-        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, batch);
+        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, &batch);
         for (uint j = 0; j < count; ++j) {
-            const Splat *s = &batch[j].splat;
+            const Splat *s = &batch.splats[j];
             const Corner corner = corner_from(s, x0, y0);
             REALV difference = 0, agreement = 0, weights = 0, squares = 0, pulls[CHANNELS];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pulls[k] = 0;
-            for (uint blocks = unfinished & batch[j].blocks; blocks;) {
+            for (Blocks blocks = unfinished & blocks_of(&batch, j); blocks;) {
                 const uint b = take_block(&blocks);
                 const Offset o = offset_in(&grid, b, s, corner);
                 Bend bend;
                 const REALV exponent = splat_exponent(s, &o, &bend);
                 REALV alpha = POWERV(exponent);
                 MASKV live;
-                const REALV weight = splat_over(splat_seen(s, exponent), STOP, &alpha, &live, &transmittance[b]);
+                const REALV weight =
+                    splat_over(splat_seen(s, exponent), STOP, &alpha, &live, &pixels[b].transmittance);
                 const REALV ratio = live ? alpha / (1 - alpha) : (REALV)0;
                 _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
                     const REALV part = weight * s->color[k];
-                    behind[b][k] -= part;
-                    const REALV less = part - ratio * behind[b][k];
+                    pixels[b].color[k] -= part;
+                    const REALV less = part - ratio * pixels[b].color[k];
                     difference += counts[b] * less * less;
                     agreement += less * residual[b][k];
                     pulls[k] += weight * residual[b][k];

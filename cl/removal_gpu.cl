@@ -12,7 +12,7 @@
 //   in   image[H,W,C], all splats and the background
 // Local memory, in reals: TILE^2 (1 + 2 CHANNELS), and TILE^2 bytes. With TILE 16 and CHANNELS 4 this is 9.3 KiB
 // (double: 18.3 KiB) of the 32 KiB that OpenCL 1.2 guarantees.
-// -DTILE=8|16   edge of a tile, px
+// -DTILE=8|16|32   edge of a tile, px
 // -DCHANNELS    number of colour channels, 1 or more
 // -DSTOP        transmittance at which a pixel is finished
 // -DBATCH       number of splats per batch, 1 or more; the work-group has BATCH work-items

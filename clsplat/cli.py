@@ -2,6 +2,7 @@
 
 import atexit
 import os
+import select
 import signal
 import sys
 import threading
@@ -86,6 +87,9 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         run(sys.argv[1:] if arguments is None else arguments)
     except (ClsplatError, OSError) as error:
+        if isinstance(error, BrokenPipeError) and reader_left():
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at its end
+            sys.exit(1)
         if console.loudness == "verbose":
             traceback.print_exc()
         if isinstance(error, ClsplatError):
@@ -111,6 +115,15 @@ def main(arguments: list[str] | None = None) -> None:
 def end(kept: MemoryError) -> NoReturn:
     """End the process without its clean-up; `kept` is not released before."""
     os._exit(2)
+
+
+def reader_left() -> bool:
+    """Whether standard output is a pipe whose reader has ended, as ``head`` does."""
+    if not hasattr(select, "poll"):  # Windows, where the error is another one
+        return False
+    poll = select.poll()
+    poll.register(sys.stdout, 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
 def terminate(*_: object) -> None:

@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 
 import tyro
 
-from clsplat.constants import TILE
 from clsplat.ranges import byte_size, name_in, within
 
 Mode = Literal["classic", "antialiased"]
@@ -38,8 +37,9 @@ class RenderConfig:
 
     mode: Mode = "classic"
     """classic: the paper's dilation by 0.3 px^2. antialiased: the opacity is compensated for it (Mip-Splatting)."""
-    tile_size: Literal[8, 16] = TILE
-    """Edge of a tile, px. It changes the speed, not the image."""
+    tile_size: Literal["auto", 8, 16, 32] = "auto"
+    """Edge of a tile, px. It changes the speed, not the image. auto: 32 on CPUs with vectors of 16 numbers (AVX-512),
+    otherwise 16."""
     compositor: Literal["auto", "cpu", "gpu"] = "auto"
     """Kernel variant of the compositing stage; auto chooses by the type of the device."""
     sort: Literal["auto", "global", "per_tile", "pixel"] = "auto"
@@ -287,9 +287,9 @@ class TrainConfig:
     """Settings of a training; saved as ``config.json``, from which it can be repeated."""
 
     iterations: Annotated[int, within(least=0, most=UINT32_MAX)] = 0
-    """Optimisation steps. 0: 30 for each training photo, but at least 3000, with photos of over 90 000 pixels more in
-    proportion to their edges, and at most 30 000. In runs shorter than 7000, the paper's shorter setting, the first
-    densification and the bands of spherical harmonics come earlier in proportion."""
+    """Optimisation steps; 0: chosen by the photos. These are 30 for each training photo, at least 3000 (or more, by
+    the edges of photos over 90 000 pixels) and at most 30 000. In runs shorter than 7000, the paper's shorter
+    setting, the first densification and the bands of spherical harmonics come earlier in proportion."""
     seed: Annotated[int, within(least=0, most=UINT64_MAX)] = 0
     """Seed of the random start, of the order of the photos and of the strategy's random numbers."""
     optimizer: Literal["device", "numpy"] = "device"

@@ -6,7 +6,6 @@ the code published with it.
 """
 
 from math import exp, log2, radians
-from typing import Literal
 
 ALPHA_MIN = 1.0 / 255.0
 """Smallest alpha of a pair of splat and pixel that is drawn: one step of an 8-bit image (original, section 6 of the
@@ -62,9 +61,13 @@ EXTENT_SLACK = 1e-3
 drawn, not the rounding of an extent in float32, so that all tile sizes give the same image. It enlarges the area by
 0.02 % at opacity 1."""
 
-TILE: Literal[8, 16] = 16
-"""Edge of a tile, px. One row is a float16 vector of the CPU compositor, and 16x16 work-items are a work-group that
-every GPU accepts."""
+TILE = 16
+"""Edge of a tile, px. 16x16 work-items are a work-group that every GPU accepts. CPUs with vectors of 8 numbers gain
+nothing from larger tiles."""
+
+WIDE_TILE = 32
+"""Edge of a tile on CPUs with vectors of 16 numbers, px: fewer lists, which such CPUs process faster (measured:
+docs/stages/composite.md)."""
 
 SH_DEGREE_MAX = 3
 """Highest degree of the spherical harmonics (paper, section 7.1)."""

@@ -41,7 +41,7 @@ class Rule:
         raise NotImplementedError
 
     def __call__(self, default: str) -> str:
-        return f"({self.words})" if default == "None" else f"({self.words}; default: {default})"
+        return f"({self.words})" if default in ("None", "") else f"({self.words}; default: {default})"
 
 
 @dataclass(frozen=True)

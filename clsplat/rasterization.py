@@ -36,7 +36,7 @@ def rasterization(
     height: int,
     *,
     sh_degree: int | None = None,
-    tile_size: Literal[8, 16] = 16,
+    tile_size: Literal[8, 16, 32] = 16,
     backgrounds: ArrayLike | None = None,
     render_mode: RenderMode = "RGB",
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
@@ -71,7 +71,7 @@ def rasterization(
         Image size, px.
     sh_degree : int, optional
         Degree up to which `colors` are evaluated as spherical harmonics; None takes them as they are.
-    tile_size : {8, 16}
+    tile_size : {8, 16, 32}
         Edge of a tile, px.
     backgrounds : (C, D), optional
         Behind the Gaussians; default 0. No background is put behind the depth.

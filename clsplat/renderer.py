@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from clsplat import reference
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
+from clsplat.constants import TILE, WIDE_TILE
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.ranges import check
@@ -129,6 +130,15 @@ class Renderer:
         """Type of the reals of an image."""
         return np.dtype(np.float64) if self.device is None else self.device.real
 
+    def tile_size(self, camera: Camera) -> int:
+        """Edge of the tiles of a camera's image, px."""
+        if self.device is None:  # the reference works splat by splat and gains nothing from tiles
+            return max(camera.width, camera.height)
+        if self.config.tile_size != "auto":
+            return self.config.tile_size
+        by_tile = self.device.is_cpu and self.config.compositor != "gpu" and self.config.sort != "pixel"
+        return WIDE_TILE if by_tile and self.device.vector_width == WIDE_TILE // 2 else TILE
+
     def upload(self, name: str, array: Any, dtype: Any = None) -> Any:
         """An array where the stages run: on the device in its precision, or float64; `dtype` names another type."""
         if self.device is None:
@@ -202,12 +212,10 @@ class Renderer:
         if self.backdrop is not None:
             others = self._project(self.backdrop, camera, self.backdrop.sh_degree, len(behind), inverse)
             drawn = self._joined(splats, others)
-        # The reference works splat by splat and gains nothing from tiles.
-        tile_size = max(camera.width, camera.height) if self.device is None else config.tile_size
         by_pixel = config.sort == "pixel"
         scheme = "auto" if by_pixel else config.sort
         bins = self.stages.bin_splats(
-            drawn, camera.width, camera.height, tile_size, gradients=gradients, scheme=scheme
+            drawn, camera.width, camera.height, self.tile_size(camera), gradients=gradients, scheme=scheme
         )
         disparities = self.stages.project_disparities(gaussians, camera, splats) if by_pixel else None
         if by_pixel and self.backdrop is not None:

@@ -35,7 +35,7 @@ def by_kernel(device: Device, splats: Splats, tile: int, image: Image, v_image: 
     return ops.absgrad(device, placed, bins, *pairs).get()
 
 
-@pytest.mark.parametrize("tile", [8, 16])
+@pytest.mark.parametrize("tile", [8, 16, 32])
 @pytest.mark.parametrize(("n", "opaque"), [(1, 0.0), (40, 0.0), (80, 3.0)])
 def test_matches_twin(any_device: Device, n: int, opaque: float, tile: int) -> None:
     """Also where pixels stop, and alphas are clamped."""

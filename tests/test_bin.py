@@ -15,7 +15,7 @@ from clsplat.stages import Bins, Splats
 from clsplat.testing import synthetic_scene
 
 SCHEMES = pytest.mark.parametrize("scheme", ["global", "per_tile"])
-TILE_SIZES = pytest.mark.parametrize("tile_size", [8, 16])
+TILE_SIZES = pytest.mark.parametrize("tile_size", [8, 16, 32])
 
 
 def make_splats(n=601, seed=0, width=150, height=110, dtype=np.float32):
@@ -55,7 +55,7 @@ def test_double_matches_twin(device64, tile_size, scheme):
     splats = make_splats()
     actual = bins_on(device64, splats, 150, 110, tile_size, scheme=scheme)
     expected = reference.bin_splats(splats, 150, 110, tile_size, scheme=scheme)
-    assert len(expected.gauss_ids) > 2000
+    assert len(expected.gauss_ids) > 1500
     assert_same(actual, expected)
 
 

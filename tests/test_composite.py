@@ -10,7 +10,7 @@ from clsplat.constants import ALPHA_MAX, ALPHA_MIN, EXTENT_SLACK, TRANSMITTANCE_
 from clsplat.stages import Bins, Image, SplatGrads, Splats
 from clsplat.testing import ambiguous_pixels, assert_matches, gradcheck, synthetic_scene
 
-TILE_SIZES = pytest.mark.parametrize("tile_size", [8, 16])
+TILE_SIZES = pytest.mark.parametrize("tile_size", [8, 16, 32])
 CHANNELS = pytest.mark.parametrize("channels", [3, 4])
 BACKGROUND = (0.3, 0.6, 0.1, 0.0)
 

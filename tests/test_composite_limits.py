@@ -100,8 +100,8 @@ def test_same_bits_twice_and_for_every_tiling(device, compositor):
     """Centres on a grid of 1/256 px make every distance to a pixel exact, whichever tile it is counted from."""
     splats, width, height = make_splats(200, 6)
     splats = splats._replace(means2d=np.round(splats.means2d * 256) / 256)
-    bins = {t: reference.bin_splats(splats, width, height, t) for t in (8, 16)}
-    images = [forward(device, compositor, splats, bins[t], BACKGROUND) for t in (16, 16, 8)]
+    bins = {t: reference.bin_splats(splats, width, height, t) for t in (8, 16, 32)}
+    images = [forward(device, compositor, splats, bins[t], BACKGROUND) for t in (16, 16, 8, 32)]
     for image in images[1:]:
         np.testing.assert_array_equal(image.rgb, images[0].rgb)
         np.testing.assert_array_equal(image.alpha, images[0].alpha)

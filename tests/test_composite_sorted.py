@@ -180,8 +180,8 @@ def test_same_bits_twice_and_for_every_tiling(device):
     splats, width, height = make_splats(200, 6)
     splats = splats._replace(means2d=np.round(splats.means2d * 256) / 256)
     disparities = planes(splats)
-    bins = {t: reference.bin_splats(splats, width, height, t) for t in (8, 16)}
-    images = [forward(device, splats, bins[t], BACKGROUND, disparities) for t in (16, 16, 8)]
+    bins = {t: reference.bin_splats(splats, width, height, t) for t in (8, 16, 32)}
+    images = [forward(device, splats, bins[t], BACKGROUND, disparities) for t in (16, 16, 8, 32)]
     for image in images[1:]:
         np.testing.assert_array_equal(image.rgb, images[0].rgb)
         np.testing.assert_array_equal(image.alpha, images[0].alpha)

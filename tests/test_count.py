@@ -38,7 +38,7 @@ def brute_force_pairs(splats, bins):
     return evaluated, accepted, live
 
 
-@pytest.mark.parametrize("tile_size", [8, 16])
+@pytest.mark.parametrize("tile_size", [8, 16, 32])
 def test_pairs_are_those_of_brute_force(device64, tile_size):
     gaussians, camera = synthetic_scene(300, seed=3)
     gaussians.logit_opacities[:] += 1

@@ -207,7 +207,7 @@ def test_rendering_matches_twin_and_tiles_do_not_matter(any_device, model):
     gaussians, camera = view_scene(model, 60)
     gaussians = gaussians.astype(np.float32)
     expected = render(gaussians, camera, RAYS, "reference", depth=True)
-    images = [render(gaussians, camera, replace(RAYS, tile_size=size), any_device).rgb for size in (8, 16)]
+    images = [render(gaussians, camera, replace(RAYS, tile_size=size), any_device).rgb for size in (8, 16, 32)]
     np.testing.assert_array_equal(*images)
     assert expected.alpha.max() > 0.5
     assert_matches("rgb", images[0], expected.rgb, DOUBLE if any_device.real == np.float64 else FLOAT)

@@ -230,9 +230,10 @@ def test_gradients_of_intrinsics_by_rendering(model):
 @EACH
 def test_one_image_for_each_tiling(device, model):
     gaussians, camera = scene_around(model, 300)
-    images = [render(gaussians, camera, RenderConfig(tile_size=t), device).rgb for t in (8, 16)]
+    images = [render(gaussians, camera, RenderConfig(tile_size=t), device).rgb for t in (8, 16, 32)]
     twin = render(gaussians, camera, device="reference").rgb
-    np.testing.assert_allclose(*images, atol=1e-4)  # float32 sums in blocks of other places
+    for image in images[1:]:
+        np.testing.assert_allclose(image, images[0], atol=1e-4)  # float32 sums in blocks of other places
     assert (np.abs(images[0] - twin) > 2e-4).mean() < 1e-3  # thresholds may flip
     assert twin.std() > 0.05
 

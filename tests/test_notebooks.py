@@ -29,6 +29,13 @@ def test_no_outputs_are_kept(path):
 
 
 @EACH_NOTEBOOK
+def test_the_first_cell_names_the_wheel_for_colab(path):
+    version = re.search(r"^version = (\S+)$", (ROOT / "setup.cfg").read_text(), flags=re.M)
+    first = "".join(json.loads(path.read_text())["cells"][0]["source"])
+    assert f"`%pip install './clsplat-{version[1]}-py3-none-any.whl[pocl]'`" in first
+
+
+@EACH_NOTEBOOK
 def test_links_lead_somewhere(path):
     for cell in json.loads(path.read_text())["cells"]:
         if cell["cell_type"] == "markdown":

@@ -109,7 +109,7 @@ def test_is_what_rendering_without_the_splat_shows(each_device):
     assert (everywhere.errors == everywhere.differences).all() and (everywhere.pulls == 0).all()
 
 
-@pytest.mark.parametrize("tile_size", [8, 16])
+@pytest.mark.parametrize("tile_size", [8, 16, 32])
 @pytest.mark.parametrize("channels", [3, 4])
 def test_double_matches_twin(each_device64, tile_size, channels):
     """300 splats in one to four tiles: lists of several batches, pixels that stop and that do not count."""

@@ -40,19 +40,21 @@ class TestInvariances:
     @COMPOSITORS
     def test_tile_size(self, device64, scene, compositor):
         """To rounding, for distances to a pixel count from its tile; test_composite has the case without rounding."""
-        renders = [render(*scene, RenderConfig(tile_size=t, compositor=compositor), device64) for t in (8, 16)]
-        assert_matches("rgb", renders[0].rgb, renders[1].rgb, DOUBLE)
+        renders = [render(*scene, RenderConfig(tile_size=t, compositor=compositor), device64) for t in (8, 16, 32)]
         v_images = random_grads(renders[0])
-        v, w = (r.backward(*v_images) for r in renders)
-        for name, array in v.gaussians.arrays().items():
-            assert_matches(f"v_{name}", array, w.gaussians.arrays()[name], DOUBLE)
+        first, *others = (r.backward(*v_images).gaussians.arrays() for r in renders)
+        for other, v in zip(renders[1:], others, strict=True):
+            assert_matches("rgb", other.rgb, renders[0].rgb, DOUBLE)
+            for name, array in first.items():
+                assert_matches(f"v_{name}", v[name], array, DOUBLE)
 
     @COMPOSITORS
     def test_tile_size_in_float(self, device, scene, compositor):
         """No band of ambiguous pixels: tilings decide alike but for the last bit of a distance."""
-        renders = [render(*scene, RenderConfig(tile_size=t, compositor=compositor), device) for t in (8, 16)]
-        flips = np.abs(renders[0].rgb - renders[1].rgb).max(axis=2) > 1e-5
-        assert flips.mean() < 1e-3
+        renders = [render(*scene, RenderConfig(tile_size=t, compositor=compositor), device) for t in (8, 16, 32)]
+        for other in renders[1:]:
+            flips = np.abs(other.rgb - renders[0].rgb).max(axis=2) > 1e-5
+            assert flips.mean() < 1e-3
 
     def test_permutation(self, device, scene):
         gaussians, camera = scene

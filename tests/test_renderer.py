@@ -5,7 +5,9 @@ import pytest
 
 import clsplat.device
 from clsplat import Renderer, render
+from clsplat.camera import Camera
 from clsplat.config import RenderConfig
+from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.render import renderings
@@ -89,3 +91,21 @@ def test_a_backdrop_is_drawn_and_has_no_gradients(device, where, sort):
     for a, b in zip(split[1:], whole[1:], strict=True):
         np.testing.assert_array_equal(a, b[:25])
     assert not np.array_equal(alone[0], whole[0])
+
+
+@pytest.mark.parametrize(
+    ("width", "is_cpu", "settings", "size"),
+    [
+        (16, True, {}, 32),
+        (8, True, {}, 16),
+        (16, False, {}, 16),
+        (16, True, {"compositor": "gpu"}, 16),
+        (16, True, {"sort": "pixel"}, 16),
+        (8, True, {"tile_size": 32}, 32),
+    ],
+)
+def test_tiles_are_large_where_a_work_item_has_one_and_vectors_are_wide(width, is_cpu, settings, size):
+    device = Device()
+    device.vector_width, device.is_cpu = width, is_cpu  # shadow the cached properties
+    camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, 1, 0), 50, 40, 30)
+    assert Renderer(device, RenderConfig(**settings)).tile_size(camera) == size

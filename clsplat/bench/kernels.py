@@ -206,10 +206,11 @@ def bench_kernels(
         Content of the file of `clsplat bench kernels -o FILE`: device, software, date, settings, roof, networks,
         workloads.
     """
+    tile_size = Renderer(device, render).tile_size(workloads[0].view.camera)
     results: dict[str, Any] = {
         "benchmark": "kernels",
         **describe(device),
-        "settings": {"repeats": repeats, **asdict(render)},
+        "settings": {"repeats": repeats, **asdict(render), "tile_size": tile_size},
     }
     progress("roof")
     roof = measure_roof(device)

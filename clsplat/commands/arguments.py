@@ -5,7 +5,7 @@ import re
 import shutil
 import textwrap
 from collections.abc import Callable
-from dataclasses import is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from types import NoneType
 from typing import Annotated, Any, get_args, get_origin
 
@@ -65,7 +65,7 @@ def parsed(kind: Any, prog: str, arguments: list[str], default: Any = None, desc
         Default: the docstring of `kind`.
     """
     registry = _Registry(brief=any(word in arguments for word in HELP) and HELP_ALL not in arguments)
-    options: dict[str, Any] = {} if default is None else {"default": default}
+    options: dict[str, Any] = {} if default is None else {"default": _without_flags(default)}
     if description or kind.__doc__:
         width = min(shutil.get_terminal_size().columns, LINE_MAX)
         text = " ".join((description or kind.__doc__).split())
@@ -77,6 +77,12 @@ def parsed(kind: Any, prog: str, arguments: list[str], default: Any = None, desc
         if not end.code and registry.hidden:
             print(f"{HELP_ALL} shows every setting, and more about these.")
         raise
+
+
+def _without_flags(command: Any) -> Any:
+    """A command whose own flags are not set: they have no second form, so a flag that was set could not be given."""
+    flags = {f.name: f.default for f in fields(command) if isinstance(f.default, bool)}
+    return replace(command, **flags)
 
 
 def unknown(name: str, known: list[str]) -> InputError:
@@ -111,9 +117,9 @@ class _Registry(ConstructorRegistry):
         assert isinstance(spec, StructConstructorSpec), "defaults are instances of their class"
         settings = info.type.__module__ in (config.__name__, options.__name__)
         fixed = {f.name: f.default for f in spec.fields if tyro.conf.Fixed in getattr(f.type, "__metadata__", ())}
-        fields = tuple(self._presented(f, settings) for f in spec.fields if f.name not in fixed)
+        presented = tuple(self._presented(f, settings) for f in spec.fields if f.name not in fixed)
         make = spec.instantiate
-        return StructConstructorSpec(lambda **values: make(**fixed, **values), fields)
+        return StructConstructorSpec(lambda **values: make(**fixed, **values), presented)
 
     def _presented(self, field: StructFieldSpec, setting: bool) -> StructFieldSpec:
         """A field with its text on one line, and hidden if the brief help leaves it out."""

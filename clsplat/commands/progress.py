@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 WAITING = "compiling kernels, which are kept for the next run, and waiting for the first step"
 """What happens before the first step. Drivers compile some kernels only when they run for the first time."""
 
+PAUSE = 1.0
+"""Time of the viewer between two steps, s, above which the estimate of the bar leaves it out: the training was
+paused, or kernels were compiled for the first frame."""
+
 
 class Progress:
     """The bar, the viewer's panel and Ctrl-C of one training.
@@ -105,7 +109,10 @@ class Progress:
             self._viewer.tell(self._facts)
             self._viewer.record(record["iteration"], record["num_gaussians"], self._psnr)
             self._psnr = None
+            started = time.perf_counter()
             self._viewer.follow(record["gaussians"], self._interrupted.is_set)
+            if time.perf_counter() - started > PAUSE:
+                self._bar.unpause()
         if self._interrupted.is_set():
             warn(f"{self._out}: stopped after iteration {record['iteration']}")
             raise KeyboardInterrupt

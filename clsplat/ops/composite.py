@@ -61,16 +61,22 @@ def directions_of(splats: AnySplats) -> list[Any]:
     return [splats.directions] if isinstance(splats, RaySplats) and ray_charts(splats) == 2 else []
 
 
+def lanes_of(device: Device, bins: Bins) -> int:
+    """Value of -DLANES (cl/composite_blocks.h): a tile has 64 blocks at most."""
+    return max(device.vector_width, bins.tile_size**2 // 64)
+
+
 def _defines(device: Device, bins: Bins, channels: int, stage: str, rays: int = 0) -> dict[str, Any]:
+    lanes = lanes_of(device, bins)
     own: dict[str, dict[str, int]] = {
-        "composite_cpu": {"LANES": device.vector_width},
+        "composite_cpu": {"LANES": lanes},
         "composite_gpu": {
             "ITEMS": device.group(bins.tile_size**2),
             "BATCH": gpu_batch(device),
             "SEGMENT": SEGMENT,
             "SUBGROUPS": int(device.subgroup_size > 0),
         },
-        "composite_sorted": {"LANES": device.vector_width, "WINDOW": WINDOW},
+        "composite_sorted": {"LANES": lanes, "WINDOW": WINDOW},
     }
     along = {} if stage == "composite_sorted" else {"RAYS": rays}
     return {"TILE": bins.tile_size, "CHANNELS": channels} | own[stage] | along

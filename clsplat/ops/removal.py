@@ -7,7 +7,7 @@ from pyopencl.array import Array
 
 from clsplat.device import Device
 from clsplat.errors import InputError
-from clsplat.ops.composite import composite_until, directions_of, gpu_batch, packed, ray_charts, variant
+from clsplat.ops.composite import composite_until, directions_of, gpu_batch, lanes_of, packed, ray_charts, variant
 from clsplat.stages import AnySplats, Bins, Removal
 
 
@@ -68,7 +68,7 @@ def removal_sums(
     defines = {"TILE": bins.tile_size, "CHANNELS": channels, "RAYS": ray_charts(splats)}
     if device.is_cpu:
         group, behind = 1, device.constant("background", background)
-        defines |= {"LANES": device.vector_width}
+        defines |= {"LANES": lanes_of(device, bins)}
     else:
         stop = device.model["TRANSMITTANCE_MIN"] * (1 - device.model["ALPHA_MAX"])  # see cl/removal_cpu.cl
         group, behind = gpu_batch(device), composite_until(device, splats, pack, bins, background, stop)

@@ -126,7 +126,8 @@ class Viewer:
             self._look = LookInputs(self._panel, renderer.background, self._touch)
         if views:
             with tabs.add_tab("Photos"):
-                self._photos = Photos(self._panel, views, start.focus, self._look.background, self._touch)
+                own = self._look.background, self._touch, self._later, self._look.tell_field
+                self._photos = Photos(self._panel, views, start.focus, *own)
         with tabs.add_tab("Record"):
             self._recording = Recording(self._panel, start, self._pose_of, self._later, self._frame_of)
         first, initial = start.camera, self._server.initial_camera
@@ -139,6 +140,7 @@ class Viewer:
         self._server.scene.set_up_direction(tuple(start.up))
         initial.position, initial.look_at, initial.up = tuple(first.position), tuple(target), tuple(up)
         initial.fov = whole_view(first, first.width / first.height)
+        self._look.tell_field(initial.fov)
         self._renderer = renderer
         for client in list(self._clients.values()):
             with client.handle.atomic():

@@ -36,6 +36,10 @@ class LookInputs:
         if event.client is not None:
             event.client.camera.fov = math.radians(self._field.value)
 
+    def tell_field(self, field: float) -> None:
+        """Show a vertical field of view, radians, that the viewer has chosen."""
+        self._field.value = min(max(round(math.degrees(field)), FIELDS_OF_VIEW[0]), FIELDS_OF_VIEW[1])
+
     def background(self) -> Color:
         """The colour behind the scene, 0 to 1."""
         red, green, blue = (channel / 255 for channel in self._background.value)

@@ -4,7 +4,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from clsplat.show.viewer_server import Inputs
+Inputs = dict[str, Callable[[Any], bool]]
+"""The inputs of the panel by their identifiers: whether an input can have a value."""
 
 Changed = Callable[[Any], None]
 """Called with viser's event after a change, on a thread of viser."""
@@ -21,7 +22,7 @@ class Panel:
     ----------
     gui : viser.GuiApi
     inputs : dict
-        As of `clsplat.show.viewer_server.start_server`.
+        Those that messages of a page may change; the panel adds its own.
     """
 
     def __init__(self, gui: Any, inputs: Inputs):
@@ -36,6 +37,12 @@ class Panel:
     def button(self, label: str, clicked: Changed, hint: str | None = None) -> Any:
         """A button."""
         return self._added(self.gui.add_button(label, hint=hint), lambda value: isinstance(value, bool), clicked)
+
+    def buttons(self, label: str, options: Sequence[str], clicked: Changed) -> Any:
+        """A group of buttons; the value of the event's target is the option that was clicked."""
+        known = set(options)
+        handle = self.gui.add_button_group(label, tuple(options))
+        return self._added(handle, lambda value: isinstance(value, str) and value in known, clicked)
 
     def checkbox(self, label: str, value: bool, changed: Changed | None = None, hint: str | None = None) -> Any:
         """A box to check."""

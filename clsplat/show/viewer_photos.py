@@ -1,4 +1,4 @@
-"""The photos in the viewer: their cameras as outlines, a list with thumbnails, and a comparison with the render."""
+"""The photos in the viewer: their cameras as outlines, a list, and a comparison with the render."""
 
 import math
 from collections.abc import Callable
@@ -12,6 +12,8 @@ from clsplat.camera import Camera
 from clsplat.scene import Color
 from clsplat.show.browser_cameras import whole_view, wxyz_of
 from clsplat.show.viewer_panel import Panel
+from clsplat.show.viewer_tasks import Task
+from clsplat.show.viewer_thumbnails import Thumbnails, scaled
 
 if TYPE_CHECKING:
     from clsplat.scene import View
@@ -30,8 +32,8 @@ Below these, lines are no longer orange in front of a scene that covers the back
 FADE_REACH = 2.0
 """Distance at which outlines are faintest, in mean distances of the cameras from the focus."""
 
-THUMBNAIL = 320
-"""Longer edge of the selected photo in the panel, px: the panel's width."""
+PANEL_WIDTH = 320
+"""Longer edge of the selected photo in the panel, px."""
 
 COMPARISONS = ("off", "overlay", "beside")
 """How the selected photo is compared with the render: not, laid over it, or to the left of a line."""
@@ -55,6 +57,10 @@ class Photos:
         Returns the colour behind the scene, into which outlines fade.
     changed : callable
         Called after each change that a frame shows.
+    later : callable
+        Takes a function that the owner of the device calls, and whose steps run between frames.
+    zoomed : callable
+        Called with the vertical field of view, radians, after a jump to a camera.
     """
 
     def __init__(
@@ -64,9 +70,11 @@ class Photos:
         focus: NDArray[np.float64],
         background: Callable[[], Color],
         changed: Callable[[], None],
+        later: Callable[[Task], None],
+        zoomed: Callable[[float], None],
     ):
         self._views, self._focus = views, focus
-        self._background, self._changed = background, changed
+        self._background, self._changed, self._zoomed = background, changed, zoomed
         self._centres = np.array([view.camera.position for view in views])
         self._distance = max(float(np.linalg.norm(self._centres - focus, axis=1).mean()), 1e-9)
         self._index = {view.name: i for i, view in enumerate(views)}
@@ -74,18 +82,23 @@ class Photos:
         self._list = panel.dropdown("Photo", [view.name for view in views], self._chosen)
         panel.button("Previous", lambda event: self._step(event, -1))
         panel.button("Next", lambda event: self._step(event, 1))
-        self._thumbnail = panel.gui.add_image(thumbnail(views[0].image), format="jpeg")
+        self._shown = panel.gui.add_image(self._small(), format="jpeg")
         self._comparison = panel.dropdown("Compare", COMPARISONS, lambda _: changed())
         self._share = panel.slider("Photo's share", (0, 100), 1, 50, lambda _: changed())
         self._visible = panel.checkbox("Cameras", True, lambda _: changed())
+        self._grid = Thumbnails(panel, views, self._select, later)
 
     @property
     def selected(self) -> "View":
         """The photo that the list shows."""
         return self._views[self._index[self._list.value]]
 
+    def _small(self) -> NDArray[np.uint8]:
+        return scaled(self.selected.image, PANEL_WIDTH, PANEL_WIDTH)
+
     def _chosen(self, event: Any) -> None:
-        self._thumbnail.image = thumbnail(self.selected.image)
+        self._shown.image = self._small()
+        self._grid.mark(self._index[self._list.value])
         if event.client is not None:
             self.jump(event.client, self.selected.camera)
         self._changed()
@@ -149,7 +162,8 @@ class Photos:
             handle.camera.position = camera.position
             handle.camera.look_at = np.asarray(camera.position + max(distance, 1e-3) * axis)
             handle.camera.wxyz = wxyz_of(camera)
-            handle.camera.fov = whole_view(camera, handle.camera.aspect)
+            handle.camera.fov = field = whole_view(camera, handle.camera.aspect)
+        self._zoomed(field)
 
     def compared(self, frame: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
         """A browser's frame with the selected photo, if the view is that of its camera and a comparison is chosen."""
@@ -157,13 +171,6 @@ class Photos:
         if self._comparison.value == COMPARISONS[0] or not _same_view(photo.camera, camera):
             return frame
         return blended(frame, camera, photo.image, photo.camera, self._comparison.value, self._share.value / 100)
-
-
-def thumbnail(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A photo at the width of the panel."""
-    small = Image.fromarray(image)
-    small.thumbnail((THUMBNAIL, THUMBNAIL))
-    return np.asarray(small)
 
 
 def _same_view(photo: Camera, window: Camera) -> bool:

@@ -14,7 +14,7 @@ import secrets
 import socket
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from http import HTTPStatus
 from typing import Any, Literal
@@ -29,13 +29,11 @@ from websockets.http11 import Request, Response
 
 from clsplat.errors import InputError
 from clsplat.show.browser_cameras import client_camera
+from clsplat.show.viewer_panel import Inputs
 
 LARGEST_MESSAGE = 2**16
 """Size of the largest message that is read, bytes. A camera takes about 300, and a click names a photo, whose file
 name can have 255 characters. viser's own limit, for uploads that this viewer does not have, is 50 MiB."""
-
-Inputs = dict[str, Callable[[Any], bool]]
-"""The inputs of the panel by their identifiers: whether an input can have a value."""
 
 _LOGGER = logging.getLogger(__name__)
 """Receives what websockets says about broken connections. With its handler, nothing is printed: tracebacks would end

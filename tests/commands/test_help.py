@@ -1,6 +1,9 @@
 """Help texts, and what a misspelled command or flag is answered."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 import typing
 from pathlib import Path
 
@@ -90,6 +93,36 @@ def test_the_version_and_a_program_without_arguments(capsys: pytest.CaptureFixtu
     setup = (Path(__file__).parents[2] / "setup.cfg").read_text()
     assert f"version = {capsys.readouterr().out.split()[1]}\n" in setup
     assert printed(capsys) == printed(capsys, "--help")
+
+
+@pytest.mark.parametrize("flag", ["--viewer", "--resume"])
+def test_a_flag_can_be_given_with_a_preset(flag: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[bool, str]] = []
+    name = flag.removeprefix("--")
+    monkeypatch.setattr(
+        "clsplat.commands.train.Train.run", lambda self: seen.append((getattr(self, name), self.settings.strategy))
+    )
+    cli.main(["train", "photos", "-o", "out", "--preset", "mcmc", flag])
+    assert seen == [(True, "mcmc")]
+
+
+def test_the_first_lines_of_help_explain_a_default_of_zero_and_name_no_empty_one(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    text = " ".join(printed(capsys, "train", "--help").replace("│", " ").split())
+    assert "0: chosen by the photos. (0 to" in text
+    assert "default: )" not in printed(capsys, "mesh", "--help-all")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes of another kind on this system")
+def test_a_reader_that_ends_early_is_no_error(tmp_path: Path) -> None:
+    """As ``clsplat info scene.ply | head -1`` has."""
+    line = f"{sys.executable} -c 'from clsplat.cli import main; main()' train --help-all | head -c 1"
+    folder = Path(__file__).parents[2]
+    found = subprocess.run(
+        line, shell=True, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, text=True
+    )
+    assert found.stderr == "" and len(found.stdout) == 1
 
 
 def test_a_setting_can_still_be_unset(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

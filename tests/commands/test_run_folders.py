@@ -60,6 +60,11 @@ def test_render_writes_into_the_run(copied: Path) -> None:
     assert np.abs(picture.astype(int) - expected).max() <= 1
 
 
+def test_a_flag_of_a_command_can_be_given_with_a_run(copied: Path, tmp_path: Path) -> None:
+    run("render", copied, "-o", tmp_path / "images", "--depth")
+    assert sorted(p.name for p in (tmp_path / "images").glob("3*")) == ["3.png", "3_depth.png"]
+
+
 def test_export_of_a_scene_and_of_a_page_with_the_cameras_of_the_run(
     copied: Path, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -102,7 +102,8 @@ def browser(profile: Path, url: str, width: int, height: int) -> Iterator[Page]:
         pytest.skip("chromium is missing: install it to run the tests with a browser")
     flags = ["--headless", "--no-sandbox", "--remote-debugging-port=0", "--hide-scrollbars", "--mute-audio"]
     flags += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
-    flags += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
+    flags += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", "--disable-quic", "--no-first-run"]
+    flags += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
     flags += [f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"]
     process = subprocess.Popen([CHROMIUM, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:

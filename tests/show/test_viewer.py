@@ -1,9 +1,12 @@
 """The viewer: conversion of cameras, frames, trainings with a viewer, and a browser that shows the frames."""
 
+import os
+import subprocess
 import sys
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,6 +43,35 @@ def test_without_viser_the_message_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match=r"pip install 'clsplat\[viewer\]'"):
         Viewer()
+
+
+WITHOUT_THE_EXTRA = """
+import sys
+
+class Missing:
+    def find_spec(self, name, *_):
+        if name.split(".")[0] in ("viser", "msgspec", "websockets"):
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Missing())
+from clsplat.cli import main
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize("command", [("view", "scene.ply"), ("train", "photos", "-o", "out", "--viewer")])
+def test_without_the_extra_commands_end_with_a_sentence(command, tmp_path):
+    """viser brings other packages, which are missing as well."""
+    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    run = subprocess.run(
+        [sys.executable, "-c", WITHOUT_THE_EXTRA, *command],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 2 and "Traceback" not in run.stderr
+    assert "pip install 'clsplat[viewer]'" in run.stderr
 
 
 class TestResolution:

@@ -90,6 +90,40 @@ def test_a_browser_shows_the_render_and_moves_to_a_clicked_camera(viewer, device
         owner.join()
 
 
+def test_a_browser_moves_to_a_clicked_thumbnail(viewer, tmp_path):
+    gaussians, cams = cameras()
+    viewer._photos._views[2].image[:] = (255, 0, 255)
+    stop = threading.Event()
+    owner = threading.Thread(target=viewer.hold, args=(gaussians, stop.is_set))
+    owner.start()
+    button = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() == '2.png')"
+    try:
+        with browser(tmp_path, viewer.address, 640, 480) as page:
+            wait_for(lambda: [c for c in viewer._clients.values() if c.shown], "the first frame")
+            (client,) = viewer._clients.values()
+            page.open_tab("Photos")
+            page.press("All photos")
+            wait_for(lambda: page.evaluate(f"Boolean({button})"), "the thumbnails")
+
+            def middle():
+                """Of the thumbnail; its picture has come if it is magenta."""
+                page.evaluate(f"{button}.scrollIntoView({{block: 'center'}})")
+                time.sleep(0.5)
+                box = page.evaluate(f"(() => {{ const b = {button}.getBoundingClientRect(); return [b.x, b.y]; }})()")
+                return round(box[0]) + 33, round(box[1]) + 25
+
+            def drawn():
+                x, y = middle()
+                return np.abs(page.screenshot()[y, x].astype(int) - (255, 0, 255)).max() < 30
+
+            wait_for(drawn, "the picture of the thumbnail")
+            page.click(*middle())
+            wait_for(lambda: np.abs(client.camera.viewmat - cams[2].viewmat).max() < 1e-3, "the view of its camera")
+    finally:
+        stop.set()
+        owner.join()
+
+
 def test_a_page_says_what_it_waits_for():
     pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
     viewer = Viewer(port=18080)

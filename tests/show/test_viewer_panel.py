@@ -17,6 +17,7 @@ from clsplat.show.browser_cameras import whole_view
 from clsplat.show.pacing import STILL_AFTER
 from clsplat.show.viewer_statistics import POINTS_MAX
 from clsplat.show.viewer_tasks import TASKS_MAX
+from clsplat.show.viewer_thumbnails import Thumbnails
 
 
 class TestPanel:
@@ -72,7 +73,8 @@ class TestPanel:
         look("Photo", "2.png")
         np.testing.assert_allclose(client.state.handle.camera.position, cams[2].position)
         assert client.state.handle.camera.fov == pytest.approx(whole_view(cams[2], 4 / 3))
-        assert viewer._photos._thumbnail.image.shape == (240, 320, 3)
+        assert viewer._photos._shown.image.shape == (240, 320, 3)
+        assert viewer._look._field.value == round(math.degrees(whole_view(cams[2], 4 / 3)))
         look("Compare", "overlay")
         look("Photo's share", 100)
         self.settled(viewer, gaussians)
@@ -89,6 +91,36 @@ class TestPanel:
         look("Next")
         np.testing.assert_allclose(client.state.handle.camera.position, cams[3].position)
         assert viewer._photos.selected.name == "3.png"
+
+    def test_thumbnails_are_made_when_asked_for_and_move_the_view(self, viewer, look, client, clock, monkeypatch):
+        gaussians, cams = cameras()
+        monkeypatch.setattr("clsplat.show.viewer_thumbnails.SENT_EVERY", 2)
+        grid = viewer._photos._grid
+        self.settled(viewer, gaussians)
+        assert not grid._group.visible and grid._style.content == ""
+        look("All photos")
+        counts = []
+        while viewer.draw(gaussians):
+            counts.append(grid._style.content.count("data:image/jpeg"))
+        assert grid._group.visible and not grid._button.visible
+        assert sorted(set(counts)) == [0, 2, 4, 5] and counts == sorted(counts), "the grid fills between frames"
+        look("Thumbnails", "3.png")
+        np.testing.assert_allclose(client.state.handle.camera.position, cams[3].position)
+        assert viewer._photos.selected.name == "3.png" and "button:nth-child(4)" in grid._mark.content
+        assert not viewer._panel._inputs[grid._group._impl.uuid]("7.png")
+
+    def test_of_many_photos_every_nth_is_a_thumbnail(self, viewer, monkeypatch):
+        monkeypatch.setattr("clsplat.show.viewer_thumbnails.THUMBNAILS_MAX", 3)
+        chosen = []
+        views = viewer._photos._views
+        grid = Thumbnails(viewer._panel, views, lambda handle, index: chosen.append(index), lambda task: None)
+        assert list(grid._group.options) == ["0.png", "2.png", "4.png"]
+        grid._group._impl.update_cb[0](SimpleNamespace(client=None, target=SimpleNamespace(value="4.png")))
+        assert chosen == [4]
+        grid.mark(4)
+        assert "nth-child(3)" in grid._mark.content
+        grid.mark(3)
+        assert "nth-child(0)" in grid._mark.content, "no button"
 
     def test_outlines_fade_with_distance_and_the_one_looked_through_is_hidden(self, viewer, look):
         cams = cameras()[1]
