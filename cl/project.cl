@@ -286,14 +286,14 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
         }
     }
 
-    // 0 times infinity is NaN, so that one test detects values that are not finite in any term.
+    // A sum is not finite if a term is not: one test detects all.
     reals any =
         norm2 + f.det + f.lens.depth + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
 #if RAYS
     any += conic.x + conic.y + conic.z + f.slopes.x + f.slopes.y + f.slopes.z;
 #endif
-    const masks visible = (0 * any == zero) & lens_sees(&camera, f.p) & (norm2 >= (reals)QUAT_NORM2_MIN) &
-                          (r2 > zero) & shows_pixel(centre.x - extent.x, centre.x + extent.x, camera.width) &
+    const masks visible = FINITE(any) & lens_sees(&camera, f.p) & (norm2 >= (reals)QUAT_NORM2_MIN) & (r2 > zero) &
+                          shows_pixel(centre.x - extent.x, centre.x + extent.x, camera.width) &
                           shows_pixel(centre.y - extent.y, centre.y + extent.y, camera.height);
 #define IF_VISIBLE(x) (visible ? (x) : zero)
     const reals2 shown_centre = {IF_VISIBLE(centre.x), IF_VISIBLE(centre.y)};
@@ -450,7 +450,7 @@ INLINED GaussianGrad gaussian_vjp(size_t i, size_t n, const Camera *camera, int 
     reals *numbers = (reals *)&v, any = 0;
     for (int k = 0; k < NUMBERS; ++k)
         any += numbers[k];
-    const masks kept = visible & (0 * any == zero);
+    const masks kept = visible & FINITE(any);
     for (int k = 0; k < NUMBERS; ++k)
         numbers[k] = kept ? numbers[k] : zero;
     for (int k = 0; k < 16; ++k)
