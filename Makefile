@@ -80,8 +80,8 @@ check-variants:
 check-runtimes:
 	$(PYTHON) tests/offline/run_runtimes.py $(addprefix --driver ,$(DRIVERS)) $(TESTS)
 
-# Compile every kernel for GPUs of AMD and NVIDIA, without a GPU, and check its registers and memory against limits:
-# build/kernels.json. Needs Clang 19 and libclc; for NVIDIA, also ptxas.
+# Compile every kernel for GPUs of AMD, NVIDIA and Intel, without a GPU, and check its registers and memory against
+# limits: build/kernels.json. Needs Clang 19 and libclc; for NVIDIA, also ptxas; for Intel, ocloc.
 CLANG = clang-19
 CLC = /usr/lib/clc
 check-builds:

@@ -18,21 +18,37 @@
 
 DEFINE_ADAM(16)
 
+// The first `count` of 16 values, and 0 for the others, which are not read. Indices into vectors are constants: others
+// would keep a vector out of the registers.
+static inline real16 load_some(const __global real *values, int count) {
+    if (count == 16)
+        return load16(values);
+    real16 result = 0;
+#pragma unroll
+    for (int i = 0; i < 16; ++i)
+        if (i < count)
+            ((real *)&result)[i] = values[i];
+    return result;
+}
+
+static inline void store_some(__global real *values, int count, real16 v) {
+    if (count == 16) {
+        store16(values, v);
+        return;
+    }
+#pragma unroll
+    for (int i = 0; i < 16; ++i)
+        if (i < count)
+            values[i] = ((const real *)&v)[i];
+}
+
 // An update of `count` adjacent parameters, at most 16. Nothing beyond them is read or written.
 static inline void adam_update_some(const Adam *adam, real16 rates, int count, real16 g, __global real *parameters,
                                     __global real *first, __global real *second) {
-    real16 p = 0, m = 0, v = 0;
-    for (int i = 0; i < count; ++i) {
-        ((real *)&p)[i] = parameters[i];
-        ((real *)&m)[i] = first[i];
-        ((real *)&v)[i] = second[i];
-    }
-    p = adam_update16(adam, rates, p, g, &m, &v);
-    for (int i = 0; i < count; ++i) {
-        parameters[i] = ((const real *)&p)[i];
-        first[i] = ((const real *)&m)[i];
-        second[i] = ((const real *)&v)[i];
-    }
+    real16 m = load_some(first, count), v = load_some(second, count);
+    store_some(parameters, count, adam_update16(adam, rates, load_some(parameters, count), g, &m, &v));
+    store_some(first, count, m);
+    store_some(second, count, v);
 }
 
 __kernel void adam_step(const uint total, const uint stride, const uint width, const uint split,
@@ -44,23 +60,24 @@ __kernel void adam_step(const uint total, const uint stride, const uint width, c
         return;
     const size_t end = LESSER(begin + width, (size_t)total);
     real16 rates = rate;
-    for (uint i = 0; i < split; ++i)
-        ((real *)&rates)[i] = split_rate;
+#pragma unroll
+    for (uint i = 0; i < 16; ++i)
+        if (i < split)
+            ((real *)&rates)[i] = split_rate;
     for (size_t i = begin; i < end; i += 16, rates = rate) {
         const int count = LESSER((size_t)16, end - i);
-        real16 g = 0;
-        for (int k = 0; k < count; ++k)
-            ((real *)&g)[k] = gradients[i + k];
+        real16 g = load_some(gradients + i, count);
         if (opacity_penalty != 0 || scale_penalty != 0) {
-            real16 p = 0;
-            for (int k = 0; k < count; ++k)
-                ((real *)&p)[k] = parameters[i + k];
+            const real16 p = load_some(parameters + i, count);
             // o (1 - o) for the logit p of o, even in p
             const real16 below = -ABSOLUTE(p), e = OF16(exp, below);
             g += opacity_penalty * e / ((1 + e) * (1 + e)) + (scale_penalty != 0 ? scale_penalty * OF16(exp, p) : 0);
         }
         // In this case, runs consist of whole rows.
-        for (int k = 0; erank_penalty != 0 && k + 3 <= count; k += 3) {
+#pragma unroll
+        for (int k = 0; k < 15; k += 3) {
+            if (erank_penalty == 0 || k + 3 > count)
+                continue;
             const real3 v = erank_penalty * erank_vjp(load3(parameters + i, k / 3), adam.erank_slack);
             ((real *)&g)[k] += v.x;
             ((real *)&g)[k + 1] += v.y;

@@ -50,6 +50,13 @@ typedef int16 mask16;
 #define CLAMP(x, lo, hi) ((x) < (lo) ? (lo) : (x) > (hi) ? (hi) : (x))
 #define ABSOLUTE(x)      ((x) < 0 ? -(x) : (x))
 
+// Whether a number is neither infinite nor NaN, or of a vector, which are. Not 0 * x == 0: Mesa takes 0 * x for 0.
+#ifdef USE_DOUBLE
+#define FINITE(x) (ABSOLUTE(x) <= DBL_MAX)
+#else
+#define FINITE(x) (ABSOLUTE(x) <= FLT_MAX)
+#endif
+
 // A function of the driver on 4, 8 or 16 values, called with at most 256 bits at once. PoCL 3.0 compiles for Zen 4,
 // which has AVX-512, as for a CPU without it, but calls functions that were built for AVX-512. With wider arguments
 // its compiler crashes, hangs or generates wrong code. vload16 and conversions are such functions, too.

@@ -73,6 +73,8 @@ static inline void add_moments(const Offset *o, const Bend *bend, REALV v_sigma,
 // A record holds the sums of one splat and one tile: the moments, then those of weight v_image.
 #define MOMENTS 6
 #define RECORD  (MOMENTS + CHANNELS)
+#define MOMENTS_OF(sums)                                                                                             \
+    { (sums).m, (sums).mx, (sums).my, (sums).mxx, (sums).mxy, (sums).myy }
 #endif
 
 static inline MASKV splat_seen(const Splat *s, REALV t) {

@@ -236,8 +236,10 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
 
         if (lane < count) {
             __global real *record = records + (size_t)RECORD * slots[i];
+            // By name: of a struct that is read as an array, Mesa 22.3 sees the first member alone change.
+            const real moments[MOMENTS] = MOMENTS_OF(sums);
             for (int k = 0; k < MOMENTS; ++k)
-                record[k] = ((const real *)&sums)[k];
+                record[k] = moments[k];
             for (int k = 0; k < CHANNELS; ++k)
                 record[MOMENTS + k] = v_colors[k];
         }

@@ -85,5 +85,10 @@ static inline void add_moments(const Offset *o, const Bend *bend, REALV v_sigma,
 // A record holds the sums of one splat and one tile: the moments, then those of weight v_image.
 #define MOMENTS 10
 #define RECORD  (MOMENTS + CHANNELS)
+#define MOMENTS_OF(sums)                                                                                             \
+    {                                                                                                                \
+        (sums).m, (sums).mx, (sums).my, (sums).mxx, (sums).mxy, (sums).myy, (sums).ml, (sums).mlx, (sums).mly,       \
+            (sums).mk                                                                                                \
+    }
 
 #endif

@@ -110,7 +110,7 @@ __kernel void composite_sum(const uint n, const __global uint *order, const __gl
 #endif
     for (int k = 0; k < CHANNELS; ++k)
         any += total[MOMENTS + k];
-    const bool finite = 0 * any == 0;
+    const bool finite = FINITE(any);
     store2(v_means2d, g, finite ? v_mean : (real2)0);
     store3(v_conics, g, finite ? v_conic : (real3)0);
 #if RAYS

@@ -80,7 +80,7 @@ __kernel void filter_fwd(const uint n, const __global real *pixels, const __glob
     const Filtered f = filtered(before, logit, filters ? pixels[i] : 1);
     store3(filtered_log_scales, i, filters ? f.log_scales : before);
     // opacity' = factor/(1 + odds), so that 1/opacity' - 1 = (odds + loss)/factor
-    const bool finite = 0 * logit == 0;
+    const bool finite = FINITE(logit);
     filtered_logit_opacities[i] =
         filters && finite ? (f.log2_factor - logarithm(f.odds + f.loss)) / (real)LOG2_E : logit;
 }

@@ -109,23 +109,31 @@ static inline real sum_group(real value, __local real *sums) {
     return sums[i];
 }
 
-// Image and photo, beginning with a column, for rows of `length` values: masked, and 0 outside of the image.
+// Image and photo in column c of a row of `length` values that begins at `begin`: masked, and 0 outside of the image.
+static inline void fetch_value(int length, size_t begin, int c, const __global real *image,
+                               const __global uchar *photo, int masked, const __global uchar *mask, real *x,
+                               real *y) {
+    const bool counts = c >= 0 && c < length && !(masked && mask[(begin + c) / 3] == 0);
+    *x = counts ? image[begin + c] : 0;
+    *y = counts ? photo[begin + c] * (1 / (real)255) : 0;
+}
+
+// The same for LANES columns, beginning with `column`. A loop over one lane would keep Intel's compiler from holding
+// x and y in registers.
 static inline void fetch(int length, int row, int column, const __global real *image, const __global uchar *photo,
                          int masked, const __global uchar *mask, real *x, real *y) {
     const size_t begin = (size_t)row * length;
-#if LANES != 1
+#if LANES == 1
+    fetch_value(length, begin, column, image, photo, masked, mask, x, y);
+#else
     if (column >= 0 && column + LANES <= length && !masked) {
         VECTOR(__private, x) = VECTOR(const __global, image + begin + column);
         VECTOR(__private, y) = load_photo(photo + begin + column);
         return;
     }
+    for (int k = 0; k < LANES; ++k)
+        fetch_value(length, begin, column + k, image, photo, masked, mask, x + k, y + k);
 #endif
-    for (int k = 0; k < LANES; ++k) {
-        const int c = column + k;
-        const bool counts = c >= 0 && c < length && !(masked && mask[(begin + c) / 3] == 0);
-        x[k] = counts ? image[begin + c] : 0;
-        y[k] = counts ? photo[begin + c] * (1 / (real)255) : 0;
-    }
 }
 
 typedef struct {

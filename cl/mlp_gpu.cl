@@ -1,16 +1,20 @@
 // Stage mlp, variant for GPUs: products of matrices in tiles, one launch per layer. See mlp_cpu.cl for the equations.
 //
-// Mapping: work-groups of 16 x 16. In mlp_product, a group computes a tile of 64 rows and 16 columns of y = x W, a
-// work-item 4 rows of a column; tiles of x and W pass through local memory. In mlp_columns, a group computes a tile
-// of 16 x 16 of v_W = x^T v_y from the rows of one of `slabs` slabs; mlp_sum adds up the slabs in their order.
+// Mapping: work-groups of TILE x TILE. In mlp_product, a group computes a tile of 64 rows and TILE columns of y = x W,
+// a work-item 64 / TILE rows of a column; tiles of x and W pass through local memory. In mlp_columns, a group computes
+// a tile of TILE x TILE of v_W = x^T v_y from the rows of one of `slabs` slabs; mlp_sum adds up the slabs in their
+// order. TILE changes no bit.
 //
 // Buffers, S rows, a layer of widths `from` and `to`: x[S,from], w[from,to], y[S,to]; gate[S,to]; v_y[S,to];
 //   parts[slabs,stride], of which the matrix [from,to] begins at `place`; v_weights[P]. Sizes that begin with `x_` and
 //   so on are first values in buffers that hold several matrices.
+// -DTILE=1|2|4|8|16  edge of a work-group
 #include "common.h"
 
-#define TILE   16
-#define HEIGHT 64 // rows of a tile of y: 4 per work-item
+#if !defined(TILE) || TILE < 1 || 16 % TILE
+#error "-DTILE must be 1, 2, 4, 8 or 16"
+#endif
+#define HEIGHT 64 // rows of a tile of y
 
 // y = x W, or y = x W^T if `turned`: then w is [to,from].
 __kernel __attribute__((reqd_work_group_size(TILE, TILE, 1))) void

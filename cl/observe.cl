@@ -6,7 +6,7 @@
 // 2023, section 5.2, and the original code).
 //
 // add_column
-//   sums[0] + sums[1] += values[column]
+//   sums[0] + sums[1] += factor values[column]
 // sums[1] collects the rounding errors of sums[0], which the exact sum of two numbers yields (Knuth, "The art of
 // computer programming", volume 2, section 4.2.2, theorem B). Both together have twice the digits of a real.
 // See docs/stages/observe.md; clsplat/reference/observe.py is the twin.
@@ -27,12 +27,12 @@ __kernel void observe(const uint n, const real2 half_size, const __global real *
     seen[i] += 1;
 }
 
-__kernel void add_column(const uint n, const uint width, const uint column, const __global real *values,
-                         __global real *sums) {
+__kernel void add_column(const uint n, const uint width, const uint column, const real factor,
+                         const __global real *values, __global real *sums) {
     const size_t i = get_global_id(0);
     if (i >= n)
         return;
-    const real before = sums[2 * i], value = values[i * width + column];
+    const real before = sums[2 * i], value = factor * values[i * width + column];
     const real sum = before + value, added = sum - before;
     sums[2 * i] = sum;
     sums[2 * i + 1] += (before - (sum - added)) + (value - added);

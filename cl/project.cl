@@ -286,14 +286,14 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
         }
     }
 
-    // 0 times infinity is NaN, so that one test detects values that are not finite in any term.
+    // A sum is not finite if a term is not: one test detects all.
     reals any =
         norm2 + f.det + f.lens.depth + centre.x + centre.y + extent.x + extent.y + color.x + color.y + color.z;
 #if RAYS
     any += conic.x + conic.y + conic.z + f.slopes.x + f.slopes.y + f.slopes.z;
 #endif
-    const masks visible = (0 * any == zero) & lens_sees(&camera, f.p) & (norm2 >= (reals)QUAT_NORM2_MIN) &
-                          (r2 > zero) & shows_pixel(centre.x - extent.x, centre.x + extent.x, camera.width) &
+    const masks visible = FINITE(any) & lens_sees(&camera, f.p) & (norm2 >= (reals)QUAT_NORM2_MIN) & (r2 > zero) &
+                          shows_pixel(centre.x - extent.x, centre.x + extent.x, camera.width) &
                           shows_pixel(centre.y - extent.y, centre.y + extent.y, camera.height);
 #define IF_VISIBLE(x) (visible ? (x) : zero)
     const reals2 shown_centre = {IF_VISIBLE(centre.x), IF_VISIBLE(centre.y)};
@@ -363,9 +363,12 @@ typedef struct {
     const __global real *v_opacities, *v_colors;
 } SplatArrays;
 
+// A call instead would pass structs through the memory of each work-item; Clang for NVIDIA's GPUs would make one.
+#define INLINED static inline __attribute__((always_inline))
+
 // Gradients of the Gaussians from i on, and the basis of their spherical harmonics; 0 for those that are not visible.
-static inline GaussianGrad gaussian_vjp(size_t i, size_t n, const Camera *camera, int sh_stride, int sh_degree,
-                                        GaussianArrays gaussians, SplatArrays splats, reals *basis) {
+INLINED GaussianGrad gaussian_vjp(size_t i, size_t n, const Camera *camera, int sh_stride, int sh_degree,
+                                  GaussianArrays gaussians, SplatArrays splats, reals *basis) {
     GaussianGrad v = {0};
     for (int k = 0; k < 16; ++k)
         basis[k] = 0;
@@ -447,7 +450,7 @@ static inline GaussianGrad gaussian_vjp(size_t i, size_t n, const Camera *camera
     reals *numbers = (reals *)&v, any = 0;
     for (int k = 0; k < NUMBERS; ++k)
         any += numbers[k];
-    const masks kept = visible & (0 * any == zero);
+    const masks kept = visible & FINITE(any);
     for (int k = 0; k < NUMBERS; ++k)
         numbers[k] = kept ? numbers[k] : zero;
     for (int k = 0; k < 16; ++k)

@@ -196,7 +196,11 @@ class Device:
 
     @cached_property
     def largest_group(self) -> int:
-        """Largest work-group of one dimension that the device runs."""
+        """Largest work-group that the device runs."""
+        # Apple's device for CPUs names 1024, and refuses groups of several work-items that use barriers or local
+        # memory (https://github.com/diku-dk/futhark/issues/1708, https://github.com/boostorg/compute/pull/610).
+        if self.cl_device.platform.name.strip() == "Apple" and self.cl_device.type & cl.device_type.CPU:
+            return 1
         sizes = ask(self.cl_device, "max_work_item_sizes", ())
         return max(1, min([ask(self.cl_device, "max_work_group_size", 1), *sizes[:1]]))
 

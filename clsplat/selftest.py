@@ -231,8 +231,8 @@ def test_observe(b: Bench) -> Found:
     yield from pairs(found, (grad_sum, seen))
     values, sums = b.random(COUNT, 3), np.zeros((COUNT, 2))
     added = b.up(sums)
-    b.stages.add_column(b.up(values), 1, added)
-    reference.add_column(values, 1, sums)
+    b.stages.add_column(b.up(values), 1, added, 0.3)
+    reference.add_column(values, 1, sums, 0.3)
     yield added, sums
 
 

@@ -235,6 +235,7 @@ DEFINES = {
         **{"LANES": 16, "VECTORS": 2, "GROUP": 32},
     },
     "mlp_cpu": {"WIDTHS": "32,64,16", "WIDEST": 64, "ROWS": 6},
+    "mlp_gpu": {"TILE": 4},
     "absgrad": {"TILE": 16, "CHANNELS": 3, "BATCH": 16, "RAYS": 0, "SUBGROUPS": 0},
     "median": {"TILE": 16, "CHANNELS": 3, "RAYS": 1},
     "project": {
@@ -285,6 +286,7 @@ FORBIDDEN = [
     ("voxels", "FEATURES", 0),
     ("mlp_cpu", "WIDEST", 2064),
     ("mlp_cpu", "ROWS", 8),
+    ("mlp_gpu", "TILE", 3),
     ("project", "CHANNELS", 5),
     ("project", "ANTIALIASED", 2),
     ("project", "CAMERA_GRAD", 2),

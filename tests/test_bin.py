@@ -62,7 +62,7 @@ def test_double_matches_twin(device64, tile_size, scheme):
 @pytest.fixture(scope="module", params=["float32", "float64", "float32 as a GPU", "float64 as a GPU"])
 def each_device(request):
     """Both precisions, each as the device is and launched like a GPU."""
-    device = Device(real=request.param.split()[0])
+    device = open_device(request.param.split()[0])
     if "GPU" in request.param:
         device.is_cpu = False  # shadows the cached property
     return device

@@ -197,6 +197,19 @@ class TestLimits:
         device.largest_group = limit  # shadows the cached property
         assert device.group(256) == expected
 
+    @pytest.mark.parametrize(
+        ("platform", "kind", "expected"), [("Apple", "CPU", 1), ("Apple", "GPU", 256), ("x", "CPU", 256)]
+    )
+    def test_what_apple_says_of_its_cpu_is_not_believed(self, platform, kind, expected):
+        device = Device()
+        device.cl_device = SimpleNamespace(
+            platform=SimpleNamespace(name=platform),
+            type=getattr(cl.device_type, kind),
+            max_work_group_size=256,
+            max_work_item_sizes=(1024, 1, 1),
+        )
+        assert device.largest_group == expected
+
     def test_variants(self, monkeypatch):
         for variants, is_cpu in (("cpu", True), ("gpu", False)):
             monkeypatch.setenv("CLSPLAT_VARIANTS", variants)

@@ -63,3 +63,15 @@ def test_columns_are_added_with_twice_the_digits(any_device, n):
         np.abs([math.fsum(pair) for pair in zip(high, low, -exact, strict=True)]), atol * scale
     )
     np.testing.assert_array_less(np.abs(twin.sum(axis=1) - exact), 20 * np.finfo(np.float64).eps * scale)
+
+
+def test_a_factor_for_each_photo(any_device):
+    """An exact one, and one whose products are rounded."""
+    rng = np.random.default_rng(0)
+    sums, twin = any_device.zeros("sums", (100, 2)), np.zeros((100, 2))
+    for factor in (0.5, 1 / 3):
+        values = rng.uniform(1, 2, (100, 5)).astype(np.float32)
+        ops.add_column(any_device, any_device.upload("values", values), 4, sums, factor)
+        reference.add_column(values.astype(np.float64), 4, twin, factor)
+    found = sums.get().astype(np.float64).sum(axis=1)
+    np.testing.assert_allclose(found, twin.sum(axis=1), rtol=2 * np.finfo(any_device.real).eps)

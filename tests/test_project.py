@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from device_opening import open_device
 from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.camera import Camera
 from clsplat.config import OptimConfig
 from clsplat.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN
-from clsplat.device import Device
 from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations as reference_rotations
 from clsplat.renderer import Renderer, download
@@ -147,7 +147,7 @@ def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degr
 @pytest.fixture(scope="module", params=["as it is", "as a GPU"])
 def configured_device64(request):
     """The float64 device, and one that the launches configure like a GPU."""
-    device = Device(real=np.float64)
+    device = open_device(np.float64)
     if request.param == "as a GPU":
         device.is_cpu = False  # shadows the cached property
     return device

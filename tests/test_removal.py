@@ -4,12 +4,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from device_opening import open_device
 from test_composite import BACKGROUND, handmade, make_splats, on_device
 from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
 from clsplat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.stages import Bins, Removal, Splats
 from clsplat.testing import ambiguous_pixels, assert_matches
@@ -35,7 +35,7 @@ def each_device64(device64, variants):
 
 @cache
 def configured(real, variants):
-    device = Device(real=real)
+    device = open_device(real)
     device.is_cpu = variants == "cpu"  # shadows the cached property
     return device
 

@@ -1,5 +1,6 @@
 """The self-test of a device: it passes with both variants of the stages, and finds a stage that computes wrong."""
 
+import math
 import os
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from device_opening import open_device
 
 from clsplat import ops, selftest
+from clsplat.device import Device
 from clsplat.stages import FUNCTIONS
 
 
@@ -20,12 +22,22 @@ def test_every_stage_agrees_with_its_twin(real, variants, monkeypatch):
     assert selftest.faults(device) == {}
 
 
-def test_every_stage_agrees_in_small_groups(monkeypatch):
-    """On a device whose largest work-group is smaller than a tile, and than the groups of sorts and sums."""
-    monkeypatch.setenv("CLSPLAT_VARIANTS", "gpu")
-    device = open_device(np.float32)
-    device.largest_group = 32  # shadows the cached property
+@pytest.mark.parametrize(("variants", "limit"), [("gpu", 32), ("cpu", 1)])
+def test_every_stage_agrees_in_small_groups(monkeypatch, variants, limit):
+    """On a device whose largest work-group is smaller than a tile, and than the groups of sorts and sums; and on a
+    CPU that runs none of several work-items."""
+    monkeypatch.setenv("CLSPLAT_VARIANTS", variants)
+    device, launch = open_device(np.float32), Device.launch
+    device.largest_group = limit  # shadows the cached property
+    groups = []
+
+    def launched(self, *arguments, group=None, **options):
+        groups.append(group or ())
+        launch(self, *arguments, group=group, **options)
+
+    monkeypatch.setattr(Device, "launch", launched)
     assert selftest.faults(device) == {}
+    assert {math.prod(group) for group in groups} <= set(range(limit + 1)) and len(groups) > 100
 
 
 def test_small_groups_change_no_bit(monkeypatch):

@@ -11,7 +11,7 @@ from clsplat.errors import InputError
 # As in cl/mlp_cpu.cl: rows that pass through all layers together.
 CHUNK = 96
 
-# As in cl/mlp_gpu.cl: edges of a tile of the results.
+# As in cl/mlp_gpu.cl: largest edge of a work-group, and rows of a tile of the results.
 TILE, HEIGHT = 16, 64
 
 # Number of slabs of rows on a GPU, each with its own sum of the gradient of the weights.
@@ -122,21 +122,32 @@ def mlp_bwd(
         x, x_first = (hidden, firsts[layer - 1]) if layer else (inputs, 0)
         scalars = [rows, slab, width, after, count, place, x_first, v_first]
         size = after, width, slabs
-        group = TILE, TILE, 1
-        device.launch("mlp_gpu", "mlp_columns", size, [*scalars, x, v, parts], group=group)
+        tile = _tile(device)
+        arguments = [*scalars, x, v, parts]
+        device.launch("mlp_gpu", "mlp_columns", size, arguments, defines={"TILE": tile}, group=(tile, tile, 1))
         y, y_first = (work, max(widths) * (layer % 2)) if layer else (v_inputs, 0)
         needed = width if layer else columns
         if needed:
             scalars = [rows, after, needed, 1, 0, int(layer > 0), v_first, place, y_first, x_first]
             _product(device, rows, needed, [*scalars, v, weights, x, y])
         v, v_first = y, y_first
-    device.launch("mlp_gpu", "mlp_sum", (count,), [count, slabs, added, parts, v_weights])
+    arguments = [count, slabs, added, parts, v_weights]
+    device.launch("mlp_gpu", "mlp_sum", (count,), arguments, defines={"TILE": _tile(device)})
     return v_inputs, v_weights
 
 
+def _tile(device: Device) -> int:
+    """Edge of the work-groups: `TILE`, or less where the device does not run groups of that size."""
+    tile = TILE
+    while tile**2 > device.largest_group:
+        tile //= 2
+    return tile
+
+
 def _product(device: Device, rows: int, columns: int, arguments: list[Any]) -> None:
-    size = columns, -(-rows // HEIGHT) * TILE
-    device.launch("mlp_gpu", "mlp_product", size, arguments, group=(TILE, TILE))
+    tile = _tile(device)
+    size = columns, -(-rows // HEIGHT) * tile
+    device.launch("mlp_gpu", "mlp_product", size, arguments, defines={"TILE": tile}, group=(tile, tile))
 
 
 def _check(widths: tuple[int, ...]) -> None:

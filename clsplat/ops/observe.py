@@ -27,8 +27,8 @@ def observe(
     device.launch("observe", "observe", (n,), [n, half_size, extents, v_means2d, grad_sum, seen])
 
 
-def add_column(device: Device, values: Array, column: int, sums: Array) -> None:
-    """Add a column of an array to sums of twice the precision, in place.
+def add_column(device: Device, values: Array, column: int, sums: Array, factor: float = 1.0) -> None:
+    """Add a column of an array, times a factor, to sums of twice the precision, in place.
 
     Parameters
     ----------
@@ -38,6 +38,8 @@ def add_column(device: Device, values: Array, column: int, sums: Array) -> None:
         Less than W.
     sums : (N, 2) real
         The sum of both columns is the sum of what was added. 0 before the first call.
+    factor : float
+        The products are rounded.
     """
     n = sums.shape[0]
-    device.launch("observe", "add_column", (n,), [n, values.shape[1], column, values, sums])
+    device.launch("observe", "add_column", (n,), [n, values.shape[1], column, float(factor), values, sums])

@@ -137,8 +137,7 @@ def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands:
     InputError
         If there is no view or no Gaussian.
     """
-    if not views or not len(gaussians):
-        raise InputError(f"views, gaussians: expected at least one each, found {len(views)} and {len(gaussians)}")
+    _demand(gaussians, views)
     n, degree = len(gaussians), gaussians.sh_degree
     total = Prices(
         np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros((n, degree))
@@ -162,6 +161,11 @@ def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands:
     return total
 
 
+def _demand(gaussians: Gaussians, views: list[View]) -> None:
+    if not views or not len(gaussians):
+        raise InputError(f"views, gaussians: expected at least one each, found {len(views)} and {len(gaussians)}")
+
+
 def sight(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
     """Unit vectors (N, 3) from a camera to Gaussians, and the sizes (N,) of a pixel there, world units."""
     offsets = gaussians.means - camera.position
@@ -180,6 +184,21 @@ def _color_changes(renderer: Renderer, run: Pass) -> Array:
         for degree in range(run.sh_degree)
     ]
     return np.stack([download(other) - colors for other in fewer], axis=1)
+
+
+def _costs(gaussians: Gaussians, views: list[View], renderer: Renderer) -> Array:
+    """`Prices.costs` times a number that all Gaussians share; added up where the stages run."""
+    _demand(gaussians, views)
+    names = "errors", "differences"
+    sums = {name: renderer.zeros(f"sums of {name}", (len(gaussians), 2)) for name in names}
+    pixels = 0
+    for measured in measure_removals(renderer, gaussians, views, clamped=True):
+        pixels = pixels or measured.pixels  # of the first photo: the factor is exactly 1 where all have as many
+        for name in names:
+            column = Removal._fields.index(name)
+            renderer.stages.add_column(measured.sums, column, sums[name], pixels / measured.pixels)
+    errors, differences = (download(sums[name]).astype(np.float64).sum(axis=1) for name in names)
+    return np.maximum(errors, differences)
 
 
 def removal_order(
@@ -203,12 +222,16 @@ def removal_order(
     (N,) int
         Rows: ``gaussians.take(order[:n])`` is the scene pruned to n. Ties are ordered by index; the same input gives
         the same order.
+
+    Raises
+    ------
+    InputError
+        If there is no view or no Gaussian.
     """
     kept = np.arange(len(gaussians))
     gone: list[NDArray[np.intp]] = []
     while True:
-        prices = price(gaussians.take(kept), views, renderer, bands=False)
-        kept = kept[np.argsort(-prices.costs, kind="stable")]
+        kept = kept[np.argsort(-_costs(gaussians.take(kept), views, renderer), kind="stable")]
         left = int(ROUND * len(kept))
         if left == 0 or until(gaussians.take(np.sort(kept[:left]))):
             return np.concatenate([kept, *reversed(gone)])

@@ -15,6 +15,6 @@ def observe(extents: Array, v_means2d: Array, width: int, height: int, grad_sum:
     seen[visible] += 1
 
 
-def add_column(values: Array, column: int, sums: Array) -> None:
-    """Add a column to sums, in place. Arguments as for `clsplat.ops.add_column`."""
-    sums[:, 0] += values[: len(sums), column]
+def add_column(values: Array, column: int, sums: Array, factor: float = 1.0) -> None:
+    """Add a column, times a factor, to sums, in place. Arguments as for `clsplat.ops.add_column`."""
+    sums[:, 0] += factor * values[: len(sums), column]

@@ -33,7 +33,7 @@ ROOF = {
 LIMITS = Limits(1e-5, 25e9, 100e9, 4e9)
 STAGES = ("project_fwd", "bin_splats", "composite_fwd", "l1_ssim", "composite_bwd", "observe", "project_bwd_adam")
 FACTORS = {stage: np.linspace(1.5, 3.0, len(TERMS.get(stage, OTHERS))) for stage in STAGES}
-RECORDED = Path(__file__).parents[2] / "docs" / "results" / "kernels.json"
+RECORDED = Path(__file__).parents[2] / "docs" / "results"
 
 
 def results(noise: float = 0.0) -> dict[str, Any]:
@@ -91,9 +91,15 @@ def test_few_workloads() -> None:
         model_of(few)
 
 
-def test_the_recorded_measurements_predict_each_other() -> None:
-    """Within 25 % in the median, for each stage and for whole steps."""
-    for stage, errors in checked(json.loads(RECORDED.read_text())).items():
+@pytest.mark.parametrize(("name", "clock"), [("kernels", "median_ms"), ("kernels-intel", "cpu_ms")])
+def test_the_recorded_measurements_predict_each_other(name: str, clock: str) -> None:
+    """Within 25 % in the median, for each stage and for whole steps. The machine with Intel's runtime had other work,
+    which wall times contain and processor times do not."""
+    recorded = json.loads((RECORDED / f"{name}.json").read_text())
+    for workload in recorded["workloads"]:
+        for measured in (workload["step"], *workload["stages"].values()):
+            measured["median_ms"] = measured[clock]
+    for stage, errors in checked(recorded).items():
         assert np.median(np.abs(errors)) < 0.25, stage
 
 

@@ -1,12 +1,13 @@
-"""Compile every kernel for GPUs of AMD and NVIDIA, with Clang and without a GPU, and check what it uses.
+"""Compile every kernel for GPUs of AMD, NVIDIA and Intel, without a GPU, and check what it uses.
 
 Run by `make check-builds`, which needs Clang 19 and libclc (Debian: apt install clang-19 libclc-19), and an OpenCL
 device, such as PoCL, to find out which programs the launches build. For NVIDIA, `ptxas` (of CUDA, or of PyPI's
-nvidia-cuda-nvcc-cu12) says what its assembler takes; without it, kernels are compiled to PTX alone.
+nvidia-cuda-nvcc-cu12) says what its assembler takes; without it, kernels are compiled to PTX alone. For Intel,
+`ocloc` is the compiler of its GPU driver (Debian: in intel-opencl-icd); without it, that target is left out.
 
 The programs are those that the self-test of a device builds with the variants for GPUs, in single precision. Each is
 also parsed as strict OpenCL C 1.2. Those that can use subgroups are parsed with them as well, in the languages that
-have them; libclc has no code for their functions.
+have them; libclc has no code for their functions. For Intel they are compiled with them.
 """
 
 import argparse
@@ -33,15 +34,18 @@ AMD = ("amdgcn-mesa-mesa3d", "{}-amdgcn-mesa-mesa3d.bc")
 NVIDIA = ("nvptx64-nvidia-nvcl", "nvptx64--nvidiacl.bc")
 TARGETS = {"gfx90a": AMD, "gfx1030": AMD, "gfx1100": AMD, "sm_70": NVIDIA, "sm_90": NVIDIA}
 
+INTEL = "dg2"
+"""The processor of Intel's Arc A GPUs, for which `ocloc` compiles."""
+
 EXTENSIONS = ["-Xclang", "-cl-ext=+cl_khr_subgroups,+__opencl_c_subgroups"]
 
 # Clang's warnings that are not about the language: pragmas for one compiler, and literals that the option
 # -cl-single-precision-constant makes single.
 STRICT = ["-pedantic", "-Werror", "-Wall", "-Wno-unused-function", "-Wno-unknown-pragmas"]
 
-PRIVATE_MAX = 512
+PRIVATE_MAX = 64
 """Largest private memory of a work-item, bytes. NVIDIA's driver reserves it for each work-item that can be resident,
-270 000 on an H200, and accesses to it are those of global memory."""
+270 000 on an H200, and accesses to it are those of global memory. Compilers may spill a few registers."""
 
 PRIVATE_LARGER = {"bin_histogram": 1028, "bin_scatter": 1028}
 """Private memory of kernels that may have more, bytes: those that are launched on CPUs alone."""
@@ -73,11 +77,11 @@ def programs() -> list[tuple[str, dict[str, Any]]]:
 
 
 class Compiler:
-    """Clang with the built-in functions of libclc, and ptxas if there is one."""
+    """Clang with the built-in functions of libclc, and ptxas and ocloc if they are there."""
 
     def __init__(self, clang: str, library: Path, folder: Path):
         self.clang, self.library, self.folder = clang, library, folder
-        self.ptxas = shutil.which("ptxas")
+        self.ptxas, self.ocloc = shutil.which("ptxas"), shutil.which("ocloc")
 
     def run(self, source: str, options: list[str], *more: str) -> str:
         """Compile a source; returns what Clang says. Ends the script with the errors if it fails."""
@@ -135,10 +139,47 @@ class Compiler:
             }
         yield {"names": names}
 
+    def intel(self, source: str, options: list[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Name of each kernel of a program and what it uses on a GPU of Intel, as its driver's compiler says."""
+        if self.ocloc is None:
+            return
+        path, out = self.folder / "kernel.cl", self.folder / "intel"
+        path.write_text(source + "\n")
+        # A binary of this format holds a list of its kernels as YAML.
+        command = [self.ocloc, "compile", "-file", str(path), "-device", INTEL, "--format", "zebin"]
+        command += ["-options", " ".join([*options, "-w"]), "-out_dir", str(out)]
+        result = subprocess.run(command, capture_output=True, text=True)
+        if result.returncode:
+            sys.exit(f"{' '.join(command)}\n{result.stdout[:4000]}{result.stderr[:4000]}")
+        (binary,) = out.glob("*.bin")
+        yield from intel_kernels(binary.read_bytes())
+
+
+def intel_kernels(binary: bytes) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Name of each kernel of a binary for a GPU of Intel, and what it uses. Registers are those of a thread, which
+    runs as many work-items as it has lanes."""
+    begin = binary.index(b"kernels:")
+    text = binary[begin : binary.index(b"\0", begin)].decode().partition("kernels_misc_info:")[0]
+    for part in re.split(r"^  - name: +", text, flags=re.MULTILINE)[1:]:
+        found = {name: int(value) for name, value in re.findall(r"^ {6}(\w+): +(\d+)$", part, re.MULTILINE)}
+        memory = part.partition("per_thread_memory_buffers:")[2]
+        # Of a work-item or, without the mark, of a thread.
+        buffers = re.findall(r"size: +(\d+)\n(?: +slot: +\d+\n)?( +is_simt_thread: +true)?", memory)
+        private = sum(int(size) if mark else int(size) / found["simd_size"] for size, mark in buffers)
+        uses = {"registers": found["grf_count"], "private": private, "local": found.get("slm_size", 0)}
+        if part.startswith("Intel_Symbol_Table"):  # not one of the sources
+            continue
+        yield part.split()[0], uses | {"lanes": found["simd_size"]}
+
 
 def measure(compiler: Compiler) -> list[dict[str, Any]]:
     """What every kernel uses on every target."""
     rows = []
+
+    def add(stage: str, name: str, target: str, use: dict[str, Any]) -> None:
+        rows.append({"stage": stage, "kernel": name, "target": target} | use)
+        print(f"{stage:15} {name:24} {target:8} {use}", flush=True)
+
     for stage, defines in programs():
         source, options = inline_includes(f"{stage}.cl", kernel_folder()), build_options(np.float32, defines)
         compiler.run(source, options, "-fsyntax-only", "-target", "spir64", *STRICT)
@@ -151,8 +192,11 @@ def measure(compiler: Compiler) -> list[dict[str, Any]]:
         for target in TARGETS:
             *uses, last = list(compiler.kernels(source, options, target)) or [{"names": []}]
             for name, use in zip(last["names"], uses, strict=True):
-                rows.append({"stage": stage, "kernel": name, "target": target} | use)
-                print(f"{stage:15} {name:24} {target:8} {use}", flush=True)
+                add(stage, name, target, use)
+        if "SUBGROUPS" in defines:
+            options = build_options(np.float32, defines | {"SUBGROUPS": 1}, SUBGROUP_LANGUAGES[0][0])
+        for name, use in compiler.intel(source, options):
+            add(stage, name, INTEL, use)
     return rows
 
 

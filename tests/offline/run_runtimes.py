@@ -48,7 +48,7 @@ def run(driver: Path, tests: list[str]) -> bool:
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests]
         lines = subprocess.run(command, env=env, capture_output=True, text=True).stdout.splitlines()
     for line in lines:
-        if re.match(r"(FAILED|ERROR) |.* (passed|failed|error)", line):
+        if re.match(r"(FAILED|ERROR) |.*\d (passed|failed|errors?)\b", line):
             print(f"  {line}", flush=True)
     return bool(lines) and "passed" in lines[-1] and "failed" not in lines[-1] and "error" not in lines[-1]
 

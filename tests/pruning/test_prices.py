@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pyopencl.array
 import pytest
 
 from clsplat.camera import Camera
@@ -132,6 +133,29 @@ def test_what_would_add_to_an_error_goes_last(device):
         assert removal_order(pair, [view], lambda left: True, Renderer(device))[0] == first
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_order_brings_no_photo_to_the_host(device, monkeypatch, masked):
+    """Sums of two numbers of twice the precision, 16 bytes per Gaussian and round, whatever the number of photos. At
+    commit 0296780 it was 28 for each photo. Photos count equally, however many pixels they have."""
+    gaussians, views = scene()
+    gaussians = gaussians.astype(np.float32)
+    views = [replace(v, mask=v.mask if masked else None) for v in views]
+    renderer = Renderer(device, background=BACKGROUND)
+    expected = np.argsort(-price(gaussians, views, renderer).costs, kind="stable")
+    brought, get = [0], pyopencl.array.Array.get
+
+    def counted(array, *arguments, **options):
+        brought[0] += array.nbytes
+        return get(array, *arguments, **options)
+
+    monkeypatch.setattr(pyopencl.array.Array, "get", counted)
+    for count in (1, 2):
+        brought[0] = 0
+        order = removal_order(gaussians, views[:count], lambda left: True, renderer)
+        assert brought[0] == 16 * len(gaussians)
+    np.testing.assert_array_equal(order, expected)
+
+
 def test_degrees():
     gaussians, _ = scene()
     assert with_degree(gaussians, 1).sh_degree == 1
@@ -155,3 +179,5 @@ def test_nothing_to_price_is_an_error():
     for arguments in ((gaussians, []), (gaussians.take(np.arange(0)), views)):
         with pytest.raises(InputError, match="expected at least one each"):
             price(*arguments, Renderer("reference"))
+        with pytest.raises(InputError, match="expected at least one each"):
+            removal_order(*arguments, lambda left: True, Renderer("reference"))
