@@ -315,7 +315,7 @@ class TestPage:
     def test_bytes_are_those_of_the_page(self, page):
         values = {"N": 7, "P": 59, "M": 11}
         by_hand = {}
-        for stage, formula in re.findall(r"^\| `(\w+)` \| ([^:]+):", page, flags=re.M):
+        for stage, formula in re.findall(r"^\| `(\w+)` \| ([^:|\n]+):", page, flags=re.M):
             formula = formula.replace("27 per pixel", "27 13")
             by_hand[stage] = eval(re.sub(r"(?<=[\w)]) (?=[\w(])", "*", formula), values)
         assert by_hand == stage_bytes(7, 3, 13, 11)
