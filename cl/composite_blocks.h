@@ -34,7 +34,7 @@
 #define ROWS       (TILE / BLOCK_ROWS)
 #define BLOCKS     (ROWS * COLUMNS)
 
-// BlockPixels of a block, in lanes: centres relative to its corner.
+// Pixels of a block, in lanes: centres relative to its corner.
 #if LANES == 16
 #define PIXEL_X ((real16)(0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5))
 #define PIXEL_Y ((real16)(0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5))
@@ -47,27 +47,19 @@
 typedef ulong Blocks;
 #define HALVES ((BLOCKS + 31) / 32)
 
-static inline real4 quarters(REALV v) {
-#if LANES == 16
-    const real8 half_sums = v.lo + v.hi;
-    return half_sums.lo + half_sums.hi;
-#else
-    return v.lo + v.hi;
-#endif
-}
-
-static inline real sum_lanes(REALV v) {
-    const real4 a = quarters(v);
-    const real2 b = a.lo + a.hi;
-    return b.x + b.y;
-}
-
 static inline real8 half_sums(REALV v) {
 #if LANES == 16
     return v.lo + v.hi;
 #else
     return v;
 #endif
+}
+
+static inline real sum_lanes(REALV v) {
+    const real8 a = half_sums(v);
+    const real4 b = a.lo + a.hi;
+    const real2 c = b.lo + b.hi;
+    return c.x + c.y;
 }
 
 // The sums of a and b, in halves of four.
@@ -81,7 +73,7 @@ static inline real8 neighbour_sums(real8 x, real8 y) {
     return (real8)(x.s02, y.s02, x.s46, y.s46) + (real8)(x.s13, y.s13, x.s57, y.s57);
 }
 
-// The sums over the lanes of eight vectors. With a tree, a sum takes a third of the instructions.
+// The sums over the lanes of eight vectors, by a tree that they share.
 static inline real8 sum_lanes8(REALV v0, REALV v1, REALV v2, REALV v3, REALV v4, REALV v5, REALV v6, REALV v7) {
     const real8 v0415 = neighbour_sums(pair_sums(v0, v4), pair_sums(v1, v5));
     return neighbour_sums(v0415, neighbour_sums(pair_sums(v2, v6), pair_sums(v3, v7)));
@@ -287,7 +279,7 @@ static inline void find_blocks(const Outlines *outlines, uint g, int x0, int y0,
         const REALV sq_right = half_sq * GREATER(1 - t_right * t_right, zero);
         const REALV x_min = x + slope * at_left - SQRTV(sq_left), x_max = x + slope * at_right + SQRTV(sq_right);
         const MASKV met = (top <= half_height) & (bottom >= -half_height) & (x_min <= x_max);
-        // The first pixel of block i is at 4 i + 0.5, its last one at 4 i + 3.5. Comparisons with NaN are false.
+        // Block i has pixels from 4 i + 0.5 to 4 i + 3.5. Comparisons with NaN are false.
         const REALV limit = COLUMNS;
         REALV begin = (x_min + (real)0.5) / 4, end = (x_max + (real)3.5) / 4;
         begin = LESSER(GREATER(begin, zero), limit);
@@ -318,7 +310,7 @@ static inline uint load_batch(const __global Splat *splats, const __global uint 
     return count;
 }
 
-// Transmittance 1 inside the image. BlockPixels outside count as finished.
+// Transmittance 1 inside the image. Pixels outside count as finished.
 static inline REALV transmittance_at_first(const Grid *grid, int b, int rows, int columns) {
     const MASKV inside = (PIXEL_X < (REALV)(columns - grid->x[b])) & (PIXEL_Y < (REALV)(rows - grid->y[b]));
     return inside ? (REALV)1 : (REALV)-1;
