@@ -57,6 +57,7 @@ def curvatures(gaussians: Gaussians, views: list[View], renderer: Renderer) -> A
         # The mean of Y Y^T over all directions is the unit matrix divided by the area of the sphere.
         anywhere = SPREAD / (1 - SPREAD) / (4 * np.pi) * weights[seen]
         out[np.ix_(seen, np.flatnonzero(a == b))] += anywhere[:, None].astype(np.float32)
+        del measured
     return out
 
 

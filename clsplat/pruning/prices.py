@@ -102,17 +102,21 @@ def measure_removals(
     Yields
     ------
     Measured
-        Per view.
+        Per view. Callers delete it before they ask for the next one, which would otherwise take as much memory again.
     """
     placed = renderer.place(gaussians)
     for view in in_turn(views):
-        run = renderer.forward(placed, view.camera, sh_degree)
-        photo = renderer.upload("photo", view.image, np.uint8)
-        mask = None if view.mask is None else renderer.upload("mask", view.mask, np.uint8)
-        residuals, errors = renderer.stages.removal_residuals(run.image.rgb, photo, mask, clamped=clamped)
-        background = np.array(renderer.background)
-        sums = renderer.stages.removal_sums(run.drawn, run.bins, background, residuals, mask)
-        yield Measured(view, run, errors, sums)
+        yield _measured(renderer, placed, view, sh_degree, clamped)
+
+
+def _measured(renderer: Renderer, placed: Gaussians, view: View, sh_degree: int | None, clamped: bool) -> Measured:
+    run = renderer.forward(placed, view.camera, sh_degree)
+    photo = renderer.upload("photo", view.image, np.uint8)
+    mask = None if view.mask is None else renderer.upload("mask", view.mask, np.uint8)
+    residuals, errors = renderer.stages.removal_residuals(run.image.rgb, photo, mask, clamped=clamped)
+    background = np.array(renderer.background)
+    sums = renderer.stages.removal_sums(run.drawn, run.bins, background, residuals, mask)
+    return Measured(view, run, errors, sums)
 
 
 def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands: bool = True) -> Prices:
@@ -158,6 +162,7 @@ def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands:
             squares, pulls = part.squares[seen, None], part.pulls[seen]
             error = squares * (change**2).sum(axis=2) + 2 * np.einsum("ndc,nc->nd", change, pulls)
             total.bands[seen] += error / pixels
+        del measured, run
     return total
 
 
@@ -197,6 +202,7 @@ def _costs(gaussians: Gaussians, views: list[View], renderer: Renderer) -> Array
         for name in names:
             column = Removal._fields.index(name)
             renderer.stages.add_column(measured.sums, column, sums[name], pixels / measured.pixels)
+        del measured
     errors, differences = (download(sums[name]).astype(np.float64).sum(axis=1) for name in names)
     return np.maximum(errors, differences)
 

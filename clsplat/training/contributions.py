@@ -1,11 +1,12 @@
 """Contributions of Gaussians to photos and to the errors in them."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
 from clsplat.gaussians import Gaussians
-from clsplat.pruning.prices import measure_removals
+from clsplat.pruning.prices import Measured, measure_removals
 from clsplat.renderer import Renderer, download
 from clsplat.scene import View
 from clsplat.stages import Image, Removal
@@ -37,9 +38,14 @@ def contributions(
     """
     names = "weights", "errors", "prices", "differences"
     sums = {name: renderer.zeros(f"sums of {name}", (len(gaussians), 2)) for name in names}
-    for view, run, squares, removals in measure_removals(renderer, gaussians, views, sh_degree):
-        v = Image(squares, renderer.no_alpha_gradient(view.camera))
-        renderer.stages.add_column(renderer.backward_to_splats(run, v).colors, 0, sums["errors"])
-        for name, field in (("weights", "weights"), ("prices", "errors"), ("differences", "differences")):
-            renderer.stages.add_column(removals, Removal._fields.index(field), sums[name])
+    for measured in measure_removals(renderer, gaussians, views, sh_degree):
+        _add(renderer, measured, sums)
+        del measured
     return Contributions(**{name: download(parts).astype(np.float64).sum(axis=1) for name, parts in sums.items()})
+
+
+def _add(renderer: Renderer, measured: Measured, sums: dict[str, Any]) -> None:
+    v = Image(measured.errors, renderer.no_alpha_gradient(measured.view.camera))
+    renderer.stages.add_column(renderer.backward_to_splats(measured.run, v).colors, 0, sums["errors"])
+    for name, field in (("weights", "weights"), ("prices", "errors"), ("differences", "differences")):
+        renderer.stages.add_column(measured.sums, Removal._fields.index(field), sums[name])

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,10 +17,15 @@ from clsplat.config import AdcConfig, OptimConfig, RenderConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
+from clsplat.pruning.harmonics import curvatures
+from clsplat.pruning.prices import price, removal_order
 from clsplat.ranges import parse_bytes
 from clsplat.render import render_views
+from clsplat.renderer import Renderer
 from clsplat.scene import DepthMap, Scene, View
+from clsplat.testing import synthetic_scene
 from clsplat.training.checkpoint import load_state
+from clsplat.training.contributions import contributions
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.loop import complete, train
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
@@ -253,3 +259,24 @@ def test_a_limit_does_not_change_the_result_where_it_holds_nothing_back(tmp_path
         # Too little for the photos beside the rest: they are uploaded anew each time.
         result = train(scene, config, tmp_path, Device(memory_limit=free.memory_peak))
     assert all((a == b).all() for a, b in zip(result.arrays().values(), expected.arrays().values(), strict=True))
+
+
+@pytest.mark.parametrize(
+    "survey",
+    [
+        lambda renderer, gaussians, views: contributions(renderer, gaussians, views),
+        lambda renderer, gaussians, views: price(gaussians, views, renderer),
+        lambda renderer, gaussians, views: removal_order(gaussians, views, lambda _: True, renderer),
+        lambda renderer, gaussians, views: curvatures(gaussians, views, renderer),
+    ],
+    ids=["contributions", "price", "removal_order", "curvatures"],
+)
+def test_a_surveyed_photo_is_released_before_the_next(survey: Callable[..., Any]) -> None:
+    scene = make_scene(1, 96, 64, views=1)
+    gaussians = synthetic_scene(3000)[0].astype(np.float32)
+    peaks = []
+    for count in (1, 3):
+        device = Device()
+        survey(Renderer(device), gaussians, scene.train * count)
+        peaks.append(device.memory_peak)
+    assert peaks[1] <= 1.2 * peaks[0], "a render takes three tenths, what the pool keeps of it one"
