@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from clsplat.config import TrainConfig
 from clsplat.ranges import checked
 from clsplat.scene import Scene
+from clsplat.training.densify.schedule import WINDOW
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.rows import Rows
 from clsplat.training.run_length import SMALL_PHOTO, largest_photo
@@ -45,10 +46,6 @@ NORMAL_DEVIATIONS = 1.4826
 
 PATIENCE = 2.0
 """Factor by which the number of Gaussians grows without paying before growth ends."""
-
-GROWTH_WINDOW = 0.1
-"""Fraction of the iterations in a window of growth. In its first part the number of Gaussians grows, in its second
-half the scene is validated: Gaussians that have just been split are worse before they are better."""
 
 PACE = 3.0
 """Multiple of the first Gaussians that growth reaches by its end, unless `PER_PIXEL` allows more. Faster growth ends
@@ -224,8 +221,12 @@ def growth_bounds(config: TrainConfig) -> list[int]:
 
 
 def growth_window(config: TrainConfig) -> int:
-    """Iterations in a window of growth."""
-    return max(1, round(GROWTH_WINDOW * config.iterations))
+    """Iterations in a window of growth.
+
+    In its first part the number of Gaussians grows, in its second half the scene is validated: Gaussians that have just
+    been split are worse before they are better.
+    """
+    return max(1, round(WINDOW * config.iterations))
 
 
 def start(scene: Scene, n: int, config: TrainConfig) -> "Search":

@@ -7,9 +7,15 @@ from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 from clsplat.training.run_length import FEWEST_ITERATIONS
 
-MOST_GROWTH = 1.25
-"""Factor by which the number of Gaussians grows in a round with ``--size auto``, up to the cap (measured:
-docs/size.md). A factor of 2 would split every Gaussian, wherever it is."""
+WINDOW = 0.1
+"""Fraction of the iterations after which ``--size auto`` raises the cap."""
+
+GROWTH = 1.25
+"""Factor by which the number of Gaussians grows in a round with ``--size auto``, if the rounds before the next cap are
+enough to reach this one (measured: docs/size.md)."""
+
+MOST_GROWTH = 2.0
+"""Largest factor of a round with ``--size auto``: every Gaussian is split."""
 
 
 class Growth(Protocol):
@@ -30,9 +36,9 @@ class Growth(Protocol):
 class Schedule:
     """Rounds at equal intervals, and growth by equal factors to the cap.
 
-    With ``--size auto``, which raises the cap step by step, the factor is `MOST_GROWTH`, whatever the length of the
-    run. Runs shorter than `FEWEST_ITERATIONS` therefore have shorter intervals, in proportion: as many rounds as that
-    run, and as much growth.
+    With ``--size auto``, which raises the cap step by step, the factor is `GROWTH`, and larger only where the cap is
+    far away: a scene of few points. Runs shorter than `FEWEST_ITERATIONS` have shorter intervals, in proportion: as
+    many rounds as that run, and as much growth.
 
     Raises
     ------
@@ -49,6 +55,7 @@ class Schedule:
         self.stepwise = config.size == "auto"
         share = min(1.0, config.iterations / FEWEST_ITERATIONS) if self.stepwise else 1.0
         self.every, self.growth = max(1, round(settings.every * share)), settings.growth
+        self.rounds = round(WINDOW * config.iterations) // self.every
         self.start = config.shortened(settings.start)
         self.full = round(settings.full_fraction * config.iterations)
         self.stop = round(settings.stop_fraction * config.iterations)
@@ -60,12 +67,14 @@ class Schedule:
     def count_after(self, iteration: int, n: int, cap: int) -> int:
         """Number of Gaussians after a round that began with n.
 
-        With ``--size auto`` it grows by `MOST_GROWTH`. Otherwise it grows by a fixed fraction, and by at least the
+        With ``--size auto`` it grows by `GROWTH`, or as much as reaches the cap one round before the next one, up to
+        `MOST_GROWTH`. Otherwise it grows by a fixed fraction, and by at least the
         equal factor that reaches the cap in the remaining rounds of the growth phase. It never falls.
         """
         if n >= cap:
             return n
         if self.stepwise:
-            return min(cap, ceil(n * MOST_GROWTH))
+            factor = (cap / n) ** (1 / max(1, self.rounds - 1))
+            return min(cap, ceil(n * min(MOST_GROWTH, max(GROWTH, factor))))
         rounds = max(1, self.full // self.every - iteration // self.every + 1)
         return min(cap, round(n * max(1 + self.growth, (cap / n) ** (1 / rounds))))
