@@ -272,14 +272,13 @@ class ErrorConfig:
 class FewViewsConfig:
     """Settings for few photos (reasons: clsplat.training.few_views; effects: docs/stability.md)."""
 
-    below: Annotated[int, within(least=0)] = 9
+    below: Annotated[int, within(least=0)] = 17
     """Number of training photos below which the other settings of this group apply (0: never)."""
     dropout: PartialFraction = 0.2
     """Fraction of the splats left out of each image at the end of the training (DropGaussian)."""
-    sh_degree: Literal[0, 1, 2, 3] = 1
-    """Highest degree of the spherical harmonics."""
-    growth: Positive = 2.0
-    """Largest number of Gaussians, as a multiple of the scene's points."""
+    growth: Positive = 4.0
+    """Largest number of Gaussians, as a multiple of the scene's points. With --size auto, the pixels of a photo may
+    allow more."""
 
 
 @dataclass(frozen=True)

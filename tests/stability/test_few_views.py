@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.bench.stability.small import CONFIG, small_scene, with_train
+from clsplat.bench.stability.small import CONFIG, SIZE, small_scene, with_train
 from clsplat.evaluate import mean_metrics
 from clsplat.renderer import Renderer
 from clsplat.training import few_views
@@ -42,18 +42,24 @@ def test_three_photos_do_not_overfit(scene, device, tmp_path):
 def test_settings_for_few_photos(scene):
     config = replace(CONFIG, max_gaussians=None)
     few = few_views.adapted(config, scene)
-    assert (few.init.sh_degree, few.max_gaussians, few.dropout) == (1, 2 * len(scene.points), 0.2)
-    assert few.init.opacity == 0.1
+    assert (few.max_gaussians, few.dropout, few.init.opacity) == (4 * len(scene.points), 0.2, 0.1)
     given = replace(config, init=replace(config.init, opacity=0.3))
     assert few_views.adapted(given, scene).init.opacity == 0.3
     assert few_views.adapted(few, scene) == few, "a resumed run, and one from its config.json, continue"
     assert few_views.adapted(replace(config, max_gaussians=7), scene).max_gaussians == 7
-    assert few_views.adapted(replace(config, size="auto"), scene) == few, "too few photos to search for the size"
+    pixels = SIZE[0] * SIZE[1]
+    assert len(scene.points) * 4 < pixels
+    assert few_views.adapted(replace(config, size="auto"), scene) == replace(few, max_gaussians=pixels), (
+        "without a search, there may be as many as a search may find"
+    )
+    many = replace(scene, points=np.tile(scene.points, (3, 1)))
+    assert few_views.adapted(replace(config, size="auto"), many).max_gaussians == 4 * len(many.points) > pixels
     pointless = replace(scene, points=scene.points[:0])
     assert few_views.adapted(config, pointless).max_gaussians is None, "a random start has the configuration's cap"
     sought = few_views.adapted(replace(config, size="auto"), pointless)
-    assert (sought.size, sought.max_gaussians) == ("fixed", 2 * start_count(pointless, sought.init, None))
-    assert few_views.adapted(config, replace(scene, train=scene.train * 3)) == config
+    assert (sought.size, sought.max_gaussians) == ("fixed", 4 * start_count(pointless, sought.init, None))
+    assert few_views.adapted(config, replace(scene, train=scene.train * 5)) != config
+    assert few_views.adapted(config, replace(scene, train=scene.train * 6)) == config, "18 photos"
 
 
 def test_dropout_is_part_of_the_training_and_rises(scene, device, tmp_path, monkeypatch):

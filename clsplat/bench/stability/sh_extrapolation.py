@@ -37,14 +37,14 @@ def unseen_side(degree: Degree, device: Device) -> float:
 
 
 def _extrapolation(device: Device) -> Found:
-    degrees: dict[Degree, str] = {3: "degree 3", 1: "--few.sh-degree 1", 0: "--few.sh-degree 0"}
+    degrees: dict[Degree, str] = {3: "degree 3", 1: "--init.sh-degree 1", 0: "--few.sh-degree 0"}
     return Found([Figure(label, unseen_side(degree, device), "dB") for degree, label in degrees.items()])
 
 
 EXTRAPOLATION = Experiment(
     failure="SH extrapolation",
     source="bands that no photo constrains",
-    remedy="fewer bands, chosen automatically when there are few photos (`--few.sh-degree`)",
+    remedy="fewer bands (`--init.sh-degree`), where a scene is seen from sides that no photo shows",
     test="tests/stability/test_views.py::test_unseen_sides_keep_their_colour",
     measure=_extrapolation,
     figure="PSNR of photos from the unseen side; trained on 4 photos of a quarter of a circle whose brightness "
