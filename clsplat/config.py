@@ -276,9 +276,9 @@ class FewViewsConfig:
     """Number of training photos below which the other settings of this group apply (0: never)."""
     dropout: PartialFraction = 0.2
     """Fraction of the splats left out of each image at the end of the training (DropGaussian)."""
-    growth: Positive = 4.0
-    """Largest number of Gaussians, as a multiple of the scene's points. With --size auto, the pixels of a photo may
-    allow more."""
+    growth: Positive = 8.0
+    """Largest number of Gaussians, as a multiple of the scene's points. Small photos, with fewer pixels than that,
+    have one per pixel, or half the multiple if this is more."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Adaptation of a configuration to few photos, which many arrangements of Gaussians fit equally well.
 
-With few photos none is held back to choose the number of Gaussians by: each shows what no other does, and two or three
-do not decide. Splats are left out at random, so that none is indispensable, which generalises better to other
+With few photos none is held back to choose the number of Gaussians by: each shows what no other does, and two or
+three do not decide. Splats are left out at random, so that none is indispensable, which generalises better to other
 viewpoints (Park et al. 2025, "DropGaussian").
 """
 
@@ -9,8 +9,9 @@ from dataclasses import replace
 
 from clsplat.config import TrainConfig
 from clsplat.scene import Scene
-from clsplat.training.autosize.rule import RANDOM_START, reach
+from clsplat.training.autosize.rule import PER_PIXEL, RANDOM_START
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
+from clsplat.training.run_length import largest_photo
 
 OPACITY = 0.1
 """Opacity of the first Gaussians, as the paper's, unless it is given (measured: docs/howto/strategies.md). With few
@@ -21,21 +22,23 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Adapt a configuration to the number of training photos.
 
     With fewer than `config.few.below` dropout is on, the first Gaussians are fainter, and the number of Gaussians is
-    not searched but bounded: by a multiple of the points, or with ``--size auto`` by the pixels, if these allow more.
+    not searched but bounded by a multiple of the points; for small photos by half of it, or one per pixel.
     Otherwise the configuration is returned as it is.
     """
     few = config.few
     if len(scene.train) >= few.below:
         return config
     opacity = OPACITY if config.init.opacity is None else config.init.opacity
-    init, first, least = replace(config.init, opacity=opacity), len(scene.points), 0
+    init, first = replace(config.init, opacity=opacity), len(scene.points)
     if config.size == "auto":
-        config, least = replace(config, size="fixed"), round(reach(scene))
+        config = replace(config, size="fixed")
         if not first:
             first = init.random_points or RANDOM_START
             init = replace(init, random_points=first)
     cap = config.max_gaussians
     if first:
-        most = min(max(1, round(few.growth * first), least), MOST_GAUSSIANS)
+        pixels = PER_PIXEL * largest_photo(scene)
+        grown = few.growth * first
+        most = max(1, min(round(min(grown, max(grown / 2, pixels))), MOST_GAUSSIANS))
         cap = most if cap is None else min(cap, most)
     return replace(config, init=init, max_gaussians=cap, dropout=max(config.dropout, few.dropout))

@@ -91,8 +91,8 @@ def prepare(
     few = adapted(config, scene)
     if few != config:
         tell(
-            f"few photos: with fewer than {config.few.below} none is held back to choose the number of Gaussians, and "
-            "some Gaussians are left out of each image (--few.below 0 trains as with many)"
+            f"few photos: with fewer than {config.few.below} none is held back to choose the number of Gaussians, "
+            "and some Gaussians are left out of each image (--few.below 0 trains as with many)"
         )
     check_memory(scene, few, device or open_device(config), tell)
     return scene, few

@@ -223,22 +223,18 @@ def growth_bounds(config: TrainConfig) -> list[int]:
 def growth_window(config: TrainConfig) -> int:
     """Iterations in a window of growth.
 
-    In its first part the number of Gaussians grows, in its second half the scene is validated: Gaussians that have just
-    been split are worse before they are better.
+    In its first part the number of Gaussians grows, in its second half the scene is validated: Gaussians that have
+    just been split are worse before they are better.
     """
     return max(1, round(WINDOW * config.iterations))
 
 
 def start(scene: Scene, n: int, config: TrainConfig) -> "Search":
     """The search before the first iteration, with n Gaussians."""
-    growing = max(1, len(growth_bounds(config)) - 1)  # the first window has the first Gaussians
-    return Search(n, max(PACE, reach(scene) / n) ** (1 / growing))
-
-
-def reach(scene: Scene) -> float:
-    """Number of Gaussians that the pixels of the photos allow."""
     pixels = largest_photo(scene)
-    return PER_PIXEL * min(pixels, sqrt(pixels * SMALL_PHOTO))
+    reach = PER_PIXEL * min(pixels, sqrt(pixels * SMALL_PHOTO))
+    growing = max(1, len(growth_bounds(config)) - 1)  # the first window has the first Gaussians
+    return Search(n, max(PACE, reach / n) ** (1 / growing))
 
 
 def validation_times(config: TrainConfig) -> set[int]:

@@ -11,8 +11,8 @@ WINDOW = 0.1
 """Fraction of the iterations after which ``--size auto`` raises the cap."""
 
 GROWTH = 1.25
-"""Factor by which the number of Gaussians grows in a round with ``--size auto``, if the rounds before the next cap are
-enough to reach this one (measured: docs/size.md)."""
+"""Factor by which the number of Gaussians grows in a round with ``--size auto``, if the rounds before the next cap
+are enough to reach this one (measured: docs/size.md)."""
 
 MOST_GROWTH = 2.0
 """Largest factor of a round with ``--size auto``: every Gaussian is split."""
