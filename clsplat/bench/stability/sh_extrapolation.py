@@ -37,7 +37,7 @@ def unseen_side(degree: Degree, device: Device) -> float:
 
 
 def _extrapolation(device: Device) -> Found:
-    degrees: dict[Degree, str] = {3: "degree 3", 1: "--init.sh-degree 1", 0: "--few.sh-degree 0"}
+    degrees: dict[Degree, str] = {3: "degree 3", 1: "--init.sh-degree 1", 0: "--init.sh-degree 0"}
     return Found([Figure(label, unseen_side(degree, device), "dB") for degree, label in degrees.items()])
 
 
