@@ -120,7 +120,7 @@ class InitConfig:
     """Half edge of the box of a random start, as a fraction of the cameras' mean distance from the point they look
     at. For NeRF-synthetic scenes (distance 4) the box is that of the original within 3 %."""
     opacity: Annotated[float | None, within(above=0, below=1)] = None
-    """Opacity of the first Gaussians. Default: the strategy's, which is 0.1 for adc, 0.5 for mcmc and error."""
+    """Opacity of the first Gaussians. Default: the strategy's, which is 0.1 for adc and error, 0.5 for mcmc."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """Highest degree of the spherical harmonics."""
 

@@ -13,23 +13,18 @@ from clsplat.training.autosize.rule import PER_PIXEL, RANDOM_START
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.run_length import largest_photo
 
-OPACITY = 0.1
-"""Opacity of the first Gaussians, as the paper's, unless it is given (measured: docs/howto/strategies.md). With few
-photos, what is hidden behind opaque Gaussians is not corrected by another photo."""
-
 
 def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Adapt a configuration to the number of training photos.
 
-    With fewer than `config.few.below` dropout is on, the first Gaussians are fainter, and the number of Gaussians is
-    not searched but bounded by a multiple of the points; for small photos by half of it, or one per pixel.
-    Otherwise the configuration is returned as it is.
+    With fewer than `config.few.below` dropout is on, and the number of Gaussians is not searched but bounded by a
+    multiple of the points; for small photos by half of it, or one per pixel. Otherwise the configuration is returned
+    as it is.
     """
     few = config.few
     if len(scene.train) >= few.below:
         return config
-    opacity = OPACITY if config.init.opacity is None else config.init.opacity
-    init, first = replace(config.init, opacity=opacity), len(scene.points)
+    init, first = config.init, len(scene.points)
     if config.size == "auto":
         config = replace(config, size="fixed")
         if not first:

@@ -42,12 +42,10 @@ def test_three_photos_do_not_overfit(scene, device, tmp_path):
 def test_settings_for_few_photos(scene):
     config, points = replace(CONFIG, max_gaussians=None), len(scene.points)
     few = few_views.adapted(config, scene)
-    assert (few.max_gaussians, few.dropout, few.init.opacity) == (8 * points, 0.2, 0.1)
+    assert (few.max_gaussians, few.dropout) == (8 * points, 0.2)
     for times, most in ((2, SIZE[0] * SIZE[1]), (3, 12 * points)):  # 2400 and 3600 are more than the pixels
         more = replace(scene, points=np.tile(scene.points, (times, 1)))
         assert few_views.adapted(config, more).max_gaussians == most
-    given = replace(config, init=replace(config.init, opacity=0.3))
-    assert few_views.adapted(given, scene).init.opacity == 0.3
     assert few_views.adapted(few, scene) == few, "a resumed run, and one from its config.json, continue"
     assert few_views.adapted(replace(config, max_gaussians=7), scene).max_gaussians == 7
     assert few_views.adapted(replace(config, size="auto"), scene) == few, "too few photos to search for the size"

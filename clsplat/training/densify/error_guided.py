@@ -51,7 +51,6 @@ class ErrorGuided(Strategy):
     surveys count less. They keep what only photos outside the present survey show.
     """
 
-    start_opacity = 0.5  # as mcmc
     leaves_room = True
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
