@@ -52,7 +52,7 @@ METRICS = {
 COSTS = {
     "seconds": Quantity("training time", "s", _two_digits),
     "cpu_seconds": Quantity("processor time", "s", _two_digits),
-    "num_gaussians": Quantity("Gaussians", "", short),
+    "num_gaussians": Quantity("Gaussians", "", lambda v: short(round(v))),
     "spz_bytes": Quantity("model file", "MB", _megabytes),
     "memory_bytes": Quantity("device memory", "MB", _megabytes),
     "fps": Quantity("rendering speed", "frames/s", _two_digits, less_is_better=False),
