@@ -203,7 +203,7 @@ __kernel void bin_prepare(const uint n, const int width, const int height, const
     const ints large = (rows > COVER_ROWS) | (right - left > COVER_COLUMNS);
     ints packed[COVER_ROWS / 4] = {0, 0, 0};
     FOR_ROWS(k, most) {
-        const ints row = begins[k] - left | ends[k] - left << 4;
+        const ints row = (begins[k] - left) | (ends[k] - left) << 4;
         packed[k / 4] |= begins[k] < ends[k] ? row << 8 * (k % 4) : none;
     }
     for (uint lane = 0; lane < LANES && i + lane < n; ++lane) {
@@ -232,24 +232,20 @@ static inline uint run_begin(uint n, uint runs, uint run) {
     return (uint)((ulong)n * run / runs);
 }
 
-// Number of splats whose values are loaded together, so that their cache misses overlap.
-#define BATCH 32
+// Number of visits after which a splat is visited whose values are fetched now: cache misses then overlap.
+#define AHEAD 32
 
-typedef struct {
-    uint g[BATCH], slot[BATCH];
-    Cover cover[BATCH];
-} Batch;
-
-static inline uint load_batch(uint begin, uint end, int by_index, const __global uint *order,
-                              const __global Cover *covers, const __global uint *first_slots, Batch *batch) {
-    const uint count = min(end - begin, (uint)BATCH);
-    for (uint k = 0; k < count; ++k) {
-        const uint g = by_index ? begin + k : order[begin + k];
-        batch->g[k] = g;
-        batch->cover[k] = covers[g];
-        batch->slot[k] = first_slots ? first_slots[g] : 0;
+static inline uint splat_of_visit(uint i, uint end, int by_index, const __global uint *order,
+                                  const __global Cover *covers, const __global uint *first_slots) {
+    if (by_index)
+        return i;
+    if (i + AHEAD < end) {
+        const uint next = order[i + AHEAD];
+        FETCH_TO_READ(&covers[next]);
+        if (first_slots)
+            FETCH_TO_READ(&first_slots[next]);
     }
-    return count;
+    return order[i];
 }
 
 __kernel void bin_histogram(const uint n, const uint runs, const uint tile_count, const int width, const int height,
@@ -261,12 +257,10 @@ __kernel void bin_histogram(const uint n, const uint runs, const uint tile_count
     counters += (size_t)tile_count * run;
     for (uint t = 0; t < tile_count; ++t)
         counters[t] = 0;
-    Batch batch;
     const uint end = run_begin(n, runs, run + 1);
-    for (uint first = run_begin(n, runs, run); first < end; first += BATCH) {
-        const uint count = load_batch(first, end, by_index, order, covers, 0, &batch);
-        for (uint k = 0; k < count; ++k)
-            walk_tiles(TALLY, batch.g[k], batch.cover[k], GEOMETRY_GIVEN, width, height, 0, 0, counters, 0, 0);
+    for (uint i = run_begin(n, runs, run); i < end; ++i) {
+        const uint g = splat_of_visit(i, end, by_index, order, covers, 0);
+        walk_tiles(TALLY, g, covers[g], GEOMETRY_GIVEN, width, height, 0, 0, counters, 0, 0);
     }
 }
 
@@ -295,13 +289,11 @@ __kernel void bin_scatter(const uint n, const uint runs, const uint tile_count, 
     counters += (size_t)tile_count * run;
     for (uint t = 0; t < tile_count; ++t)
         counters[t] += tile_begins[t];
-    Batch batch;
     const uint end = run_begin(n, runs, run + 1);
-    for (uint first = run_begin(n, runs, run); first < end; first += BATCH) {
-        const uint count = load_batch(first, end, by_index, order, covers, GRADIENTS ? first_slots : 0, &batch);
-        for (uint k = 0; k < count; ++k)
-            walk_tiles(SCATTER, batch.g[k], batch.cover[k], GEOMETRY_GIVEN, width, height, 0, batch.slot[k], counters,
-                       gauss_ids, slots);
+    for (uint i = run_begin(n, runs, run); i < end; ++i) {
+        const uint g = splat_of_visit(i, end, by_index, order, covers, GRADIENTS ? first_slots : 0);
+        const uint slot = GRADIENTS ? first_slots[g] : 0;
+        walk_tiles(SCATTER, g, covers[g], GEOMETRY_GIVEN, width, height, 0, slot, counters, gauss_ids, slots);
     }
 }
 
