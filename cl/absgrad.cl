@@ -6,11 +6,11 @@
 //
 // Mapping: absgrad_tiles has one work-group of BATCH work-items per tile, one work-item per splat of a batch. The pixels
 // of the tile pass from work-item to work-item, in the diagonal scheme of composite_gpu.cl; with a BATCH of 1, for CPUs,
-// one work-item walks the list and the pixels. absgrad_sum has one work-item per splat, in depth order, which adds up
-// its records in the order of their slots.
+// one work-item walks the list and the pixels. absgrad_sum has one work-item per splat, which adds up its records in the
+// order of their slots.
 //
-// Buffers: N splats packed as in composite_splats.h; gauss_ids[M], tile_ranges[T,2], slots[M], order[N],
-//   first_slots[N+1] as in bin.cl; C channels
+// Buffers: N splats packed as in composite_splats.h; gauss_ids[M], tile_ranges[T,2], slots[M], first_slots[N+1]
+//   as in bin.cl; C channels
 //   in   image[H,W,C], alpha[H,W] as composited; v_image[H,W,C], v_alpha[H,W]
 //   out  records[M,2], sums of a splat and a tile; sums[N,2], px^-1
 // Local memory, in reals: TILE^2 (2 + CHANNELS).
@@ -86,8 +86,8 @@ absgrad_tiles(const int width, const int height, const __global Splat *splats, c
     }
 }
 
-__kernel void absgrad_sum(const uint n, const __global uint *order, const __global uint *first_slots,
-                          const __global real *records, __global real *sums) {
+__kernel void absgrad_sum(const uint n, const __global uint *first_slots, const __global real *records,
+                          __global real *sums) {
     const size_t i = get_global_id(0);
     if (i >= n)
         return;
@@ -95,5 +95,5 @@ __kernel void absgrad_sum(const uint n, const __global uint *order, const __glob
     for (uint slot = first_slots[i]; slot < first_slots[i + 1]; ++slot)
         total += load2(records, slot);
     const bool finite = 0 * (total.x + total.y) == 0;
-    store2(sums, order[i], finite ? total : (real2)0);
+    store2(sums, i, finite ? total : (real2)0);
 }

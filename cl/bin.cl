@@ -6,20 +6,21 @@
 // Splats are visited by depth (scheme "global", after a sort of all splats) or by index (scheme "per_tile", which
 // sorts the list of each tile afterwards). A stable distribution to the tiles keeps this order within each list.
 // Steps, with the stages scan and sort in between:
-//   bin_prepare  keys[N], depths as integers with the same order, invisible splats last; ellipses[N], see ellipse.h;
-//                with `by_index` also order[N], the splats in the order of the visits
-//   (sort)       order[N] of scheme "global"
+//   bin_prepare  keys[N], depths as integers with the same order, invisible splats last; covers[N], the tiles of each
+//                splat, and counts[N], their number
+//   (scan)       first_slots[N + 1] (GRADIENTS)
+//   (sort)       order[N] of scheme "global"; kernels with `by_index` do not read it
 // On a CPU, a counting sort by tile. Work-item w has the w-th run of splats, and its own counters:
-//   bin_histogram  counters[W,T], entries per run and tile; counts[N], number of tiles of splat order[i] (GRADIENTS)
+//   bin_histogram  counters[W,T], entries per run and tile
 //   bin_totals     totals[T], entries per tile; the counters become the numbers of entries of the preceding runs
-//   (scan)         tile_begins[T + 1] with their total M, and first_slots[N + 1] (GRADIENTS)
+//   (scan)         tile_begins[T + 1] with their total M
 //   bin_scatter    gauss_ids[M] and slots[M] (GRADIENTS), at the positions given by the counters
 //   bin_ranges     tile_ranges[T,2], begin and end of each tile's list
 // On a GPU, a radix sort by tile, with one work-item per splat:
-//   bin_count    counts[N]
-//   (scan)       first_slots[N + 1]
-//   bin_emit     for each slot the tile, tiles[M], and the index of the splat, slot_gauss[M]
-//   (sort)       the slots by tile, stable, and with GRADIENTS bin_gather
+//   (scan)       positions[N + 1], of the counts in the order of the visits
+//   bin_emit     for each position tiles[M] and entries[M], the slot or without GRADIENTS the splat; owners[M], the
+//                splat of each slot (GRADIENTS)
+//   (sort)       the entries by tile, stable, and with GRADIENTS bin_gather
 //   bin_bisect   tile_ranges[T,2], begin and end of each tile's list, from the sorted tiles
 // Scheme "per_tile" continues with
 //   bin_list_keys  the depth key of each entry
@@ -29,12 +30,14 @@
 // the lists before them. Where M, which is sums[last] of the scan, exceeds this room, these two kernels write nothing;
 // they run again with enough room.
 //
-// Counting and emitting use the same function, walk_tiles, so that they always agree.
-//
 // Buffers: N splats, M intersections, T = tiles_x tiles_y tiles in row-major order, W runs; see above and project.cl.
-// The slots of a splat are adjacent, and numbered in the order of the visits.
+// The slots of a splat are adjacent, and numbered by the index of the splat, then by tile.
 // -DTILE            edge of a tile, px
-// -DGRADIENTS=0|1   1: bin_histogram and bin_scatter also write the arrays for the backward pass
+// -DGRADIENTS=0|1   1: bin_scatter and bin_emit also write the arrays for the backward pass
+// -DLANES=1|8       splats of a work-item of bin_prepare, and rows of tiles that are tested together
+#ifndef LANES
+#error "-DLANES, the number of splats of a work-item, must be given"
+#endif
 #include "common.h"
 #include "ellipse.h"
 
@@ -45,57 +48,119 @@
 #error "-DGRADIENTS must be 0 or 1"
 #endif
 
-// Number of rows of tiles that are tested together.
-#define ROWS        8
-#define ROW_OFFSETS (TILE * (real8)(0, 1, 2, 3, 4, 5, 6, 7))
-
-// Action of walk_tiles on a tile.
-#define COUNT   0 // nothing
-#define LIST    1 // out_a[slot] = tile, out_b[slot] = g
-#define TALLY   2 // ++counters[tile]
-#define SCATTER 3 // out_a[counters[tile]] = g, out_b[counters[tile]++] = slot (GRADIENTS)
-
-// Visits the tiles of splat g with ellipse e, whose slots begin at `slot`. Returns their number.
-static inline uint walk_tiles(const int task, uint g, Ellipse e, int width, int height, uint slot,
-                              __global uint *counters, __global uint *out_a, __global uint *out_b) {
-    if (!(e.half_height > 0))
-        return 0;
-    const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
-    // Rows of tiles within the box. If rounding adds a row, the ellipse does not meet it.
-    const real top = (e.y - e.half_height) / TILE, bottom = (e.y + e.half_height) / TILE;
-    const int begin = top > 0 ? (top < tiles_y ? (int)top : tiles_y) : 0;
-    const int end = bottom > 0 ? (bottom < tiles_y ? (int)bottom + 1 : tiles_y) : 0;
-    uint count = 0;
-    for (int ty = begin; ty < end; ty += ROWS) {
-        // Distances of the first and the last row of pixel centres in each row of tiles, which the image may cut off.
-        const real8 first_row = ROW_OFFSETS + (ty * TILE + (real)0.5);
-        const real8 image_end = height - (real)0.5, tile_end = first_row + (TILE - 1);
-        const real8 last_row = LESSER(tile_end, image_end);
-        real8 x_min, x_max;
-        const mask8 met = ellipse_ranges8(&e, first_row - e.y, last_row - e.y, &x_min, &x_max);
-        int8 first, last;
-        pixels_between8(e.x + x_min, e.x + x_max, width, &first, &last);
-        const int8 listed = TO_INT8(met) & (first <= last);
-        const int8 begins = first / TILE, ends = listed ? last / TILE + 1 : 0;
-        for (int k = 0; k < ROWS && ty + k < end; ++k) {
-            for (int tx = ((const int *)&begins)[k]; tx < ((const int *)&ends)[k]; ++tx, ++count) {
-                const uint tile = (ty + k) * tiles_x + tx;
-                if (task == LIST) {
-                    out_a[slot + count] = tile;
-                    out_b[slot + count] = g;
-                } else if (task == TALLY) {
-                    ++counters[tile];
-                } else if (task == SCATTER) {
-                    const uint position = counters[tile]++;
-                    out_a[position] = g;
-#if GRADIENTS
-                    out_b[position] = slot + count;
+#if LANES == 8
+#define ROW_NUMBERS ((ints)(0, 1, 2, 3, 4, 5, 6, 7))
+#else
+#define ROW_NUMBERS 0
 #endif
-                }
-            }
+
+#define GEOMETRY                                                                                                     \
+    const __global real *means2d, const __global real *conics, const __global real *extents,                         \
+        const __global real *opacities
+#define GEOMETRY_GIVEN means2d, conics, extents, opacities
+
+// The tiles of a splat: in .x the tile at the corner of their box, and in .yzw a byte for each of up to COVER_ROWS rows,
+// the first column in the low nibble and the end of the columns in the high one, both relative to the corner.
+typedef uint4 Cover;
+#define COVER_ROWS    12
+#define COVER_COLUMNS 15
+#define LARGE         UINT_MAX // in .x: the tiles do not fit
+
+// The rows k of a cover, below `end`. Where a work-item takes one splat, the loop is unrolled: GPUs keep arrays that are
+// indexed by constants in registers.
+#if LANES == 1
+#define FOR_ROWS(k, end) _Pragma("unroll") for (int k = 0; k < COVER_ROWS; ++k) if (k < (end))
+#else
+#define FOR_ROWS(k, end) for (int k = 0; k < (end); ++k)
+#endif
+
+static inline int tiles_across(int size) {
+    return (size + TILE - 1) / TILE;
+}
+
+// Rows of tiles within the boxes of ellipses. If rounding adds a row, the ellipse does not meet it.
+static inline void tile_rows(const Ellipses *e, int height, ints *begin, ints *end) {
+    const reals zero = 0, rows = tiles_across(height);
+    const reals top = (e->y - e->half_height) / TILE, bottom = (e->y + e->half_height) / TILE;
+    const ints none = 0, last = TO_INTS(CLAMP(bottom, zero, rows)), row_end = last + 1,
+               image_end = tiles_across(height);
+    *begin = TO_INTS(CLAMP(top, zero, rows));
+    *end = TO_INTS((e->half_height > zero) & (bottom > zero)) ? LESSER(row_end, image_end) : none;
+}
+
+// Columns of tiles from `begin` to before `end` where ellipses meet a pixel centre of a row of tiles. If there is none,
+// end is 0.
+static inline void tile_columns(const Ellipses *e, ints row, int width, int height, ints *begin, ints *end) {
+    // The first and the last row of pixel centres in the row of tiles, which the image may cut off.
+    const reals first_row = REALS_OF(row * TILE) + (real)0.5, image_end = height - (real)0.5;
+    const reals tile_end = first_row + (TILE - 1), last_row = LESSER(tile_end, image_end);
+    reals x_min, x_max;
+    const masks met = ellipse_ranges(e, first_row - e->y, last_row - e->y, &x_min, &x_max);
+    ints first, last;
+    pixels_between(e->x + x_min, e->x + x_max, width, &first, &last);
+    const ints none = 0, column_end = last / TILE + 1;
+    *begin = first / TILE;
+    *end = TO_INTS(met) & (first <= last) ? column_end : none;
+}
+
+// Action on a tile of splat g.
+#define COUNT   0 // nothing
+#define TALLY   1 // ++counters[tile]
+#define SCATTER 2 // out_a[counters[tile]] = g, out_b[counters[tile]++] = slot (GRADIENTS)
+#define LIST    3 // out_a[position] = tile, out_b[position] = slot, or g without GRADIENTS
+
+static inline void visit(const int task, uint g, uint tile, uint position, uint slot, __global uint *counters,
+                         __global uint *out_a, __global uint *out_b) {
+    if (task == TALLY) {
+        ++counters[tile];
+    } else if (task == SCATTER) {
+        const uint at = counters[tile]++;
+        out_a[at] = g;
+#if GRADIENTS
+        out_b[at] = slot;
+#endif
+    } else if (task == LIST) {
+        out_a[position] = tile;
+        out_b[position] = GRADIENTS ? slot : g;
+    }
+}
+
+// Visits the tiles of an ellipse that all lanes hold. Returns their number.
+static inline uint walk_ellipse(const int task, uint g, const Ellipses *e, int width, int height, uint position,
+                                uint slot, __global uint *counters, __global uint *out_a, __global uint *out_b) {
+    ints begin, end;
+    tile_rows(e, height, &begin, &end);
+    uint count = 0;
+    for (int row = INT_LANE(begin, 0); row < INT_LANE(end, 0); row += LANES) {
+        ints begins, ends;
+        tile_columns(e, row + ROW_NUMBERS, width, height, &begins, &ends);
+        for (int k = 0; k < LANES && row + k < INT_LANE(end, 0); ++k) {
+            for (int column = INT_LANE(begins, k); column < INT_LANE(ends, k); ++column, ++count)
+                visit(task, g, (row + k) * tiles_across(width) + column, position + count, slot + count, counters,
+                      out_a, out_b);
         }
     }
     return count;
+}
+
+// Visits the tiles of splat g, whose positions and slots begin at `position` and `slot`.
+static inline void walk_tiles(const int task, uint g, Cover cover, GEOMETRY, int width, int height, uint position,
+                              uint slot, __global uint *counters, __global uint *out_a, __global uint *out_b) {
+    if (cover.x == LARGE) {
+        const reals2 centre = {means2d[2 * g], means2d[2 * g + 1]}, extent = {extents[2 * g], extents[2 * g + 1]};
+        const reals3 conic = {conics[3 * g], conics[3 * g + 1], conics[3 * g + 2]};
+        const Ellipses e = ellipses_of(centre, conic, opacities[g], extent);
+        walk_ellipse(task, g, &e, width, height, position, slot, counters, out_a, out_b);
+        return;
+    }
+    const uint rows[3] = {cover.y, cover.z, cover.w};
+    for (int k = 0; k < 3; ++k) {
+        uint corner = cover.x + 4 * k * tiles_across(width);
+        for (uint row = rows[k]; row; row >>= 8, corner += tiles_across(width)) {
+            for (uint column = row & 15; column < (row >> 4 & 15); ++column)
+                visit(task, g, corner + column, position++, slot++, counters, out_a, out_b);
+        }
+    }
 }
 
 #ifdef USE_DOUBLE
@@ -108,26 +173,52 @@ typedef uint depth_key;
 #define LAST   UINT_MAX
 #endif
 
-// The bits of positive floating-point numbers have the same order as the numbers. A work-item takes eight splats,
-// because on CPUs a vector logarithm is faster than a scalar one.
-__kernel void bin_prepare(const uint n, const int by_index, const __global real *means2d, const __global real *conics,
-                          const __global real *depths, const __global real *extents, const __global real *opacities,
-                          __global depth_key *keys, __global Ellipse *ellipses, __global uint *order) {
-    const uint begin = 8 * get_global_id(0);
-    if (begin >= n)
+// The bits of positive floating-point numbers have the same order as the numbers. Counting and emitting read the same
+// covers, so that they agree.
+__kernel void bin_prepare(const uint n, const int width, const int height, const __global real *depths, GEOMETRY,
+                          __global depth_key *keys, __global Cover *covers, __global uint *counts) {
+    const uint i = LANES * get_global_id(0);
+    if (i >= n)
         return;
-    const uint end = min(n, begin + 8);
-    real8 r2 = 0;
-    for (uint i = begin; i < end; ++i)
-        ((real *)&r2)[i - begin] = opacities[i];
-    r2 = ellipse_r2_8(r2);
-    for (uint i = begin; i < end; ++i) {
-        const real2 centre = (real2)(means2d[2 * i], means2d[2 * i + 1]);
-        const real2 extent = (real2)(extents[2 * i], extents[2 * i + 1]);
-        keys[i] = extent.x > 0 ? AS_KEY(depths[i]) : LAST;
-        ellipses[i] = ellipse_of(centre, load3(conics, i), ((const real *)&r2)[i - begin], extent);
-        if (by_index)
-            order[i] = i;
+    const Ellipses e = ellipses_of(load_vectors2(means2d, i, n), load_vectors3(conics, i, n),
+                                   load_numbers(opacities, i, n), load_vectors2(extents, i, n));
+    ints row_begin, row_end;
+    tile_rows(&e, height, &row_begin, &row_end);
+    const ints rows = row_end - row_begin, none = 0;
+    int most = 0;
+    for (int lane = 0; lane < LANES; ++lane)
+        most = GREATER(most, INT_LANE(rows, lane));
+    most = LESSER(most, COVER_ROWS);
+    ints begins[COVER_ROWS], ends[COVER_ROWS], count = 0, left = tiles_across(width), right = 0;
+    FOR_ROWS(k, most) {
+        const ints row = row_begin + k;
+        tile_columns(&e, row, width, height, &begins[k], &ends[k]);
+        ends[k] = row < row_end ? ends[k] : none;
+        begins[k] = LESSER(begins[k], ends[k]);
+        left = begins[k] < ends[k] ? LESSER(left, begins[k]) : left;
+        right = GREATER(right, ends[k]);
+        count += ends[k] - begins[k];
+    }
+    const ints corner = row_begin * tiles_across(width) + left;
+    const ints large = (rows > COVER_ROWS) | (right - left > COVER_COLUMNS);
+    ints packed[COVER_ROWS / 4] = {0, 0, 0};
+    FOR_ROWS(k, most) {
+        const ints row = (begins[k] - left) | (ends[k] - left) << 4;
+        packed[k / 4] |= begins[k] < ends[k] ? row << 8 * (k % 4) : none;
+    }
+    for (uint lane = 0; lane < LANES && i + lane < n; ++lane) {
+        const uint g = i + lane;
+        keys[g] = LANE(e.half_height, lane) > 0 ? AS_KEY(depths[g]) : LAST;
+        covers[g] = (uint4)(INT_LANE(corner, lane), INT_LANE(packed[0], lane), INT_LANE(packed[1], lane),
+                            INT_LANE(packed[2], lane));
+        counts[g] = INT_LANE(count, lane);
+        if (INT_LANE(large, lane)) {
+            covers[g].x = LARGE;
+            const Ellipses same = {
+                LANE(e.x, lane),        LANE(e.y, lane),     LANE(e.half_height, lane), LANE(e.inv_half_height, lane),
+                LANE(e.at_right, lane), LANE(e.slope, lane), LANE(e.half_sq, lane)};
+            counts[g] = walk_ellipse(COUNT, g, &same, width, height, 0, 0, 0, 0, 0);
+        }
     }
 }
 
@@ -141,34 +232,35 @@ static inline uint run_begin(uint n, uint runs, uint run) {
     return (uint)((ulong)n * run / runs);
 }
 
-// Number of ellipses that are loaded together, so that their cache misses overlap.
-#define BATCH 32
+// Number of visits after which a splat is visited whose values are fetched now: cache misses then overlap.
+#define AHEAD 32
 
-static inline void gather(uint begin, uint end, const __global uint *order, const __global Ellipse *ellipses,
-                          Ellipse *batch) {
-    for (uint i = begin; i < min(end, begin + BATCH); ++i)
-        batch[i - begin] = ellipses[order[i]];
+static inline uint splat_of_visit(uint i, uint end, int by_index, const __global uint *order,
+                                  const __global Cover *covers, const __global uint *first_slots) {
+    if (by_index)
+        return i;
+    if (i + AHEAD < end) {
+        const uint next = order[i + AHEAD];
+        FETCH_TO_READ(&covers[next]);
+        if (first_slots)
+            FETCH_TO_READ(&first_slots[next]);
+    }
+    return order[i];
 }
 
 __kernel void bin_histogram(const uint n, const uint runs, const uint tile_count, const int width, const int height,
-                            const __global uint *order, const __global Ellipse *ellipses, __global uint *counters,
-                            __global uint *counts) {
+                            const int by_index, const __global uint *order, const __global Cover *covers, GEOMETRY,
+                            __global uint *counters) {
     if (get_global_id(0) >= runs)
         return;
     const uint run = run_of(get_global_id(0), runs);
     counters += (size_t)tile_count * run;
     for (uint t = 0; t < tile_count; ++t)
         counters[t] = 0;
-    Ellipse batch[BATCH];
     const uint end = run_begin(n, runs, run + 1);
-    for (uint first = run_begin(n, runs, run); first < end; first += BATCH) {
-        gather(first, end, order, ellipses, batch);
-        for (uint i = first; i < min(end, first + BATCH); ++i) {
-            const uint count = walk_tiles(TALLY, 0, batch[i - first], width, height, 0, counters, 0, 0);
-#if GRADIENTS
-            counts[i] = count;
-#endif
-        }
+    for (uint i = run_begin(n, runs, run); i < end; ++i) {
+        const uint g = splat_of_visit(i, end, by_index, order, covers, 0);
+        walk_tiles(TALLY, g, covers[g], GEOMETRY_GIVEN, width, height, 0, 0, counters, 0, 0);
     }
 }
 
@@ -187,9 +279,9 @@ __kernel void bin_totals(const uint runs, const uint tile_count, __global uint *
 }
 
 __kernel void bin_scatter(const uint n, const uint runs, const uint tile_count, const int width, const int height,
-                          const __global uint *order, const __global Ellipse *ellipses, __global uint *counters,
-                          const __global uint *tile_begins, const __global uint *first_slots, const uint room,
-                          const uint last, const __global ulong *sums, __global uint *gauss_ids,
+                          const int by_index, const __global uint *order, const __global Cover *covers, GEOMETRY,
+                          __global uint *counters, const __global uint *tile_begins, const __global uint *first_slots,
+                          const uint room, const uint last, const __global ulong *sums, __global uint *gauss_ids,
                           __global uint *slots) {
     if (get_global_id(0) >= runs || sums[last] > room)
         return;
@@ -197,34 +289,30 @@ __kernel void bin_scatter(const uint n, const uint runs, const uint tile_count, 
     counters += (size_t)tile_count * run;
     for (uint t = 0; t < tile_count; ++t)
         counters[t] += tile_begins[t];
-    Ellipse batch[BATCH];
     const uint end = run_begin(n, runs, run + 1);
-    for (uint first = run_begin(n, runs, run); first < end; first += BATCH) {
-        gather(first, end, order, ellipses, batch);
-        for (uint i = first; i < min(end, first + BATCH); ++i) {
-#if GRADIENTS
-            const uint slot = first_slots[i];
-#else
-            const uint slot = 0;
-#endif
-            walk_tiles(SCATTER, order[i], batch[i - first], width, height, slot, counters, gauss_ids, slots);
-        }
+    for (uint i = run_begin(n, runs, run); i < end; ++i) {
+        const uint g = splat_of_visit(i, end, by_index, order, covers, GRADIENTS ? first_slots : 0);
+        const uint slot = GRADIENTS ? first_slots[g] : 0;
+        walk_tiles(SCATTER, g, covers[g], GEOMETRY_GIVEN, width, height, 0, slot, counters, gauss_ids, slots);
     }
 }
 
-__kernel void bin_count(const uint n, const int width, const int height, const __global uint *order,
-                        const __global Ellipse *ellipses, __global uint *counts) {
+__kernel void bin_emit(const uint n, const int width, const int height, const int by_index,
+                       const __global uint *order, const __global Cover *covers, GEOMETRY,
+                       const __global uint *positions, const __global uint *first_slots, const uint room,
+                       const uint last, const __global ulong *sums, __global uint *tiles, __global uint *entries,
+                       __global uint *owners) {
     const uint i = get_global_id(0);
-    if (i < n)
-        counts[i] = walk_tiles(COUNT, 0, ellipses[order[i]], width, height, 0, 0, 0, 0);
-}
-
-__kernel void bin_emit(const uint n, const int width, const int height, const __global uint *order,
-                       const __global Ellipse *ellipses, const __global uint *first_slots, const uint room,
-                       const uint last, const __global ulong *sums, __global uint *tiles, __global uint *slot_gauss) {
-    const uint i = get_global_id(0);
-    if (i < n && sums[last] <= room)
-        walk_tiles(LIST, order[i], ellipses[order[i]], width, height, first_slots[i], 0, tiles, slot_gauss);
+    if (i >= n || sums[last] > room)
+        return;
+    const uint g = by_index ? i : order[i];
+    uint slot = 0;
+#if GRADIENTS
+    slot = first_slots[g];
+    for (uint s = slot; s < first_slots[g + 1]; ++s)
+        owners[s] = g;
+#endif
+    walk_tiles(LIST, g, covers[g], GEOMETRY_GIVEN, width, height, positions[i], slot, 0, tiles, entries);
 }
 
 // Index of the first of the m sorted tiles that is not below t.

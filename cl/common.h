@@ -75,6 +75,15 @@ typedef int16 mask16;
 #define TO_INT4(x)  convert_int4(x)
 #define TO_INT16(x) ((int16)(TO_INT8((x).lo), TO_INT8((x).hi)))
 
+// Prefetches memory to read or to write, where addresses are random. Only for kernels on the host's processor, where addresses are ordinary pointers.
+#if defined(__clang__) && (defined(__x86_64__) || defined(__aarch64__))
+#define FETCH_TO_READ(p)  __builtin_prefetch((const void *)(size_t)(p))
+#define FETCH_TO_WRITE(p) __builtin_prefetch((const void *)(size_t)(p), 1)
+#else
+#define FETCH_TO_READ(p)  ((void)(p))
+#define FETCH_TO_WRITE(p) ((void)(p))
+#endif
+
 static inline real2 load2(const __global real *x, size_t i) {
     return (real2)(x[2 * i], x[2 * i + 1]);
 }

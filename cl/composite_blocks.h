@@ -218,16 +218,6 @@ static inline Blocks blocks_of(const Batch *batch, uint j) {
 #endif
 }
 
-// Prefetches memory to read or to write. Splats and records have random addresses, and a load that misses the nearest
-// caches takes as long as a block. Only for kernels on the host's processor, where addresses are ordinary pointers.
-#if defined(__clang__) && (defined(__x86_64__) || defined(__aarch64__))
-#define FETCH_TO_READ(p)  __builtin_prefetch((const void *)(size_t)(p))
-#define FETCH_TO_WRITE(p) __builtin_prefetch((const void *)(size_t)(p), 1)
-#else
-#define FETCH_TO_READ(p)
-#define FETCH_TO_WRITE(p)
-#endif
-
 // Outlines of a batch of splats (ellipse.h), with splats in lanes.
 typedef struct {
     REALV x[BATCH / LANES], y[BATCH / LANES]; // centre, px

@@ -4,8 +4,7 @@
 //     v_mean2d = -sum_pixels v_sigma (a dx + b dy, b dx + c dy),   v_conic = sum_pixels v_sigma (dx^2/2, dx dy, dy^2/2),
 //     v_opacity = -sum_pixels v_sigma / opacity,                   v_colour = sum_pixels weight v_image
 //
-// Mapping: one work-item per splat, by index (composite_pack) or in depth order (composite_sum, see bin.cl). Buffers
-// as in composite_cpu.cl.
+// Mapping: one work-item per splat. Buffers as in composite_cpu.cl.
 #ifndef CLSPLAT_COMPOSITE_SPLATS_H
 #define CLSPLAT_COMPOSITE_SPLATS_H
 
@@ -13,7 +12,7 @@
 // Of a row of rays: RAY_REALS in gaussian_rays.h.
 #define ROW_REALS (RAYS == 2 ? 17 : 8)
 
-// The outline as in ellipse_of (ellipse.h); r2 in the unit of 2 sigma.
+// The outline as in ellipses_of (ellipse.h); r2 in the unit of 2 sigma.
 static inline Outline outline_of(real2 centre, real2 extent, real3 conic, real level) {
     Outline e = {centre.x, centre.y, extent.y, 0, 0, 0, extent.x * extent.x};
     if (conic.x > 0) {
@@ -72,25 +71,24 @@ __kernel void composite_pack(const uint n, const __global real *means2d, const _
     splats[i] = s;
 }
 
-__kernel void composite_sum(const uint n, const __global uint *order, const __global uint *first_slots,
-                            const __global real *conics, const __global real *opacities, const __global real *records,
-                            __global real *v_means2d, __global real *v_conics,
+__kernel void composite_sum(const uint n, const __global uint *first_slots, const __global real *conics,
+                            const __global real *opacities, const __global real *records, __global real *v_means2d,
+                            __global real *v_conics,
 #if RAYS
                             __global real *v_slopes,
 #endif
                             __global real *v_opacities, __global real *v_colors) {
-    const size_t i = get_global_id(0);
-    if (i >= n)
+    const size_t g = get_global_id(0);
+    if (g >= n)
         return;
     real total[RECORD];
     for (int k = 0; k < RECORD; ++k)
         total[k] = 0;
-    const uint begin = first_slots[i], end = first_slots[i + 1];
+    const uint begin = first_slots[g], end = first_slots[g + 1];
     for (uint slot = begin; slot < end; ++slot) {
         for (int k = 0; k < RECORD; ++k)
             total[k] += records[(size_t)RECORD * slot + k];
     }
-    const uint g = order[i];
 #if RAYS
     const __global real *row = conics + (size_t)ROW_REALS * g; // of rays
     const real3 conic = (real3)(row[2], row[3], row[4]);

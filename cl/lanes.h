@@ -3,6 +3,7 @@
 // `reals` holds one real number per Gaussian, and reals2 to reals4 hold the components of vectors. Arrays in memory
 // hold Gaussians one after the other: chunks of LANES adjacent numbers are loaded, and rearranged by gathered2 to
 // gathered4; scattered2 to scattered4 are the inverse. With one lane, chunks are values, and nothing is rearranged.
+// `ints` holds one integer per Gaussian.
 //
 // The file that includes this documents -DLANES=1|8. Default: 1.
 #ifndef CLSPLAT_LANES_H
@@ -20,7 +21,9 @@
 #if LANES == 8
 typedef real8 reals;
 typedef mask8 masks; // results of comparisons of reals: all bits of a lane are set if it is true
+typedef int8 ints;
 #define OF_LANES(f, x) OF8(f, x)
+#define TO_INTS(x)     TO_INT8(x) // of reals or masks
 #define LANE_NUMBERS   ((reals)(0, 1, 2, 3, 4, 5, 6, 7))
 DEFINE_POWER(8)
 DEFINE_LOGARITHM(8)
@@ -29,7 +32,9 @@ DEFINE_LOGARITHM(8)
 #else
 typedef real reals;
 typedef int masks;
+typedef int ints;
 #define OF_LANES(f, x) f(x)
+#define TO_INTS(x)     ((int)(x))
 #define LANE_NUMBERS   ((reals)0)
 DEFINE_POWER()
 #define POWER          power
@@ -48,7 +53,8 @@ typedef struct {
     reals x, y, z, w;
 } reals4;
 
-#define LANE(v, lane) (((const real *)&(v))[lane])
+#define LANE(v, lane)     (((const real *)&(v))[lane])
+#define INT_LANE(v, lane) (((const int *)&(v))[lane])
 
 static inline bool any_lane(masks m) {
 #if LANES == 8

@@ -212,14 +212,9 @@ static inline Activated activate(reals3 log_scales, reals logit_opacity) {
 
 // Whether the centre of one of `size` pixels lies in [lo, hi].
 static inline masks shows_pixel(reals lo, reals hi, int size) {
-#if LANES == 8
-    int8 first, last;
-    pixels_between8(lo, hi, size, &first, &last);
-    return MASK8_OF(first <= last);
-#else
-    const int2 pixels = pixels_between(lo, hi, size);
-    return pixels.x <= pixels.y;
-#endif
+    ints first, last;
+    pixels_between(lo, hi, size, &first, &last);
+    return MASKS_OF(first <= last);
 }
 
 // The coefficients k with first <= k < last of the Gaussians from i on: values[3 (k - first) + c] for channel c.

@@ -16,7 +16,7 @@
 // written, as a record, to the splat's slot in the unsorted list. removal_sum adds up the records of a splat in a fixed
 // order, with one work-item per splat and without atomics. removal_gpu.cl is the variant for GPUs.
 //
-// Buffers: N, M, T, C and splats as in composite_cpu.cl, order[N], first_slots[N+1], slots[M] as in bin.cl
+// Buffers: N, M, T, C and splats as in composite_cpu.cl, first_slots[N+1], slots[M] as in bin.cl
 //   in   splats[N], gauss_ids[M], tile_ranges[T,2], slots[M], background[C]; residuals[H,W,C], image - target;
 //        mask[H,W] uchar, 1 where pixels count
 //   out  records[M,4+C]; sums[N,4+C]: change of the squared error, sums of |D|^2, of w, of w^2, of w r

@@ -121,15 +121,13 @@ class Bins(NamedTuple):
     """Lists of splats per tile, in depth order.
 
     gauss_ids (M,) uint32 and tile_ranges (T, 2) uint32: tile t, row-major, holds gauss_ids[begin:end], and tile t + 1
-    begins where it ends. order (N,) uint32: the splats in the order of their slots, by depth (ties by index, those
-    not visible last) or by index; first_slots (N + 1,) uint32: splat order[i] owns the slots first_slots[i] to
-    first_slots[i + 1]; slots (M,) uint32: the slot of each entry of gauss_ids. Lists that were made without gradients
-    have None for the last two.
+    begins where it ends. first_slots (N + 1,) uint32: splat i owns the slots first_slots[i] to first_slots[i + 1].
+    slots (M,) uint32: the slot of each entry of gauss_ids. Lists that were made without gradients have None for the
+    last two.
     """
 
     gauss_ids: Any
     tile_ranges: Any
-    order: Any
     first_slots: Any
     slots: Any
     tile_size: int

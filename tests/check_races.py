@@ -94,7 +94,7 @@ def schemes(device):
         expected = reference.bin_splats(splats, 37, 21, 8, scheme=scheme)
         for device.is_cpu in (True, False):
             found = ops.bin_splats(device, arrays, 37, 21, 8, scheme=scheme)
-            for a, b in zip(found[:5], expected[:5], strict=True):
+            for a, b in zip(found[:4], expected[:4], strict=True):
                 np.testing.assert_array_equal(a.get(), b)
             forward = ops.bin_splats(device, arrays, 37, 21, 8, scheme=scheme, gradients=False)
             np.testing.assert_array_equal(forward.gauss_ids.get(), expected.gauss_ids)

@@ -216,7 +216,7 @@ def test_no_path_of_a_machine():
 # Defines that the header of a file documents, with allowed values. Files without defines are not listed.
 DEFINES = {
     "noise": {"GATE_SLOPE": 100.0, "GATE_OPACITY": 0.005},
-    "bin": {"TILE": 16, "GRADIENTS": 1},
+    "bin": {"TILE": 16, "GRADIENTS": 1, "LANES": 8},
     "composite_cpu": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "RAYS": 2},
     "composite_gpu": {"TILE": 8, "CHANNELS": 1, "ITEMS": 32, "BATCH": 16, "SEGMENT": 64, "RAYS": 1, "SUBGROUPS": 0},
     "composite_sorted": {"TILE": 8, "CHANNELS": 1, "LANES": 8, "WINDOW": 2},
@@ -256,6 +256,7 @@ FORBIDDEN = [
     ("absgrad", "RAYS", 1),
     ("bin", "TILE", 0),
     ("bin", "GRADIENTS", 2),
+    ("bin", "LANES", 4),
     ("composite_cpu", "TILE", 12),
     ("composite_cpu", "CHANNELS", 0),
     ("composite_cpu", "LANES", 4),

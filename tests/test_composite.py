@@ -43,8 +43,8 @@ def handmade(means2d, cov, opacities, colors):
 
 
 def on_device(device, splats, bins):
-    arrays = [device.upload("bins", a, np.uint32) for a in bins[:5]]
-    return Splats(*(device.upload("splats", a) for a in splats)), Bins(*arrays, *bins[5:])
+    arrays = [device.upload("bins", a, np.uint32) for a in bins[:4]]
+    return Splats(*(device.upload("splats", a) for a in splats)), Bins(*arrays, *bins[4:])
 
 
 def forward(device, compositor, splats, bins, background):

@@ -31,7 +31,7 @@ def test_stop_and_skip_in_numbers(any_device, compositor):
         [[1, 0, 0], [0, 1, 0], [9, 9, 9], [0, 0, 1], [9, 9, 9], [9, 9, 9]],
     )
     order = np.arange(6)
-    bins = Bins(order, np.array([[0, 6]]), order, np.arange(7), order, 16, 1, 1)
+    bins = Bins(order, np.array([[0, 6]]), np.arange(7), order, 16, 1, 1)
     image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
     weights = 0.95 * np.array([1, 0.05, 0.0025])
     np.testing.assert_allclose(image.rgb[0, 0], weights, rtol=1e-5)
@@ -45,7 +45,7 @@ def test_stop_and_skip_in_numbers(any_device, compositor):
 def test_alpha_is_clamped(any_device, compositor):
     splats = handmade([(0.5, 0.5)], np.eye(2), [1.0], [[1, 1, 1]])
     one = np.zeros(1)
-    bins = Bins(one, np.array([[0, 1]]), one, np.arange(2), one, 16, 1, 1)
+    bins = Bins(one, np.array([[0, 1]]), np.arange(2), one, 16, 1, 1)
     image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(image.alpha, ALPHA_MAX, rtol=1e-6)
 
@@ -87,7 +87,7 @@ def test_negative_sigma_is_skipped(any_device, compositor):
     """A conic that rounding made indefinite: exp(-sigma) would grow without bound along its axis."""
     splats = handmade([(8.0, 8.0)], np.eye(2), [0.5], [[1, 1, 1]])._replace(conics=np.array([[1.0, 1.5, 1.0]]))
     one = np.zeros(1)
-    bins = Bins(one, np.array([[0, 1]]), one, np.arange(2), one, 16, 16, 16)
+    bins = Bins(one, np.array([[0, 1]]), np.arange(2), one, 16, 16, 16)
     image = forward(any_device, compositor, splats, bins, (0.0, 0.0, 0.0))
     i, j = np.indices((16, 16)) + 0.5 - 8
     assert (image.alpha[i * j < 0][np.abs(i + j)[i * j < 0] < 1] == 0).all()

@@ -148,7 +148,7 @@ def test_an_opaque_splat_before_another_in_numbers(each_device):
     colors = np.eye(4)[[0, 1, 2]][:, :3]
     splats = handmade([(0.5, 0.5)] * 3, np.eye(2), [1.0, 1.0, 0.5], colors)
     order = np.arange(3)
-    bins = Bins(order, np.array([[0, 3]]), order, np.arange(4), order, 16, 1, 1)
+    bins = Bins(order, np.array([[0, 3]]), np.arange(4), order, 16, 1, 1)
     found = by_kernel(each_device, splats, bins, np.zeros(3))
     # Seen in front of what lies behind: red 0.99, green 0.0099; without red green 0.99, blue 0.005.
     less = np.array([0.99, 0.0099 - 0.99, 0.00005 - 0.005])
@@ -196,7 +196,7 @@ def test_what_is_too_faint_to_be_drawn_costs_nothing(each_device):
     splats = handmade([(8.0, 8.0)], np.eye(2) * 9, [0.5], [[1, 1, 1]])
     splats = splats._replace(opacities=np.array([0.9 * ALPHA_MIN]))
     one = np.zeros(1)
-    bins = Bins(one, np.array([[0, 1]]), one, np.arange(2), one, 16, 16, 16)
+    bins = Bins(one, np.array([[0, 1]]), np.arange(2), one, 16, 16, 16)
     assert by_kernel(each_device, splats, bins, np.zeros(3)).errors[0] == 0
 
 
@@ -206,7 +206,7 @@ def test_splats_behind_a_finished_tile(each_device):
     rng = np.random.default_rng(0)
     splats = handmade(np.full((n, 2), 0.5), np.eye(2), np.full(n, 0.95), rng.uniform(size=(n, 3)))
     order = np.arange(n)
-    bins = Bins(order, np.array([[0, n]]), order, np.arange(n + 1), order, 16, 1, 1)
+    bins = Bins(order, np.array([[0, n]]), np.arange(n + 1), order, 16, 1, 1)
     each_device.upload("prices per intersection", np.full((n, 7), np.nan))  # what the next of this name will hold
     expected = reference.removal(splats, bins, (50.0, 20.0, 30.0))
     found = by_kernel(each_device, splats, bins, (50.0, 20.0, 30.0))

@@ -46,6 +46,6 @@ def absgrad(device: Device, splats: AnySplats, bins: Bins, image: Image, v_image
     arguments = [bins.width, bins.height, pack, *lists, *image, *v_image, records]
     device.launch("absgrad", "absgrad_tiles", (tiles * group,), arguments, defines=defines, group=(group,))
     sums = device.empty("absgrad", (n, 2))
-    arguments = [n, bins.order, bins.first_slots, records, sums]
+    arguments = [n, bins.first_slots, records, sums]
     device.launch("absgrad", "absgrad_sum", (n,), arguments, defines=defines)
     return sums

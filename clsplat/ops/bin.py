@@ -1,7 +1,7 @@
 """Launch of the stage bin (cl/bin.cl)."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pyopencl.array import Array
@@ -14,6 +14,22 @@ from clsplat.ops.sort import argsort, argsort_segments
 from clsplat.stages import AnySplats, Bins
 
 WHAT = "intersections of Gaussians and tiles"
+
+
+class _Walk(NamedTuple):
+    """N splats in the order in which they are distributed to T tiles."""
+
+    n: int
+    tile_count: int
+    # Arguments of the kernels that walk over the splats' tiles.
+    arguments: list[Any]
+    # The splats in that order; None: by index.
+    order: Array | None
+    # Number of tiles of each splat, and first slot; None without gradients.
+    counts: Array
+    first_slots: Array | None
+    defines: dict[str, Any]
+
 
 # Name of the lists of intersections in device memory, and bytes of an entry.
 LIST, ENTRY = "intersections", 4
@@ -40,7 +56,7 @@ def bin_splats(
         True if `composite_bwd` will follow. If False, first_slots and slots of the result are None.
     scheme : {"auto", "global", "per_tile"}
         "global" sorts all splats by depth and distributes them to the tiles. "per_tile" distributes them and sorts
-        the list of each tile. The lists are the same; `order` of the result is by depth or by index.
+        the list of each tile. The results are the same.
 
     Raises
     ------
@@ -54,22 +70,22 @@ def bin_splats(
     by_depth = scheme != "per_tile"
     n = splats.depths.shape[0]
     tile_count = -(-width // tile_size) * -(-height // tile_size)
-    defines = {"TILE": tile_size, "GRADIENTS": int(gradients)}
+    defines = {"TILE": tile_size, "GRADIENTS": int(gradients), "LANES": 8 if device.is_cpu else 1}
     # The key of a double has 64 bits. The sign bit of a depth is never set, but that of LAST is.
     keys = device.empty("depth keys", n, np.uint32 if device.real == np.float32 else np.uint64)
     bits = 8 * keys.dtype.itemsize
-    ellipses = device.empty("ellipses", (n, 8))
-    # The global scheme gets its order from the sort; it passes a buffer that the kernel does not touch.
-    order = keys if by_depth else device.empty("order", n, np.uint32)
-    geometry = [splats.means2d, splats.conics, splats.depths, splats.extents, splats.opacities]
-    arguments = [n, int(not by_depth), *geometry, keys, ellipses, order]
-    device.launch("bin", "bin_prepare", (-(-n // 8),), arguments, defines=defines)
-    if by_depth:
-        _, order = argsort(device, keys, bits)
+    covers = device.empty("tiles of each Gaussian", (n, 4), np.uint32)
+    counts = device.empty("tiles per Gaussian", n, np.uint32)
+    geometry = [splats.means2d, splats.conics, splats.extents, splats.opacities]
+    arguments = [n, width, height, splats.depths, *geometry, keys, covers, counts]
+    device.launch("bin", "bin_prepare", (-(-n // defines["LANES"]),), arguments, defines=defines)
+    first_slots = queue_scan(device, counts)[0] if gradients else None
+    order = argsort(device, keys, bits)[1] if by_depth else None
 
-    geometry = [width, height, order, ellipses]
+    arguments = [width, height, int(not by_depth), counts if order is None else order, covers, *geometry]
     distribute = _counting_sort if device.is_cpu else _radix_sort
-    gauss_ids, slots, first_slots, tile_ranges = distribute(device, n, tile_count, geometry, defines)
+    walk = _Walk(n, tile_count, arguments, order, counts, first_slots, defines)
+    gauss_ids, slots, tile_ranges = distribute(device, walk)
     m = gauss_ids.shape[0]
     if m and not by_depth:
         list_keys = device.empty("list keys", m, keys.dtype)
@@ -79,8 +95,7 @@ def bin_splats(
             gauss_ids, slots = (_gather(device, m, permutation, a, defines) for a in (gauss_ids, slots))
         else:
             gauss_ids = argsort_segments(device, list_keys, bits - 1, tile_ranges, gauss_ids)
-    bins = Bins(gauss_ids, tile_ranges, order, first_slots, slots, tile_size, width, height)
-    return bins if gradients else bins._replace(first_slots=None, slots=None)
+    return Bins(gauss_ids, tile_ranges, first_slots, slots if gradients else None, tile_size, width, height)
 
 
 def _list(device: Device, m: int) -> Array:
@@ -121,54 +136,47 @@ def _gather(device: Device, m: int, permutation: Array, values: Array, defines: 
     return result
 
 
-def _counting_sort(
-    device: Device, n: int, tile_count: int, geometry: list[Any], defines: dict[str, Any]
-) -> tuple[Array, Array, Array, Array]:
-    """gauss_ids, slots, first_slots and tile_ranges by a counting sort, in which each core has its own counters."""
-    runs = min(n, 4 * device.cl_device.max_compute_units)
-    head = [n, runs, tile_count, *geometry]
+def _counting_sort(device: Device, walk: _Walk) -> tuple[Array, Array, Array]:
+    """gauss_ids, slots and tile_ranges by a counting sort, in which each core has its own counters."""
+    tile_count, first_slots, defines = walk.tile_count, walk.first_slots, walk.defines
+    runs = min(walk.n, 4 * device.cl_device.max_compute_units)
+    head = [walk.n, runs, tile_count, *walk.arguments]
     counters = device.empty("tile counters", (runs, tile_count), np.uint32)
-    # Without gradients, the kernels do not access these.
-    counts = first_slots = counters
-    if defines["GRADIENTS"]:
-        counts = device.empty("tiles per Gaussian", n, np.uint32)
-    device.launch("bin", "bin_histogram", (runs,), [*head, counters, counts], defines=defines, group=(1,))
+    device.launch("bin", "bin_histogram", (runs,), [*head, counters], defines=defines, group=(1,))
     totals = device.empty("tile totals", tile_count, np.uint32)
     device.launch("bin", "bin_totals", (tile_count,), [runs, tile_count, counters, totals], defines=defines)
     tile_begins, partial = queue_scan(device, totals)
-    if defines["GRADIENTS"]:
-        first_slots, _ = queue_scan(device, counts)
+    # Without gradients, the kernel does not access the slots.
+    slots_in = counters if first_slots is None else first_slots
 
     def scatter(room: list[Any], lists: list[Array]) -> None:
-        arguments = [*head, counters, tile_begins, first_slots, *room, lists[0], lists[-1]]
+        arguments = [*head, counters, tile_begins, slots_in, *room, lists[0], lists[-1]]
         device.launch("bin", "bin_scatter", (runs,), arguments, defines=defines, group=(1,))
 
     gauss_ids, *slots = _filled(device, partial, 1 + defines["GRADIENTS"], scatter)
     tile_ranges = device.empty("tile ranges", (tile_count, 2), np.uint32)
     device.launch("bin", "bin_ranges", (tile_count,), [tile_count, tile_begins, tile_ranges], defines=defines)
-    return gauss_ids, slots[0] if slots else gauss_ids, first_slots, tile_ranges
+    return gauss_ids, slots[0] if slots else gauss_ids, tile_ranges
 
 
-def _radix_sort(
-    device: Device, n: int, tile_count: int, geometry: list[Any], defines: dict[str, Any]
-) -> tuple[Array, Array, Array, Array]:
+def _radix_sort(device: Device, walk: _Walk) -> tuple[Array, Array, Array]:
     """The same result as `_counting_sort`, by a radix sort of the tile numbers, which uses all cores of a GPU."""
-    counts = device.empty("tiles per Gaussian", n, np.uint32)
-    device.launch("bin", "bin_count", (n,), [n, *geometry, counts], defines=defines)
-    first_slots, partial = queue_scan(device, counts)
+    n, tile_count, arguments, order, counts, first_slots, defines = walk
+    if order is not None:
+        by_index, counts = counts, device.empty("tiles per Gaussian", n, np.uint32)
+        device.launch("bin", "bin_gather", (n,), [n, order, by_index, counts], defines=defines)
+    positions, partial = queue_scan(device, counts)
+    slots_in = positions if first_slots is None else first_slots
 
     def emit(room: list[Any], lists: list[Array]) -> None:
-        device.launch("bin", "bin_emit", (n,), [n, *geometry, first_slots, *room, *lists], defines=defines)
+        more = [positions, slots_in, *room, lists[0], lists[1], lists[-1]]
+        device.launch("bin", "bin_emit", (n,), [n, *arguments, *more], defines=defines)
 
-    tiles, slot_gauss = _filled(device, partial, 2, emit)
+    tiles, entries, *owners = _filled(device, partial, 2 + defines["GRADIENTS"], emit)
     m = tiles.shape[0]
-    tile_ranges = device.empty("tile ranges", (tile_count, 2), np.uint32)
-    gauss_ids = slots = slot_gauss
     if m:
-        if defines["GRADIENTS"]:
-            tiles, slots = argsort(device, tiles, tile_count.bit_length())
-            gauss_ids = _gather(device, m, slots, slot_gauss, defines)
-        else:
-            tiles, gauss_ids = argsort(device, tiles, tile_count.bit_length(), values=slot_gauss)
+        tiles, entries = argsort(device, tiles, tile_count.bit_length(), values=entries)
+    tile_ranges = device.empty("tile ranges", (tile_count, 2), np.uint32)
     device.launch("bin", "bin_bisect", (tile_count,), [m, tile_count, tiles, tile_ranges], defines=defines)
-    return gauss_ids, slots, first_slots, tile_ranges
+    gauss_ids = _gather(device, m, entries, owners[0], defines) if m and owners else entries
+    return gauss_ids, entries, tile_ranges

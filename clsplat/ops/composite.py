@@ -237,7 +237,7 @@ def composite_bwd(
     conics = splats.conics
     if isinstance(splats, RaySplats):
         v, conics = RayGrads(*geometry, device.empty("v_slopes", (n, 3)), *rest), splats.rays
-    arguments = [n, bins.order, bins.first_slots, conics, splats.opacities, records, *v]
+    arguments = [n, bins.first_slots, conics, splats.opacities, records, *v]
     defines = _defines(device, bins, channels, stage, ray_charts(splats))
     device.launch(stage, "composite_sum", (n,), arguments, defines=defines)
     return v

@@ -76,7 +76,7 @@ def removal_sums(
     lists = [bins.gauss_ids, bins.tile_ranges, bins.slots]
     arguments = [bins.width, bins.height, pack, *lists, behind, *pixels, records, *directions_of(splats)]
     device.launch(stage, "removal", (tiles * group,), arguments, defines=defines, group=(group,))
-    arguments = [n, bins.order, bins.first_slots, records, sums]
+    arguments = [n, bins.first_slots, records, sums]
     device.launch(stage, "removal_sum", (n,), arguments, defines=defines)
     return sums
 

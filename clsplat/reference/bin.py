@@ -15,20 +15,18 @@ def bin_splats(
     gradients: bool = True,
     scheme: str = "auto",
 ) -> Bins:
-    """List the splats of each tile. Arguments and result as for `clsplat.ops.bin_splats`; "auto" is "global".
+    """List the splats of each tile. Arguments and result as for `clsplat.ops.bin_splats`.
 
     The ellipse {alpha >= ALPHA_MIN} is cut at the first and at the last row of pixel centres of the tile. The splat
     belongs to the tile if this part spans a pixel centre of one of the tile's columns.
     """
     tiles_x, tiles_y = -(-width // tile_size), -(-height // tile_size)
     visible = splats.extents[:, 0] > 0
-    by_depth = np.argsort(np.where(visible, splats.depths, np.inf), kind="stable").astype(np.uint32)
-    order = np.arange(len(visible), dtype=np.uint32) if scheme == "per_tile" else by_depth
-    rank = np.argsort(by_depth)
+    rank = np.argsort(np.argsort(np.where(visible, splats.depths, np.inf), kind="stable"))
     tiles: list[int] = []
     slot_gauss: list[int] = []
     first_slots = [0]
-    for g in order:
+    for g in range(len(visible)):
         if visible[g]:
             cells = _tiles_of(splats, g, width, height, tile_size)
             tiles += [ty * tiles_x + tx for ty, tx in cells]
@@ -40,7 +38,7 @@ def bin_splats(
     edges = np.searchsorted(sorted_tiles, np.arange(tiles_x * tiles_y + 1))
     ranges = np.stack([edges[:-1], edges[1:]], axis=1).astype(np.uint32)
     first, slot = (np.array(first_slots, np.uint32), slots) if gradients else (None, None)
-    return Bins(gauss[slots], ranges, order, first, slot, tile_size, width, height)
+    return Bins(gauss[slots], ranges, first, slot, tile_size, width, height)
 
 
 def _tiles_of(splats: AnySplats, g: int, width: int, height: int, tile_size: int) -> list[tuple[int, int]]:

@@ -25,7 +25,7 @@ REAL = 4  # bytes of a float32, a uint32 or an index
 # shared, so that the buffers of all stages add up.
 PER_GAUSSIAN = {
     "project": 12,  # means2d 2, conics 3, depths, extents 2, opacities, colors 3
-    "bin": 15,  # depth keys, ellipses 8, sort keys and sort order twice, tiles per Gaussian and their sums
+    "bin": 11,  # depth keys, tiles 4, sort keys and sort order twice, tiles per Gaussian and their sums
     "composite": 12 + 9,  # packed splats; v_means2d 2, v_conics 3, v_opacities, v_colors 3
     "observe": 2,  # grad_sum, seen
 }
@@ -37,7 +37,8 @@ PER_INTERSECTION = {
     "composite": 9,  # gradients per intersection
 }
 PER_INTERSECTION_RAYS = 4  # gradients per intersection
-PER_INTERSECTION_GPU = 5 + 4  # bin: intersections once more, sort keys and sort order twice; states of 256 pixels
+PER_GAUSSIAN_GPU = 2  # bin: tiles per Gaussian and their sums, in the order by depth
+PER_INTERSECTION_GPU = 6 + 4  # bin: intersections twice more, sort keys and sort order twice; states of 256 pixels
 PER_INTERSECTION_PER_TILE = 4  # bin: list keys; of the sorts, what is not shared with the sort by depth
 PER_PIXEL = {
     "composite": 4,  # image 3, alpha
@@ -110,6 +111,7 @@ class Footprint:
         """Bytes per Gaussian, if each meets `intersections` tiles."""
         values = COPIES * self._parameters + sum(PER_GAUSSIAN.values()) + intersections * self._per_intersection
         values += (self.rays > 0) * PER_GAUSSIAN_RAYS + (self.rays > 1) * PER_GAUSSIAN_CHARTS + self.depth * PER_DEPTH
+        values += self.gpu * PER_GAUSSIAN_GPU
         return REAL * ROUNDING * (values + (JOINED if self.backdrop else 0))
 
     @property

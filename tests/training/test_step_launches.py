@@ -17,7 +17,7 @@ STEPS = 8
 
 @pytest.mark.parametrize("variants", ["cpu", "gpu"])
 def test_a_step_takes_few_launches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variants: str) -> None:
-    """At most 30, with more tiles than one digit of the sort has, and lists longer than the bitonic sort takes."""
+    """At most 31, with more tiles than one digit of the sort has, and lists longer than the bitonic sort takes."""
     monkeypatch.setenv("CLSPLAT_VARIANTS", variants)
     launched: list[list[str]] = [[]]
     launch = Device.launch
@@ -30,7 +30,7 @@ def test_a_step_takes_few_launches(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     config = TrainConfig(strategy="adc", size="fixed", iterations=STEPS, adc=FIXED_N, eval_every=0)
     train(make_scene(2000, 288, 256), config, tmp_path, Device(), progress=lambda _: launched.append([]))
     for step in launched[1:-2]:  # the first prepares, and after the last the scene is finished
-        assert len(step) <= 30, step
+        assert len(step) <= 31, step
         assert step.count("composite_pack") == 1 and step.count("composite_bwd") == 1
     expected = 2 * (4 + 2) if variants == "gpu" else 2 * 3  # passes of the sorts by depth and by tile
     assert sum(kernel in ("sort_count", "sort_scatter") for kernel in launched[2]) == expected
