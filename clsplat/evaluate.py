@@ -89,7 +89,7 @@ def evaluate(
     renderer : Renderer, optional
         Its background is that of the photos where they were transparent. Default: ``Renderer()``.
     metrics : functions of `clsplat.metrics`
-        What is computed; `METRICS` and maybe `lpips`.
+        Metrics to compute, such as `METRICS`, or `METRICS` and `lpips`.
 
     Returns
     -------

@@ -54,7 +54,7 @@ def photo_budget(memory: int | None) -> int | None:
 
 @dataclass(frozen=True)
 class Source:
-    """How a photo is read.
+    """Source of a photo that is read when it is needed.
 
     decode: returns it, with the arrays of `View`; camera: its camera; layers: arrays that it may have; used: whether
     any pixel counts, found without decoding the photo itself.

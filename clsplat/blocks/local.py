@@ -97,7 +97,7 @@ def _ended(process: subprocess.Popen[bytes]) -> None:
 
 
 def _reason(status: int, errors: IO[bytes]) -> str:
-    """Why a process failed: the last line that it wrote."""
+    """Reason of the failure of a process: its status, and the last line that it wrote."""
     errors.seek(0)
     lines = errors.read().decode(errors="replace").strip().splitlines()
     return f"its process ended with status {status}{': ' if lines else ''}{''.join(lines[-1:])}"

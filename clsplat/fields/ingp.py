@@ -89,7 +89,7 @@ class IngpBase(Field):
 
     @property
     def rays(self) -> int:
-        """Number of rays of the next step: so many that they have about `samples` samples."""
+        """Number of rays of the next step, chosen so that they have about `samples` samples."""
         return self._rays
 
     def step(self, batch: Batch, progress: float) -> float:

@@ -63,7 +63,7 @@ def shared_rows(rows: Array, most: int) -> tuple[Array, Array] | None:
     tuple or None
         Different rows (P, D), in the order of their first appearance, and labels (N,); None if there are more.
     """
-    # Rows with equal sums of their columns, multiplied by irregular factors, are equal but for rare coincidences.
+    # Rows with equal sums of their columns, multiplied by irregular factors, are equal, except for rare coincidences.
     factors = np.sqrt(np.arange(2, rows.shape[1] + 2, dtype=np.float64))
     _, first, labels = np.unique(rows @ factors, return_index=True, return_inverse=True)
     if len(first) > most:

@@ -283,7 +283,7 @@ class Viewer:
             self._text.content, self._written = text, now
 
     def hold(self, gaussians: Gaussians, until: Callable[[], bool] = lambda: False) -> None:
-        """Show Gaussians that do not change, but for the edits of browsers, until `until` returns True or Ctrl-C.
+        """Show Gaussians that only browsers edit, until `until` returns True or Ctrl-C.
 
         Parameters
         ----------

@@ -42,7 +42,7 @@ class Photo(NamedTuple):
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a run trains on.
+    """Inputs of a run.
 
     train, test: photos by name; points: digest of points and colours, empty without points; device: its platform,
     name and driver version.

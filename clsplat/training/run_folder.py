@@ -68,14 +68,14 @@ def held(out: Path) -> Iterator[None]:
 
 
 def _sign(out: Path) -> None:
-    """Write who holds the folder."""
+    """Write the process that holds the folder, its host and the time to the folder."""
     since = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
     with replacing(out / HOLDER) as file:
         file.write(json.dumps({"process": os.getpid(), "host": socket.gethostname(), "since": since}).encode())
 
 
 def _holder(out: Path) -> str:
-    """Who holds the folder, as far as it is known: a process signs after it has locked."""
+    """Process that holds the folder, if it is known: a process signs after it has locked."""
     try:
         signed = json.loads((out / HOLDER).read_text())
         return f"process {signed['process']} on {signed['host']} (since {signed['since']})"
