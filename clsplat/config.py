@@ -87,7 +87,7 @@ class DataConfig:
     """Factor by which the photos' edges are divided: the folder images_2, images_4 or images_8 is read if it exists,
     otherwise the photos are resampled."""
     test_every: Annotated[int, within(least=0)] = 8
-    """Every n-th photo by name is held out (0: none). Ignored where the dataset has a split of its own."""
+    """Every n-th photo by name is held out (0: none). Ignored if the dataset has its own split."""
     background: Background = "black"
     """Colour behind the scene and behind transparent photos."""
     random_background: bool = False

@@ -95,7 +95,7 @@ def evaluate(
     -------
     dict
         The content of metrics.json. ``mean`` holds the means over the views of psnr (dB), psnr_fitted (dB, after an
-        affine fit of the colours), ssim and flip, and of lpips if it is asked for; ``views`` holds the same of each
+        affine fit of the colours), ssim, flip, and lpips if it is in `metrics`; ``views`` holds the same of each
         view, its size and the paths of its pictures. None (null) stands for an infinite PSNR, as between equal
         images, and for FLIP where flip-evaluator is not installed.
 

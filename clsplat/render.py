@@ -54,7 +54,7 @@ class Rendering:
         1 - transmittance.
     depth : (H, W) or None
         Expected depth: the mean of the splats' depths in world units (z; distances for a fisheye and a panorama),
-        weighted as the colours are; 0 where alpha is 0. None unless asked for.
+        weighted as the colours are; 0 where alpha is 0. None without ``depth=True``.
     """
 
     def __init__(self, renderer: Renderer, run: Pass | None, gaussians: Gaussians, image: Array, alpha: Array):
@@ -278,7 +278,7 @@ def renderings(
 def _renderings(
     renderer: Renderer, gaussians: Gaussians, cameras: Iterable[Camera], degree: int, depth: bool, gradients: bool
 ) -> Iterator[Rendering]:
-    """A generator, apart from `renderings` so that this one's errors come before the first image is asked for."""
+    """Generator of the images. It is separate so that errors of `renderings` come before the first image."""
     placed = renderer.place(gaussians) if len(gaussians) else gaussians
     near: float | None = None
     for camera in cameras:

@@ -30,7 +30,7 @@ class Gradients(NamedTuple):
 
     gaussians: one per field of `Gaussians`, pre-activation; means2d (N, 2): per pixel, the statistic of
     densification; viewmat (4, 4): each entry as an independent variable; intrinsics (4,): fx, fy, cx, cy. The last
-    two are None if they were not asked for.
+    two are None unless they were requested.
     """
 
     gaussians: Gaussians

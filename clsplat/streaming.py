@@ -1,4 +1,4 @@
-"""Photos that do not fit the memory: they are decoded when they are needed, and the next ones meanwhile."""
+"""Photos that do not fit the memory: they are decoded when they are needed, the next ones ahead of time."""
 
 import os
 import warnings
@@ -182,7 +182,7 @@ def _nbytes(view: View) -> int:
 
 
 class StreamedView(View):
-    """A view that a `PhotoStream` reads when its arrays are asked for.
+    """A view that a `PhotoStream` reads when its arrays are needed.
 
     ``dataclasses.replace`` makes an ordinary view of it, in memory; `with_camera` and `changed` do not.
     """

@@ -35,7 +35,7 @@ def surface_of(gaussians: Gaussians, camera: Camera, ids: NDArray[np.int32]) -> 
     """Compute depths and normals of the surface from the indices of its Gaussians.
 
     The density along the ray t d is largest at t = (w . u)/(u . u) with w = L^-1 p, u = L^-1 d and L L^T the
-    covariance. This is exact, whatever the projection of the image.
+    covariance. This is exact for every projection of the image.
 
     Parameters
     ----------

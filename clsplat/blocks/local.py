@@ -46,7 +46,7 @@ def devices_like(device: "Device") -> list[int]:
 
 
 def run_on_devices(jobs: list[Path], devices: list[int], tell: Callable[[str], None]) -> None:
-    """Train the blocks that have no result, each in a process of its own, one at a time on each device.
+    """Train the blocks that have no result, each in a separate process, one at a time on each device.
 
     The processes end with this one. A block that has been interrupted continues from its last checkpoint.
 

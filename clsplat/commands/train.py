@@ -95,7 +95,7 @@ class Train:
             try:
                 gaussians, viewer = self.trained(out, suffix)
             except JobsPrinted:
-                say("when these commands have run, go on with the same one and --resume")
+                say("when these commands have run, repeat this command with --resume")
                 return
         if viewer and gaussians is not None:
             say(f"viewer: {viewer.address} stays open; Ctrl-C ends it")
@@ -104,7 +104,7 @@ class Train:
             viewer.close()
 
     def trained(self, out: Path, suffix: str) -> "tuple[Gaussians | None, Viewer | None]":
-        """Train in a folder that is held, and write the file of Gaussians that a suffix asks for."""
+        """Train in a folder that is held; if `suffix` is not empty, also write a file of Gaussians."""
         from clsplat.formats import load_gaussians, save_gaussians
 
         check_new(out, self.resume)

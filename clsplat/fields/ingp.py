@@ -45,7 +45,7 @@ RAYS_MAX = 32768
 """Largest number of rays in a step."""
 
 EVALUATED = 1 << 18
-"""Number of points at which the grid asks for densities at once."""
+"""Number of points at which densities for the grid are computed at once."""
 
 
 class Evaluation(NamedTuple):

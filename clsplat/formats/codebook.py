@@ -17,7 +17,7 @@ PALETTE_MAX = 1 << 16
 """Largest number of entries in a palette of rows, so that an index is two bytes."""
 
 PALETTE_MIN = 1024
-"""Number of rows up to which each row has an entry of its own in the palette."""
+"""Number of rows up to which each row has its own entry in the palette."""
 
 PALETTE_SHARE = 3
 """Mean number of rows per entry of the palette, for more than PALETTE_MIN rows. Measurement: docs/formats.md."""

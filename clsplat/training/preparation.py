@@ -114,7 +114,7 @@ def check_memory(scene: Scene, config: TrainConfig, device: "Device", tell: Call
 
 
 def of_fixed_size(config: TrainConfig, gaussians: int, rate: float) -> TrainConfig:
-    """The configuration of a training that goes on with Gaussians that have been trained, and edits none.
+    """Configuration of a training that continues with trained Gaussians, and adds or removes none.
 
     Parameters
     ----------

@@ -24,9 +24,9 @@ HOLDER = ".lock.json"
 def held(out: Path) -> Iterator[None]:
     """Hold the folder of a run while the block runs, against other processes and threads.
 
-    The system ends the lock when the process dies, by whatever means. A thread may hold a folder more than once. The
-    folder is created if it is missing, and removed again if the block leaves nothing in it. What processes left that
-    died while they wrote a file is removed.
+    The system ends the lock when the process ends, even if it is killed. A thread may hold a folder more than once.
+    The folder is created if it is missing, and removed again if the block leaves nothing in it. Files that killed
+    processes left half written are removed.
 
     Raises
     ------

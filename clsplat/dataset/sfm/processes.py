@@ -47,7 +47,7 @@ def child(
 
 
 def apart(what: str, function: str, work: Path, **arguments: Any) -> Any:
-    """Call a function in a process of its own, since COLMAP ends its process where it cannot go on.
+    """Call a function in a separate process, because COLMAP ends its process if it cannot continue.
 
     Parameters
     ----------
