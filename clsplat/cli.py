@@ -55,9 +55,9 @@ class Bench:
         self.what.run()
 
 
-DESCRIPTION = """3D Gaussian Splatting on any OpenCL device. COMMAND --help shows the settings that most need, and
---help-all shows all. Every command accepts -q (--quiet: only warnings and errors) and -v (--verbose: also messages of
-structure from motion and of the driver's compiler, and tracebacks of errors). --version prints the version."""
+DESCRIPTION = """3D Gaussian Splatting on any OpenCL device. COMMAND --help shows the common settings, and --help-all
+shows all. Every command accepts -q (--quiet: only warnings and errors) and -v (--verbose: also messages of structure
+from motion and of the driver's compiler, and tracebacks of errors). --version prints the version."""
 
 COMMANDS = (
     Train | View | Export | Render | Mesh | Eval | Compact | Info | Frames | Sfm | Block | Devices | Demo | Bench

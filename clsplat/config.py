@@ -10,7 +10,7 @@ from clsplat.ranges import byte_size, name_in, within
 Mode = Literal["classic", "antialiased"]
 Background = Literal["black", "white"]
 
-# The ranges of most fields. `clsplat.ranges.check` checks them.
+# Ranges of most fields, which `clsplat.ranges.check` checks.
 Count = Annotated[int, within(least=1)]
 Fraction = Annotated[float, within(least=0, most=1)]
 PositiveFraction = Annotated[float, within(above=0, most=1)]
@@ -43,17 +43,17 @@ class RenderConfig:
     compositor: Literal["auto", "cpu", "gpu"] = "auto"
     """Kernel variant of the compositing stage; auto chooses by the type of the device."""
     sort: Literal["auto", "global", "per_tile", "pixel"] = "auto"
-    """Sort splats by the depths of their centres: all of them before they are distributed to tiles (global), or
-    within each tile afterwards (per_tile). Both give the same image; auto takes global, which was faster wherever it
-    was measured. pixel sorts in each pixel by the points where its ray meets the Gaussians: nothing pops when the
-    camera turns, but it is slower (StopThePop)."""
+    """Order of the splats. global and per_tile: by the depths of their centres, sorted before the splats are
+    distributed to tiles or within each tile afterwards; both give the same image. auto: global. pixel: in each pixel
+    by the points where its ray meets the Gaussians (StopThePop). Nothing then pops when the camera turns, but
+    rendering is slower."""
     projection: Literal["affine", "ray"] = "affine"
     """affine: the paper's local affine approximation of the camera. Its error grows with the angle from the axis and
     with the size of a Gaussian. ray: exact along the ray of each pixel, for wide angles, fisheyes and panoramas."""
     near: Annotated[float | None, within(above=0)] = None
     """Depth up to which nothing is drawn, world units. Default: three tenths of the depth of the nearest points in
-    each photo for a dataset's cameras, 0.01 for others. Without it, Gaussians very close to a camera spread over its
-    whole image."""
+    each photo for a dataset's cameras, 0.01 for others. Gaussians very close to a camera would otherwise spread over
+    its whole image."""
 
 
 @dataclass(frozen=True)
@@ -67,16 +67,16 @@ class SfmConfig:
     vocabulary: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """COLMAP's vocabulary tree for SIFT, for matching by vocabulary."""
     mapper: Literal["incremental", "global"] = "incremental"
-    """incremental: photos are added one after the other. global: all poses are found at once, in less time for many
-    photos (GLOMAP)."""
+    """Method that finds the poses. incremental: photos are added one after the other. global: all poses are found at
+    once, in less time for many photos (GLOMAP)."""
     camera_model: Annotated[str, name_in("clsplat.dataset.lenses:camera_models")] = "OPENCV"
     """COLMAP camera model to fit; photos are undistorted when they are loaded."""
     single_camera: bool = True
-    """All photos were taken by one camera with one focal length; otherwise each photo has its own intrinsics."""
+    """Treat all photos as taken by one camera with one focal length; otherwise each photo has its own intrinsics."""
     max_image_size: Annotated[int, within(least=1, most=INT32_MAX)] = 1600
     """Longer edge of the photos in which features are detected, px."""
     min_registered: Annotated[int, within(least=2, most=INT32_MAX)] = 3
-    """Fewest registered photos; fewer are an error."""
+    """Fewest photos for which a pose must be found; fewer are an error."""
 
 
 @dataclass(frozen=True)
@@ -87,15 +87,15 @@ class DataConfig:
     """Factor by which the photos' edges are divided: the folder images_2, images_4 or images_8 is read if it exists,
     otherwise the photos are resampled."""
     test_every: Annotated[int, within(least=0)] = 8
-    """Every n-th photo by name is held out (0: none). Ignored where the dataset has a split of its own."""
+    """Every n-th photo by name is held out (0: none). Ignored if the dataset has its own split."""
     background: Background = "black"
     """Colour behind the scene and behind transparent photos."""
     random_background: bool = False
     """Train each iteration with another background colour. Dark areas then become opaque instead of transparent in
     front of a black background. Evaluation uses `background`."""
     panoramas: Literal["faces", "whole"] = "faces"
-    """Equirectangular photos become six pinhole photos each, the faces of a cube, or stay as they are. whole needs
-    `--projection ray`, and weighs the pixels at the poles as those at the horizon."""
+    """faces: each equirectangular photo becomes six pinhole photos, the faces of a cube. whole: it stays as it is,
+    which needs `--projection ray`; pixels at the poles then have the same weight as those at the horizon."""
     masks: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder of masks, named as the photos are (NAME.png or NAME.jpg.png): white pixels train, black ones do not."""
     invert_masks: bool = False
@@ -104,7 +104,7 @@ class DataConfig:
     """Folder of depth maps, named as the photos are (NAME.png of 16 bits, NAME.npy or NAME.tiff). They hold depths or
     inverse depths in any unit, which are scaled to the scene's points; 0 is unknown. For few photos."""
     sfm: SfmConfig = field(default_factory=SfmConfig)
-    """Settings of structure from motion, which runs where there are photos without poses."""
+    """Settings of structure from motion, which recovers the cameras of photos without poses."""
 
 
 @dataclass(frozen=True)
@@ -112,23 +112,23 @@ class InitConfig:
     """Settings of the first Gaussians."""
 
     triangulate: bool = True
-    """Triangulate points from the photos where the dataset has poses but no points; otherwise the start is random."""
+    """Triangulate points from the photos if the dataset has poses but no points; otherwise the start is random."""
     random_points: Annotated[int | None, within(least=1, most=UINT32_MAX)] = None
-    """Number of Gaussians of a random start, where there are no points. Default: 100 000 (original), or 10 000 with
+    """Number of Gaussians of a random start, if there are no points. Default: 100 000 (original), or 10 000 with
     --size auto, which adds more where they are needed."""
     random_extent: Positive = 1 / 3
     """Half edge of the box of a random start, as a fraction of the cameras' mean distance from the point they look
     at. For NeRF-synthetic scenes (distance 4) the box is that of the original within 3 %."""
     opacity: Annotated[float | None, within(above=0, below=1)] = None
-    """Opacity of the first Gaussians. Default: the strategy's, which is 0.1 for adc and error, 0.5 for mcmc."""
+    """Opacity of the first Gaussians. Default: that of the strategy, which is 0.1 for adc and error, 0.5 for mcmc."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """Highest degree of the spherical harmonics."""
 
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Adam and its learning rates. Those of the Gaussians, but for the opacities, are twice the original's, for runs
-    of fewer iterations; the presets named after papers have the original's."""
+    """Adam and its learning rates. The rates of the Gaussians, except that of the opacities, are twice the
+    original's, for runs of fewer iterations. The presets have the original's."""
 
     means_lr: Positive = 3.2e-4
     """Learning rate of the means at the start, in extents of the scene."""
@@ -145,7 +145,7 @@ class OptimConfig:
     sh_rest_lr: NonNegative = 5e-3 / 20
     """Learning rate of the spherical harmonics of degree 1 and above."""
     rates_final: PositiveFraction = 0.1
-    """Factor on the learning rates above, except that of the means, at the last iteration; it falls exponentially
+    """Factor on the learning rates above, except that of the means, at the last iteration. It falls exponentially
     from 1 over the last two fifths of the iterations."""
     beta1: PartialFraction = 0.9
     """Decay rate of Adam's mean of the gradients."""
@@ -162,13 +162,13 @@ class OptimConfig:
     depth_weight: Positive = 1.0
     """Weight in the loss, at the start, of the relative difference from the depth maps; with --depth."""
     depth_weight_final: Positive = 0.1
-    """This weight at the last iteration; it changes exponentially in between."""
+    """Weight of the depth maps at the last iteration; it changes exponentially in between."""
     exposure_lr: Positive = 1e-2
-    """Learning rate of the photos' exposures at the start (original code); that of gains is ten times as high."""
+    """Learning rate of the photos' exposures at the start (original code); for gains it is ten times as high."""
     exposure_lr_final: Positive = 1e-3
     """Learning rate of the exposures at the last iteration; it changes exponentially in between."""
     poses_lr: Positive = 1e-3
-    """Learning rate of the photos' poses at the start: radians, and extents of the scene."""
+    """Learning rate of the photos' poses at the start: in radians, and in extents of the scene."""
     poses_lr_final: Positive = 1e-5
     """Learning rate of the poses at the last iteration; it changes exponentially in between."""
 
@@ -195,9 +195,9 @@ class AdcConfig:
     every: Count = 100
     """Iterations between two rounds."""
     grad_threshold: NonNegative = 2e-4
-    """Mean norm of the positional gradient, in normalised device coordinates, from which a Gaussian is densified."""
+    """Mean positional gradient, in normalised device coordinates, from which Gaussians are cloned or split."""
     scale_threshold: NonNegative = 0.01
-    """Largest scale of a Gaussian, in extents of the scene, up to which it is cloned and above which it is split."""
+    """Scale of the longest axis, in extents of the scene, up to which Gaussians are cloned; larger ones are split."""
     opacity_min: PartialFraction = 0.005
     """Opacity below which Gaussians are removed."""
     scale_max: NonNegative = 0.1
@@ -241,8 +241,8 @@ class McmcConfig:
 
 @dataclass(frozen=True)
 class ErrorConfig:
-    """Growth to a cap where the photos' errors are (sources: clsplat.training.densify.error_guided; values measured:
-    docs/howto/strategies.md)."""
+    """Growth to a cap in the places of the photos' errors (sources: clsplat.training.densify.error_guided; values
+    measured: docs/howto/strategies.md)."""
 
     start: Annotated[int, within(least=0)] = 500
     """First iteration after which Gaussians are split or removed; earlier in short runs."""
@@ -259,26 +259,26 @@ class ErrorConfig:
     opacity_min: PartialFraction = 0.005
     """Opacity up to which Gaussians are removed."""
     replaced: Fraction = 0.02
-    """Fraction of the Gaussians that are replaced in each round at the cap: those whose removal changes the squared
+    """Fraction of the Gaussians that is replaced in each round at the cap: those whose removal increases the squared
     error of the photos least."""
     replaced_most: Fraction = 0.05
-    """Largest fraction that is replaced, if the removal of that many lowers the error."""
+    """Largest fraction of the Gaussians that is replaced in a round, if their removal lowers the error."""
     opacity_penalty: NonNegative = 0.01
-    """Weight of the mean opacity in the loss. Faint Gaussians that no photo needs vanish; otherwise they cover
-    cameras that stand where no photo was taken."""
+    """Weight of the mean opacity in the loss. It removes faint Gaussians that no photo needs and that would show as a
+    haze between the photos' viewpoints."""
 
 
 @dataclass(frozen=True)
 class FewViewsConfig:
-    """Settings for few photos (reasons: clsplat.training.few_views; effects: docs/stability.md)."""
+    """Settings for few photos (reasons: clsplat.training.few_views; effects: docs/howto/strategies.md)."""
 
     below: Annotated[int, within(least=0)] = 17
-    """Number of training photos below which the other settings of this group apply (0: never)."""
+    """Number of training photos below which the settings for few photos apply (0: never)."""
     dropout: PartialFraction = 0.2
     """Fraction of the splats left out of each image at the end of the training (DropGaussian)."""
     growth: Positive = 8.0
-    """Largest number of Gaussians, as a multiple of the scene's points. Small photos, with fewer pixels than that,
-    have one per pixel, or half the multiple if this is more."""
+    """Largest number of Gaussians, as a multiple of the number of the scene's points. If a photo has fewer pixels
+    than this number, the bound is the number of pixels, or half the multiple if this is more."""
 
 
 @dataclass(frozen=True)
@@ -286,9 +286,9 @@ class TrainConfig:
     """Settings of a training; saved as ``config.json``, from which it can be repeated."""
 
     iterations: Annotated[int, within(least=0, most=UINT32_MAX)] = 0
-    """Optimisation steps; 0: chosen by the photos. These are 30 for each training photo, at least 3000 (or more, by
-    the edges of photos over 90 000 pixels) and at most 30 000. In runs shorter than 7000, the paper's shorter
-    setting, the first densification and the bands of spherical harmonics come earlier in proportion."""
+    """Optimisation steps; 0: chosen by the photos. The choice is 30 for each training photo, at least 3000 (more in
+    proportion to the edges of photos over 90 000 pixels) and at most 30 000. In runs of fewer than 7000 (the paper's
+    shorter setting), the first densification and the bands of spherical harmonics come earlier in proportion."""
     seed: Annotated[int, within(least=0, most=UINT64_MAX)] = 0
     """Seed of the random start, of the order of the photos and of the strategy's random numbers."""
     optimizer: Literal["device", "numpy"] = "device"
@@ -296,9 +296,9 @@ class TrainConfig:
     strategy: Annotated[str, name_in("clsplat.training.densify:STRATEGIES")] = "error"
     """Densification strategy; adc is the paper's."""
     size: Literal["auto", "fixed"] = "auto"
-    """auto: the number of Gaussians and the degree of the spherical harmonics are chosen by photos that are held back
-    until the choice is made, and train afterwards (size.json explains it). fixed: the strategy alone decides, up to
-    the cap."""
+    """auto: the number of Gaussians and the degree of the spherical harmonics are chosen from photos that are held
+    back until the choice is made, and train afterwards (size.json explains the choice). fixed: the strategy alone
+    decides, up to the cap."""
     size_price: NonNegative = 0.05
     """Gain of quality, dB, that a doubling of the Gaussians or of the bytes must bring; with --size auto. Quality is
     the mean of PSNR and of SSIM in decibels."""
@@ -306,33 +306,33 @@ class TrainConfig:
     """Largest number of Gaussians in any iteration. A larger start is reduced to it. The strategies mcmc and error
     grow to it and need it with --size fixed."""
     blocks: Annotated[int | Literal["auto"], within(least=1)] = 1
-    """Number of parts in which the scene trains; auto: the fewest that fit the memory limit. Without --scheduler they
-    train one after the other. Iterations are those of a part."""
+    """Number of blocks in which the scene trains; auto: the fewest that fit the memory limit. Without --scheduler
+    they train one after the other, or on all devices of the same name. --iterations counts those of a block."""
     dropout: PartialFraction = 0.0
     """Fraction of the splats left out of each image at the end of the training; it rises from 0."""
     exposure: bool = False
     """Learn an affine map of the colours of each training photo, for photos with different exposure or white
     balance."""
     response: bool = False
-    """With --exposure, also learn a curve of each photo's response, and the vignetting that all photos share: for
-    cameras that change contrast, and for lenses that darken the corners."""
+    """With --exposure, also learn a contrast curve for each photo and the vignetting that all photos share: for
+    cameras that change the contrast, and for lenses that darken the corners."""
     filter_3d: bool = False
     """Keep every Gaussian at least as thick as the photos resolve (Mip-Splatting's 3D filter), for scenes that will
     be seen from closer or at a larger size than they were photographed, and with --mode antialiased also from farther
     away. Saved scenes contain the filter, so that any viewer shows them right."""
     poses: bool = False
-    """Refine the training photos' poses, where they are inaccurate. Held-out photos are then evaluated twice: with
-    their given poses, and with each camera aligned with the scene."""
+    """Refine the training photos' poses, if they are inaccurate. Held-out photos are then evaluated twice: with their
+    given poses, and with each camera aligned with the scene."""
     checkpoint_every: Count = 1000
     """Iterations between two checkpoints, from which an interrupted run resumes."""
     eval_every: Annotated[int, within(least=0)] = 500
     """Iterations between two evaluations of the held-out photos for the training curve (0: none before the end)."""
     device: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Part of the platform's or device's name. Default: PYOPENCL_CTX, or the first GPU, or a CPU."""
+    """Part of the platform's or device's name. Default: PYOPENCL_CTX, or the first GPU, accelerator or CPU."""
     memory_limit: Annotated[str | None, byte_size()] = None
     """Limit of device memory, such as 4GB or 512MiB (default: all memory of the device). The number of Gaussians
-    stops growing where more would exceed it. Photos that do not fit are uploaded each time they are needed. Decoded
-    photos in the machine's memory have the same limit (default: half of it); the others stream from the disk."""
+    stops growing before it exceeds the limit. Photos that do not fit are uploaded each time they are needed. The same
+    limit holds for decoded photos in the machine's memory (default: half of it); others stream from the disk."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     init: InitConfig = field(default_factory=InitConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)

@@ -55,7 +55,7 @@ VARIANTS = "CLSPLAT_VARIANTS"
 
 
 def list_devices() -> list[cl.Device]:
-    """All OpenCL devices, in the order of the platforms; an empty list if there is no driver."""
+    """List all OpenCL devices, in the order of the platforms; an empty list if there is no driver."""
     try:
         platforms = cl.get_platforms()
     except cl.LogicError:  # the loader found no driver
@@ -70,7 +70,7 @@ def list_devices() -> list[cl.Device]:
 
 
 def device_label(device: cl.Device) -> str:
-    """Platform and name of a device. ``--device`` selects by a part of it."""
+    """Platform and name of a device. ``--device`` takes a part of this text."""
     return f"{device.platform.name.strip()}: {device.name.strip()}"
 
 
@@ -120,13 +120,13 @@ class Device:
     Attributes
     ----------
     memory_limit : int
-        As above.
+        Largest total size of all buffers, bytes.
     model : dict
         Values of the constants of the rendering model.
     buffers : Buffers
-        Its memory.
+        Buffers in the device's memory.
     lengths : dict
-        Lengths of lists when they were last made, by name. The next ones are probably similar.
+        Lengths of lists when they were last made, by name. The next lists are probably of similar lengths.
     """
 
     def __init__(

@@ -89,13 +89,13 @@ def evaluate(
     renderer : Renderer, optional
         Its background is that of the photos where they were transparent. Default: ``Renderer()``.
     metrics : functions of `clsplat.metrics`
-        What is computed; `METRICS` and maybe `lpips`.
+        Metrics to compute, such as `METRICS`, or `METRICS` and `lpips`.
 
     Returns
     -------
     dict
         The content of metrics.json. ``mean`` holds the means over the views of psnr (dB), psnr_fitted (dB, after an
-        affine fit of the colours), ssim and flip, and of lpips if it is asked for; ``views`` holds the same of each
+        affine fit of the colours), ssim, flip, and lpips if it is in `metrics`; ``views`` holds the same of each
         view, its size and the paths of its pictures. None (null) stands for an infinite PSNR, as between equal
         images, and for FLIP where flip-evaluator is not installed.
 

@@ -75,10 +75,10 @@ class RayColors(NamedTuple):
 
 
 class Marching(NamedTuple):
-    """How rays are sampled: every max(step, cone t) from t = near to t = far, lengths in the field's coordinates.
+    """Sampling of rays: every max(step, cone t) from t = near to t = far, lengths in the field's coordinates.
 
-    Without `contracted`, rays begin and end at the unit cube. With it, space is contracted to a ball of radius 2, and
-    steps beyond t = 1 are as much longer as the contraction shortens them: max(step, cone t^2).
+    Without `contracted`, rays begin and end at the unit cube. With `contracted`, space is contracted to a ball of
+    radius 2, and steps beyond t = 1 are equal in contracted lengths: max(step, cone t^2).
     """
 
     step: float
@@ -89,10 +89,10 @@ class Marching(NamedTuple):
 
 
 class Span(NamedTuple):
-    """Where rays have intervals: lengths in the field's coordinates, as for `Marching`.
+    """Range of the intervals of rays: lengths in the field's coordinates, as for `Marching`.
 
-    Without `contracted`, rays begin and end at the unit cube, and intervals are equal in their lengths; with it, from
-    `near` to `far`, and equal in their contracted distances.
+    Without `contracted`, rays begin and end at the unit cube, and intervals have equal lengths. With `contracted`,
+    rays go from `near` to `far`, and intervals are equal in contracted distances.
     """
 
     near: float

@@ -65,8 +65,13 @@ def make_mesh(
     resolution : int
         Voxels along the longest edge of the box.
     box : pair of (3,), optional
-        Smallest and largest coordinates of the mesh, world units. Default: all surface points but a fiftieth on each
-        side.
+        Smallest and largest coordinates of the mesh, world units. Default: the box of all surface points, except for
+        the outermost fiftieth on each side.
+
+    Returns
+    -------
+    Mesh
+        Vertices in world units, faces and colours.
 
     Raises
     ------

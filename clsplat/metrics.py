@@ -64,8 +64,8 @@ def psnr(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> f
 def psnr_fitted(image: Array, truth: Array, mask: NDArray[np.bool_] | None = None) -> float:
     """PSNR after the affine map of the image's colours that brings the image closest to the truth.
 
-    It ignores changes that a photo's exposure and white balance make to all pixels alike, and that no training could
-    predict. Martin-Brualla et al. 2021 and Barron et al. 2022 fit held-out photos in a similar way.
+    This metric ignores changes that a photo's exposure and white balance make to all pixels alike, and that no
+    training could predict. Martin-Brualla et al. 2021 and Barron et al. 2022 fit held-out photos in a similar way.
 
     Parameters, result and errors are those of `psnr`. Up to rounding and clamping, the result is at least `psnr`.
     """

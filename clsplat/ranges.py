@@ -29,7 +29,7 @@ EXPECTED = {int: "an integer", float: "a finite number", str: "text", bool: "tru
 
 
 class Rule:
-    """What a setting may be, besides its type; an instance also makes the hint that ``--help`` shows."""
+    """Condition on the value of a setting, besides its type; an instance also makes the hint in ``--help``."""
 
     @property
     def words(self) -> str:

@@ -15,7 +15,7 @@ Array = NDArray[Any]
 
 
 class RasterPass(NamedTuple):
-    """What the gradients of one camera need.
+    """Forward pass of one camera, for its gradients.
 
     splats: as projected, with RGB and the depth as colours; colored: the same with the values that were composited.
     render (H, W, X), alpha (H, W, 1) and background (X,) are on the host, the others where the stages ran.
@@ -35,13 +35,26 @@ class RasterPass(NamedTuple):
 
 
 class RasterGradients(NamedTuple):
-    """Gradients of a scalar with respect to the arguments of `rasterization`, of their shapes.
+    """Gradients of a scalar with respect to the arguments of `rasterization`, in the arguments' shapes.
 
-    colors is that of the values or of the coefficients of spherical harmonics, summed over the cameras if they share
-    them. viewmats (C, 4, 4) has each entry as an independent variable, Ks (C, 3, 3) those of fx, fy, cx and cy.
-    means2d (C, N, 2) is the gradient with respect to the splats' centres, px, which densification uses; absgrad
-    (C, N, 2) are the sums over pixels of its absolute values (Ye et al. 2024, "AbsGS"), None unless they were asked
-    for.
+    Attributes
+    ----------
+    means, quats, scales, opacities : arrays in the arguments' shapes, float64
+        Gradients with respect to the activated parameters.
+    colors : (N, D), (C, N, D) or (N, K, 3) float64
+        Gradients with respect to the values, or to the coefficients of spherical harmonics; summed over the cameras
+        if these share them.
+    viewmats : (C, 4, 4) float64
+        Each entry of the upper three rows is an independent variable; the last row is 0.
+    Ks : (C, 3, 3) float64
+        Gradients with respect to fx, fy, cx and cy; 0 elsewhere.
+    backgrounds : (C, D) float64
+        Gradients with respect to the backgrounds.
+    means2d : (C, N, 2)
+        Gradients with respect to the splats' centres, per px, which densification uses.
+    absgrad : (C, N, 2) or None
+        Sums over pixels of the absolute gradients with respect to the splats' centres, per px (Ye et al. 2024,
+        "AbsGS"); None without ``absgrad=True``.
     """
 
     means: Array

@@ -62,7 +62,7 @@ def rasterization(
     opacities : (N,)
         In [0, 1] (activated).
     colors : (N, D) or (C, N, D), or (N, K, 3) with sh_degree
-        Values of D channels per Gaussian (and camera), or coefficients of spherical harmonics.
+        Values of D channels, 1 to 32, per Gaussian (and camera), or coefficients of spherical harmonics.
     viewmats : (C, 4, 4)
         World to camera.
     Ks : (C, 3, 3)
@@ -88,9 +88,9 @@ def rasterization(
     eps2d : float
         Variance that is added to the splats' 2D covariances, px^2. The reference has the default only.
     radius_clip : float
-        Splats whose half width is at most this are left out, px.
+        Half width, px, up to which splats are left out.
     gradients : bool
-        Whether `Rasterization.backward` follows. True keeps on the device what it needs.
+        Whether `Rasterization.backward` follows. True keeps its inputs on the device.
     normals : bool
         Whether meta also holds the surface: normals and median_depths, which have no gradient.
     device : Device, "reference" or None
@@ -101,7 +101,7 @@ def rasterization(
     Rasterization
         The tuple (render, alpha, meta), with a method `backward`. render (C, H, W, X) has X channels: D, 1 or D + 1,
         the depth last. alpha is (C, H, W, 1). meta is a dict of means2d (C, N, 2), conics (C, N, 3), depths (C, N),
-        opacities (C, N) with the compensation, radii (C, N, 2) px as integers, 0 for what is not visible,
+        opacities (C, N) with the compensation, radii (C, N, 2) px as integers, 0 for splats that are not visible,
         tiles_per_gauss (C, N), and width, height, tile_size, n_cameras; with `normals`, normals (C, H, W, 3), in the
         world, and median_depths (C, H, W), as `clsplat.surface.Surface` has them.
 
@@ -109,7 +109,9 @@ def rasterization(
     ------
     InputError
         If shapes do not fit each other, a number is out of range, or an array of another library is not in the memory
-        of the host, naming the argument.
+        of the host; the message names the argument.
+    DeviceError
+        If there is no OpenCL device, or a buffer exceeds its limits.
     """
     means, quats, scales, opacities = _arrays(means=means, quats=quats, scales=scales, opacities=opacities)
     colors, viewmats, Ks = _arrays(colors=colors, viewmats=viewmats, Ks=Ks)

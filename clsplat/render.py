@@ -25,7 +25,7 @@ Array = NDArray[Any]
 
 
 class Stored(Protocol):
-    """Gaussians that are not in memory together: those that some cameras may show are, at a time."""
+    """Gaussians that are read in parts: only those that some cameras may show are in memory at a time."""
 
     def __len__(self) -> int: ...
 
@@ -35,9 +35,10 @@ class Stored(Protocol):
         ...
 
     def shown(self, renderer: Renderer, cameras: Iterable[Camera]) -> Iterator[tuple[list[Camera], Gaussians]]:
-        """Yield the cameras, some at a time, and the Gaussians that these may show; both in their order.
+        """Yield the cameras, some at a time, and the Gaussians that these cameras may show; both in their order.
 
-        What is left out would not be drawn. Each camera has a near plane: no default follows from some Gaussians.
+        Gaussians that are left out would not be drawn. Each camera needs a near plane, because the default would
+        depend on the Gaussians that are read.
         """
         ...
 
@@ -53,7 +54,7 @@ class Rendering:
         1 - transmittance.
     depth : (H, W) or None
         Expected depth: the mean of the splats' depths in world units (z; distances for a fisheye and a panorama),
-        weighted as the colours are; 0 where alpha is 0. None unless asked for.
+        weighted as the colours are; 0 where alpha is 0. None without ``depth=True``.
     """
 
     def __init__(self, renderer: Renderer, run: Pass | None, gaussians: Gaussians, image: Array, alpha: Array):
@@ -177,14 +178,15 @@ def render(
     Parameters
     ----------
     gaussians : Gaussians
-        Pre-activation, on the host.
+        N Gaussians, pre-activation, on the host.
     camera : Camera
-        With the affine projection, an equirectangular one is resampled from six faces of a cube, and has no
-        gradients.
+        Camera of any model. With the affine projection, the image of an equirectangular camera is resampled from the
+        six faces of a cube, and has no gradients.
     config : RenderConfig
+        Settings of rendering.
     device : Device, "reference" or None
-        None takes the default OpenCL device, opened once and kept; "reference" the float64 twins, which are exact,
-        slow and need no OpenCL.
+        None takes the default OpenCL device, opened once and kept. "reference" takes the float64 twins, which are
+        exact and slow, and need no OpenCL.
     background : (3,) floats
         RGB behind the Gaussians.
     sh_degree : int, optional
@@ -192,7 +194,7 @@ def render(
     depth : bool
         Composite the expected depth too.
     gradients : bool
-        Keep on the device what `Rendering.backward` needs. False is for pictures alone: faster, and nothing stays.
+        Keep the inputs of `Rendering.backward` on the device. False renders only the image, which is faster.
 
     Returns
     -------
@@ -224,15 +226,22 @@ def render_views(
 
     Parameters
     ----------
+    gaussians : Gaussians
+        N Gaussians, pre-activation, on the host.
     cameras : iterable of Camera
-        Cameras of any sizes; each is asked for when its image is.
-    gaussians, config, device, background, sh_degree, depth
-        As given to `render`, which has the errors too.
+        Cameras of any sizes. The next camera is taken when its image is needed.
+    config, device, background, sh_degree, depth
+        As for `render`.
 
     Yields
     ------
     Rendering
         One per camera, without gradients.
+
+    Raises
+    ------
+    InputError, DeviceError
+        As `render`.
     """
     return renderings(Renderer(device, config, background), gaussians, cameras, sh_degree, depth=depth)
 
@@ -246,7 +255,7 @@ def renderings(
     depth: bool = False,
     gradients: bool = False,
 ) -> Iterator[Rendering]:
-    """Render with a renderer that exists; arguments and errors as of `render`.
+    """Render one image after the other with a `Renderer`; arguments and errors as for `render_views`.
 
     Parameters
     ----------
@@ -269,7 +278,7 @@ def renderings(
 def _renderings(
     renderer: Renderer, gaussians: Gaussians, cameras: Iterable[Camera], degree: int, depth: bool, gradients: bool
 ) -> Iterator[Rendering]:
-    """A generator, apart from `renderings` so that this one's errors come before the first image is asked for."""
+    """Generator of the images. It is separate so that errors of `renderings` come before the first image."""
     placed = renderer.place(gaussians) if len(gaussians) else gaussians
     near: float | None = None
     for camera in cameras:

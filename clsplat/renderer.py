@@ -30,7 +30,7 @@ class Gradients(NamedTuple):
 
     gaussians: one per field of `Gaussians`, pre-activation; means2d (N, 2): per pixel, the statistic of
     densification; viewmat (4, 4): each entry as an independent variable; intrinsics (4,): fx, fy, cx, cy. The last
-    two are None if they were not asked for.
+    two are None unless they were requested.
     """
 
     gaussians: Gaussians
@@ -61,7 +61,7 @@ class Pass:
 
 
 class Renderer:
-    """Where and how Gaussians become images.
+    """A device, settings and a background with which Gaussians are rendered.
 
     Parameters
     ----------
@@ -79,11 +79,11 @@ class Renderer:
     device : Device or None
         None for the reference.
     config, background
-        As given.
+        The arguments.
     backdrop : Gaussians or None
-        Where the stages run.
+        The argument, with its arrays where the stages run.
     stages : Stages
-        The functions of the stages that it runs.
+        Functions of the stages: launches on the device, or the twins of the reference.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Scenes: posed photos and sparse points, as `clsplat.dataset` loads them."""
+"""Scenes: photos with their cameras, and sparse points, as `clsplat.dataset` loads them."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -34,11 +34,12 @@ class DepthMap:
     Parameters
     ----------
     values : (H, W) float32
-        As they are in the file; NaN where the map knows none.
+        Values of the file; NaN where the depth is unknown.
     inverse : bool
         Whether the values fall with the depth.
     scale, shift : float
-        Found by `clsplat.dataset.depth_maps.aligned`. As they are by default, the values are in world units.
+        Scale and shift, which `clsplat.dataset.depth_maps.aligned` finds. By default, `values` are depths in world
+        units.
     """
 
     values: NDArray[np.float32]
@@ -172,8 +173,8 @@ class Scene:
     colors : (P, 3) uint8
         RGB of the points.
     offset : (3,) float64
-        What was subtracted from the world's coordinates, in world units; zero unless the cameras are far from the
-        origin, as in geo-referenced scenes.
+        Offset that was subtracted from the world's coordinates, in world units; zero unless the cameras are far from
+        the origin, as in geo-referenced scenes.
     """
 
     train: list[View]

@@ -1,6 +1,6 @@
 """A test of a device: every stage on a small scene, against its twin, within seconds.
 
-`clsplat devices` runs it in a process of its own for each device, because a faulty driver can end the process.
+`clsplat devices` runs it in a separate process for each device, because a faulty driver can end the process.
 """
 
 from collections.abc import Callable, Iterator
@@ -322,7 +322,7 @@ def _report(index: int, answers: Any) -> None:
 
 
 def faults_of(index: int) -> dict[str, str]:
-    """`faults` of the device with this index in `clsplat.device.list_devices`, tested in a process of its own.
+    """`faults` of the device with this index in `clsplat.device.list_devices`, tested in a separate process.
 
     A driver that ends the process, or takes longer than `TIME_LIMIT`, is a fault of "device".
     """

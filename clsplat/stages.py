@@ -137,7 +137,7 @@ class Bins(NamedTuple):
 
 class Image(NamedTuple):
     """Result of compositing: rgb (H, W, C), background included, with the depth, or its inverse, as a fourth channel
-    where it was asked for; and alpha (H, W)."""
+    if one was requested; and alpha (H, W)."""
 
     rgb: Any
     alpha: Any

@@ -1,4 +1,4 @@
-"""Photos that do not fit the memory: they are decoded when they are needed, and the next ones meanwhile."""
+"""Photos that do not fit the memory: they are decoded when they are needed, the next ones ahead of time."""
 
 import os
 import warnings
@@ -54,7 +54,7 @@ def photo_budget(memory: int | None) -> int | None:
 
 @dataclass(frozen=True)
 class Source:
-    """How a photo is read.
+    """Source of a photo that is read when it is needed.
 
     decode: returns it, with the arrays of `View`; camera: its camera; layers: arrays that it may have; used: whether
     any pixel counts, found without decoding the photo itself.
@@ -182,7 +182,7 @@ def _nbytes(view: View) -> int:
 
 
 class StreamedView(View):
-    """A view that a `PhotoStream` reads when its arrays are asked for.
+    """A view that a `PhotoStream` reads when its arrays are needed.
 
     ``dataclasses.replace`` makes an ordinary view of it, in memory; `with_camera` and `changed` do not.
     """

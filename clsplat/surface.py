@@ -23,7 +23,7 @@ class Surface(NamedTuple):
         Median depth: where the pixel's ray has the largest density of this Gaussian, world units (z; distances for a
         fisheye and a panorama); 0 where there is none.
     normals : (H, W, 3) float64
-        Unit vectors in world coordinates: its shortest axis, turned to the camera; 0 where there is none.
+        Unit vectors in world coordinates: the Gaussian's shortest axis, turned to the camera; 0 where there is none.
     """
 
     ids: NDArray[np.int32]
@@ -35,7 +35,7 @@ def surface_of(gaussians: Gaussians, camera: Camera, ids: NDArray[np.int32]) -> 
     """Compute depths and normals of the surface from the indices of its Gaussians.
 
     The density along the ray t d is largest at t = (w . u)/(u . u) with w = L^-1 p, u = L^-1 d and L L^T the
-    covariance. This is exact, whatever the projection of the image.
+    covariance. This is exact for every projection of the image.
 
     Parameters
     ----------
@@ -43,7 +43,11 @@ def surface_of(gaussians: Gaussians, camera: Camera, ids: NDArray[np.int32]) -> 
         On the host.
     camera : Camera
     ids : (H, W) int32
-        Result of `clsplat.ops.median_splats`.
+        Index of the Gaussian in each pixel, as `clsplat.ops.median_splats` finds it; -1 where there is none.
+
+    Returns
+    -------
+    Surface
     """
     seen = ids >= 0
     unique, inverse = np.unique(ids[seen], return_inverse=True)

@@ -46,7 +46,7 @@ class Figure:
 
     @property
     def result(self) -> str:
-        """How a difference from the best competitor is called."""
+        """Name of a difference from the best competitor: win, tie, loss or noise unknown."""
         if self.error is None:
             return "noise unknown"
         if abs(self.value) <= ERRORS * self.error:

@@ -1,4 +1,4 @@
-"""Where the time of radiance fields goes: evaluations per pixel, operations, bytes, and the share of each stage."""
+"""Account of the time of radiance fields: evaluations per pixel, operations, bytes, and the share of each stage."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -29,7 +29,7 @@ HEADS = ("heads_fwd", "heads_sh_fwd", "heads_soft_fwd")
 
 
 class Work:
-    """What stages have done: evaluations of the field, operations of networks, bytes, and clocks by stage.
+    """Work of the stages: evaluations of the field, operations of networks, bytes, and clocks by stage.
 
     Bytes are those of the arrays that a stage reads and writes, each once; of tables, the entries of the points.
     """

@@ -25,8 +25,8 @@ from clsplat.ranges import parse_bytes
 from clsplat.scene import Color, Scene, View, evenly_spaced
 
 SAMPLE_EVERY = 3
-"""One of so many samples of a training of Gaussians is taken of a field, the last among them: its images take
-seconds."""
+"""Divisor of the number of evaluations during a training: a field, whose images take seconds, has a third of those of
+Gaussians, the last included."""
 
 TIMED_VIEWS = 5
 """Number of held-out views that are rendered for the rate of frames: a field takes seconds for some."""

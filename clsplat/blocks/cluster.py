@@ -90,10 +90,10 @@ def run_on_cluster(address: str, jobs: list[Path], views: list[View], tell: Call
 
 
 def _why(job: Path, error: Exception) -> str:
-    """Why a block has failed."""
+    """Sentence on the failure of a block."""
     if isinstance(error, ClsplatError):
         return f"block {job.stem}: {error}"
-    return f"block {job.stem}: expected a worker that trains it, found that each one has died meanwhile"
+    return f"block {job.stem}: expected a worker that trains it, found that each worker died"
 
 
 def _train(job: str, desk: str) -> str:

@@ -31,7 +31,7 @@ FORMAT = 2
 
 @dataclass(frozen=True)
 class Job:
-    """How a block is trained.
+    """Description of the training of a block.
 
     data: folder of the dataset; scene: name of the index (`clsplat.blocks.parts`), beside the job's file, of the
     Gaussians from which the block starts and that surround it; near: where these are used; far: the index of those

@@ -46,7 +46,7 @@ def devices_like(device: "Device") -> list[int]:
 
 
 def run_on_devices(jobs: list[Path], devices: list[int], tell: Callable[[str], None]) -> None:
-    """Train the blocks that have no result, each in a process of its own, one at a time on each device.
+    """Train the blocks that have no result, each in a separate process, one at a time on each device.
 
     The processes end with this one. A block that has been interrupted continues from its last checkpoint.
 
@@ -97,7 +97,7 @@ def _ended(process: subprocess.Popen[bytes]) -> None:
 
 
 def _reason(status: int, errors: IO[bytes]) -> str:
-    """Why a process failed: the last line that it wrote."""
+    """Reason of the failure of a process: its status, and the last line that it wrote."""
     errors.seek(0)
     lines = errors.read().decode(errors="replace").strip().splitlines()
     return f"its process ended with status {status}{': ' if lines else ''}{''.join(lines[-1:])}"

@@ -92,8 +92,8 @@ def check_blocks(config: TrainConfig) -> None:
     for name in ("exposure", "poses"):
         if getattr(config, name):
             raise InputError(
-                f"--{name}: expected not with --blocks, whose blocks would each learn their own for the same photo; "
-                "leave out one of them"
+                f"--{name}: expected a training without --blocks, found both: each block would learn its own values "
+                "for the same photo; leave out one of them"
             )
 
 

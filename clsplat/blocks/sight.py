@@ -1,4 +1,4 @@
-"""Which Gaussians photos may show, by bounds alone: no more are read from a scene that does not fit the memory."""
+"""Bounds of the Gaussians that photos may show. Only these are read from a scene that does not fit the memory."""
 
 from collections.abc import Iterable
 from math import log, sqrt

@@ -68,7 +68,7 @@ class StoredScene:
         yield from self._shown(renderer, cameras[half:])
 
     def _read(self, renderer: Renderer, cameras: list[Camera]) -> Gaussians | None:
-        """What cameras may show; None if these are several and it is too much for all of them."""
+        """Read the Gaussians that cameras may show; None if there are several cameras, and too many Gaussians."""
         most = np.inf if renderer.device is None or len(cameras) == 1 else SHARE * renderer.device.memory_limit
         found, size = [self._none], 0
         for part in compress(self._parts, seen(cameras, bounds_of(self._parts), renderer.config)):

@@ -1,4 +1,4 @@
-"""What a scene shows in photos: the weights of its Gaussians, by which blocks choose photos and share pixels."""
+"""Weights of a scene's Gaussians in photos, by which blocks choose photos and share pixels."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace

@@ -232,8 +232,8 @@ def merge(jobs: list[Path], path: Path, offset: NDArray[np.float64] | None = Non
 def write_log(out: Path, jobs: list[Path], last: dict[str, Any]) -> None:
     """Write the log of a run: those of the blocks one after the other, and a last record.
 
-    Iterations and seconds go on from block to block; `block` counts blocks from 1. The last record, about the whole
-    scene, needs only what is measured in it.
+    Iterations and seconds continue from block to block; `block` counts blocks from 1. The last record is about the
+    whole scene; `last` has only its measurements.
     """
     lines: list[dict[str, Any]] = []
     iteration, seconds = 0, 0.0

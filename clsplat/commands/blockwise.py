@@ -32,7 +32,7 @@ def train_in_blocks(
     Raises
     ------
     JobsPrinted
-        If `where` asks for commands, and blocks have to be trained.
+        If `where.print_jobs` is set, and blocks have to be trained.
     """
     from clsplat.blocks.stored import StoredScene
     from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log

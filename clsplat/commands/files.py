@@ -124,7 +124,7 @@ class Export:
         say(f"{out}: {len(gaussians)} Gaussians, {out.stat().st_size / 1e6:.3g} MB")
 
     def _load(self, scene: Path, turn: bool) -> "tuple[Gaussians, Mode, Any]":
-        """Read the scene; with the axes that were asked for, if an .spz is to `turn`."""
+        """Read the scene; if `turn` is set, an .spz with the axes of --spz-axes."""
         from clsplat.formats import load_gaussians
         from clsplat.formats.spz import load_spz
 

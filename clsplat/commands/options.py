@@ -61,10 +61,11 @@ class ServerOptions:
 
 @dataclass(frozen=True)
 class ClusterOptions:
-    """Settings of where blocks train."""
+    """Settings of the machines on which blocks train."""
 
     scheduler: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
     """Scheduler of dask whose workers train the blocks, such as tcp://host:8786; needs the extra `cluster`."""
     print_jobs: bool = False
-    """Print the commands that train the blocks, for a batch system, and stop. When they have run, the same command
-    with --resume goes on: the first time it prints those of the second trainings, then it merges."""
+    """Print the commands that train the blocks, for a batch system, and stop. When they have run, repeat the command
+    with --resume: the first time it prints the commands of the second trainings, the next time it joins the
+    blocks."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from clsplat.show.viewer import Viewer
 
 WAITING = "compiling kernels, which are kept for the next run, and waiting for the first step"
-"""What happens before the first step. Drivers compile some kernels only when they run for the first time."""
+"""Text of the progress bar before the first step. Drivers compile some kernels only when they first run."""
 
 PAUSE = 1.0
 """Time of the viewer between two steps, s, above which the estimate of the bar leaves it out: the training was

@@ -48,18 +48,18 @@ class Train:
     """Train Gaussians on photos, a video, a COLMAP model with its photos, or a transforms.json."""
 
     data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS|VIDEO|DATASET")]
-    """Folder of photos, with or without cameras, or a video. The two sharpest frames of each second of a video are
+    """Folder of photos, with or without cameras, or a video. The sharpest frame of each half second of a video is
     written to the folder `frames` of OUT (`clsplat frames` takes more or fewer)."""
     out: Out
     """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians, such as scene.spz, which is
     written as well; its name without the suffix becomes the folder."""
     method: Annotated[str, name_in("clsplat.fields:method_names")] = "gaussians"
-    """Gaussians or a radiance field. For a field only --iterations, --seed, the settings of the photos, of
-    evaluations and of checkpoints, --device and --memory-limit count."""
+    """Gaussians or a radiance field. A field has only these settings: --iterations, --seed, those of the photos, of
+    evaluations and of checkpoints, --device and --memory-limit."""
     resume: bool = False
     """Continue the interrupted run in OUT."""
     viewer: bool = False
-    """Watch and pause the training in the browser, as --open does; needs the extra `viewer`."""
+    """Watch and pause the training in the browser (--open also opens it); needs the extra `viewer`."""
     server: Annotated[ServerOptions, tyro.conf.arg(name="")] = field(default_factory=ServerOptions)
     cluster: Annotated[ClusterOptions, tyro.conf.arg(name="")] = field(default_factory=ClusterOptions)
     preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
@@ -95,7 +95,7 @@ class Train:
             try:
                 gaussians, viewer = self.trained(out, suffix)
             except JobsPrinted:
-                say("when these commands have run, go on with the same one and --resume")
+                say("when these commands have run, repeat this command with --resume")
                 return
         if viewer and gaussians is not None:
             say(f"viewer: {viewer.address} stays open; Ctrl-C ends it")
@@ -104,7 +104,7 @@ class Train:
             viewer.close()
 
     def trained(self, out: Path, suffix: str) -> "tuple[Gaussians | None, Viewer | None]":
-        """Train in a folder that is held, and write the file of Gaussians that a suffix asks for."""
+        """Train in a folder that is held; if `suffix` is not empty, also write a file of Gaussians."""
         from clsplat.formats import load_gaussians, save_gaussians
 
         check_new(out, self.resume)
@@ -130,7 +130,7 @@ class Train:
     def _trained(
         self, scene: "Scene", config: TrainConfig, device: "Device", out: Path, viewer: "Viewer | None"
     ) -> "Gaussians | None":
-        """Train all at once; or in blocks, if they are asked for and one is not enough: the result is then None."""
+        """Train the whole scene; or return None after training in blocks, if the settings ask for more than one."""
         from clsplat.renderer import Renderer
         from clsplat.training.checkpoint import CHECKPOINT
 
@@ -138,9 +138,7 @@ class Train:
             raise InputError("--scheduler, --print-jobs: expected with --blocks, found --blocks 1; add --blocks auto")
         if config.blocks != 1:
             if viewer:
-                raise InputError(
-                    "--viewer: expected not with --blocks, which train apart from each other; leave out one"
-                )
+                raise InputError("--viewer: expected a training without --blocks, found both; leave out one of them")
             renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
             if stored := train_in_blocks(scene, config, renderer, self._photos(out), out, self.cluster):
                 self._began(out)()
@@ -151,7 +149,7 @@ class Train:
         return train_and_report(scene, config, device, out, resume, viewer, self._began(out))
 
     def _began(self, out: Path) -> Callable[[], None]:
-        """What is left to do after the first step, for which a user waits: a picture of recovered cameras."""
+        """Return a function that draws the recovered cameras, to run after the first step, for which a user waits."""
 
         def draw() -> None:
             if not self.resume:
@@ -290,7 +288,7 @@ def say_size(scene: "Scene", out: Path) -> None:
 def evaluate_held_out(
     gaussians: "Gaussians | Stored", scene: "Scene", config: TrainConfig, renderer: "Renderer", out: Path
 ) -> None:
-    """Evaluate the held-out photos, twice where poses were refined: as posed, and with their cameras aligned."""
+    """Evaluate the held-out photos; if poses were refined, also with the photos' cameras aligned with the scene."""
     from clsplat.commands.generalisation import generalisation
     from clsplat.evaluate import evaluate
     from clsplat.gaussians import Gaussians

@@ -263,7 +263,7 @@ def _view(plan: Plan, reduce: int, config: DataConfig) -> View:
 
 
 def _source_positions(plan: Plan, reduce: int) -> NDArray[np.float32] | None:
-    """Where the pixels of a photo, before its reduction, lie in the file's; None where they are those of the file."""
+    """Positions in the file of a photo's pixels before its reduction; None if they are the file's own pixels."""
     photo, camera = plan.photo, plan.camera
     if photo.face:
         return face_positions(photo.face, *plan.size, camera.width * reduce) + 1

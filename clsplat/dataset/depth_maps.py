@@ -169,7 +169,7 @@ def _rank_correlation(samples: _Samples) -> float:
 
 
 def _fitted(samples: _Samples, inverse: bool) -> tuple[float, float, float, float]:
-    """Scale and shift by which the map's inverse depths are those of the points, whatever some of them are.
+    """Scale and shift that fit the map's inverse depths to those of the points, even if some of them are wrong.
 
     The median of the slopes between pairs (Theil 1950, Sen 1968) is the start, since neither wrong depths of the map
     nor points that are wrong or hidden change it much. Reweighted least squares with Tukey's biweights,

@@ -78,7 +78,7 @@ class _Bounded(io.BufferedReader):
 
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
-    """Open a photo with Pillow; whatever goes wrong while it is open is an InputError that names it."""
+    """Open a photo with Pillow; any error while it is open becomes an InputError that names the photo."""
     if path.suffix.lower() in HEIF and not heif_is_read():
         raise InputError(
             f"cannot read {path}: the package pillow-heif is not installed; pip install 'clsplat[heic]', or convert "

@@ -1,4 +1,4 @@
-"""Where the pixels of an undistorted photo lie in the file's, and their values."""
+"""Positions in the file of an undistorted photo's pixels, and their values."""
 
 from functools import lru_cache
 from typing import Any

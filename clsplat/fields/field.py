@@ -1,4 +1,4 @@
-"""What all fields share: where they lie, their rays, their images and their arrays."""
+"""Base class of the radiance fields: their place in space, their rays, their images and their arrays."""
 
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -39,7 +39,7 @@ class Field(ABC):
     space : Space
     device : Device
     seed : int
-        Of all random numbers.
+        Seed of all random numbers.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Field(ABC):
     """
 
     name: str
-    """Of the method, as `--method` takes it."""
+    """Name of the method, as `--method` takes it."""
 
     iterations: int
     """Default number of steps."""

@@ -53,7 +53,7 @@ def train_field(
     resume : bool
         Continue from the checkpoint in `out`, to the same bits as a training that was never interrupted.
     evaluate : callable
-        Called with the field after every iteration; what it returns, if anything, is logged. Its time does not count.
+        Called with the field after every iteration. Its result, if any, is logged; the times in the log exclude it.
     progress : callable
         Called after every iteration with iteration, iterations, loss and rays. If it raises KeyboardInterrupt, a
         checkpoint is written.

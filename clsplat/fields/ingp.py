@@ -45,7 +45,7 @@ RAYS_MAX = 32768
 """Largest number of rays in a step."""
 
 EVALUATED = 1 << 18
-"""Number of points at which the grid asks for densities at once."""
+"""Number of points at which densities for the grid are computed at once."""
 
 
 class Evaluation(NamedTuple):
@@ -89,7 +89,7 @@ class IngpBase(Field):
 
     @property
     def rays(self) -> int:
-        """Number of rays of the next step: so many that they have about `samples` samples."""
+        """Number of rays of the next step, chosen so that they have about `samples` samples."""
         return self._rays
 
     def step(self, batch: Batch, progress: float) -> float:

@@ -33,7 +33,7 @@ BETA1, BETA2, EPS = 0.9, 0.999, 1e-7
 
 
 class Seen(NamedTuple):
-    """A pass of a network along rays, all on the device: what it was asked, the lengths, and the colours of rays."""
+    """Pass of a network along rays, all on the device: its inputs, the lengths, and the colours of rays."""
 
     asked: Asked
     deltas: Any

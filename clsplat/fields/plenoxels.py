@@ -40,11 +40,11 @@ BETA2, EPS = 0.95, 1e-8
 TV_DENSITY, TV_HARMONICS = 1e-5, 1e-3
 """Weights of the total variation of densities, in inverse halves of an edge, and of harmonics, for synthetic scenes
 (Fridovich-Keil et al. 2022, section 4 of the supplement). The paper's code ends this penalty with the first
-refinement. With few photos' pixels for each cell, trainings then overfit: so it stays, as in that code's settings for
-captures of one's own."""
+refinement. If photos have few pixels for each cell, trainings then overfit. Here the penalty therefore stays until
+the end, as in that code's settings for users' own captures."""
 
 TV_SHARE = 100
-"""One of so many corners has the total variation in its gradient, others in each step (section 3.4)."""
+"""Number of steps after which each corner has had the total variation in its gradient once (section 3.4)."""
 
 TV_CELLS = 256
 """Cells along an edge for which differences are not scaled (equation 3)."""
@@ -98,7 +98,7 @@ class Plenoxels(Field):
 
     @property
     def rays(self) -> int:
-        """Number of rays of the next step: so many that they have about `samples` samples."""
+        """Number of rays of the next step, chosen so that they have about `samples` samples."""
         return self._rays
 
     @property

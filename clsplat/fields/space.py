@@ -68,7 +68,7 @@ class Space:
 
     @property
     def marching(self) -> Marching:
-        """How rays are sampled."""
+        """Sampling of the rays of fields that have a grid of occupied cells."""
         if not self.contracted:
             return Marching(STEP, 0.0, 0.0, CUBE_FAR, False)
         return Marching(2 * STEP, CONE, self.near, FAR, True)  # the unit ball is two wide
@@ -85,7 +85,7 @@ class Space:
 
     @property
     def span(self) -> Span:
-        """Where rays have intervals."""
+        """Range of the intervals of rays."""
         return Span(self.near, FAR if self.contracted else CUBE_FAR, self.contracted)
 
     def rays(self, camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:

@@ -1,4 +1,4 @@
-"""Files of Gaussians: a reader, a writer and an anatomy for each format; some have one side only.
+"""Files of Gaussians: a reader, a writer and an anatomy for each format. Some formats are only read or only written.
 
 Belongs here: one module per format, and what formats share: `validity` (all of them), `quantisation` and `codebook`
 (the compact ones), `axes` (those with other axes than PLY), containers (`ply_container`, `glb_container`,
@@ -99,7 +99,8 @@ def load_gaussians(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float6
         Rendering mode for which the scene was trained, according to the file; classic if the format does not store
         it.
     offset : (3,) float64
-        What was subtracted from the world's coordinates, in world units; zeros if the format does not store it.
+        Offset that was subtracted from the world's coordinates, in world units; zeros if the format does not store
+        it.
 
     Raises
     ------
@@ -134,7 +135,7 @@ def save_gaussians(
     mode : {"classic", "antialiased"}
         Rendering mode for which the scene was trained.
     offset : (3,) array_like, optional
-        What was subtracted from the world's coordinates, in world units.
+        Offset that was subtracted from the world's coordinates, in world units.
 
     Raises
     ------

@@ -17,7 +17,7 @@ PALETTE_MAX = 1 << 16
 """Largest number of entries in a palette of rows, so that an index is two bytes."""
 
 PALETTE_MIN = 1024
-"""Number of rows up to which each row has an entry of its own in the palette."""
+"""Number of rows up to which each row has its own entry in the palette."""
 
 PALETTE_SHARE = 3
 """Mean number of rows per entry of the palette, for more than PALETTE_MIN rows. Measurement: docs/formats.md."""
@@ -63,7 +63,7 @@ def shared_rows(rows: Array, most: int) -> tuple[Array, Array] | None:
     tuple or None
         Different rows (P, D), in the order of their first appearance, and labels (N,); None if there are more.
     """
-    # Rows with equal sums of their columns, multiplied by irregular factors, are equal but for rare coincidences.
+    # Rows with equal sums of their columns, multiplied by irregular factors, are equal, except for rare coincidences.
     factors = np.sqrt(np.arange(2, rows.shape[1] + 2, dtype=np.float64))
     _, first, labels = np.unique(rows @ factors, return_index=True, return_inverse=True)
     if len(first) > most:

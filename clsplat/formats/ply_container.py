@@ -1,4 +1,4 @@
-"""The PLY container: header and rows of its elements, whatever they describe.
+"""The PLY container: header and rows of its elements, of any content.
 
 Gaussians in a PLY are `clsplat.formats.ply` and `clsplat.formats.compressed_ply`. plyfile parses headers; rows are
 read by NumPy, once the size of the file is known to suffice.

@@ -66,7 +66,7 @@ ZSTD_LEVEL = 12
 
 
 class Header(NamedTuple):
-    """What the header declares, and the key of `AXES` in a record; None if the file declares no axes."""
+    """Values of the header. axes: the key of `AXES` in a record, None if the file declares no axes."""
 
     version: int
     n: int

@@ -1,4 +1,4 @@
-"""K-means in which each row has a metric of its own.
+"""K-means in which each row has its own metric.
 
 The cost of an entry c for a row x is (x - c)^T M (x - c), summed over the columns of x, with the row's matrix M. But
 for a constant this is an inner product of a vector that depends on the row and one that depends on the entry. A table

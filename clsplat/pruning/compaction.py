@@ -115,7 +115,8 @@ def compact(
         Views that price the Gaussians; `loss` has others.
     loss : LossMeter
     limits : Limits
-        With a limit of the loss the smallest file is searched, otherwise the smallest loss.
+        With a limit of the loss, the result is the smallest file within it; otherwise the version of the smallest
+        loss.
     stored : Stored
     renderer : Renderer
 

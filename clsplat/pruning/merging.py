@@ -62,7 +62,7 @@ def neighbours(gaussians: Gaussians) -> NDArray[np.intp]:
 
 
 def masses(gaussians: Gaussians) -> Array:
-    """Masses, (N,) float64: optical depth times the mean area of the projections, but for a constant factor."""
+    """Masses, (N,) float64: optical depth times the mean area of the projections, up to a constant factor."""
     return _depths(gaussians.opacities) * _areas(np.exp(gaussians.log_scales.astype(np.float64)))
 
 

@@ -28,7 +28,7 @@ def _mapped(image: Array, affine: Array) -> Array:
 
 
 def _beyond(y: Array, photo: Array) -> Array:
-    """Where mapped colours `y` lie beyond the limit at which the camera has clipped the photo."""
+    """Mask of the mapped colours `y` beyond the limit at which the camera has clipped the photo."""
     return ((photo == 255) & (y > 1)) | ((photo == 0) & (y < 0))
 
 

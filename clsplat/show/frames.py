@@ -26,7 +26,7 @@ SOLID = 0.5
 
 
 class Look(NamedTuple):
-    """What a frame shows: one of `MODES`, the colour behind the scene, and the highest degree of the spherical
+    """Settings of a frame: one of `MODES`, the colour behind the scene, and the highest degree of the spherical
     harmonics. None takes the renderer's background and all degrees."""
 
     mode: str = MODES[0]

@@ -1,4 +1,4 @@
-"""When a browser's next frame is due, and at which resolution: coarse while the camera moves, then refined."""
+"""Times and resolutions of a browser's frames: coarse while the camera moves, then refined."""
 
 import math
 from dataclasses import dataclass, field

@@ -45,7 +45,7 @@ def _reason(error: Exception) -> str:
 
 
 class Viewer:
-    """A server that shows Gaussians in browsers. Until `show` is called, its page says what it waits for.
+    """Server that shows Gaussians in browsers. Until `show` is called, its page says what the viewer waits for.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ class Viewer:
                 warnings.warn(f"the viewer failed: {_reason(error)}; its frames may be missing or old", stacklevel=3)
 
     def _frame_of(self, camera: Camera, gaussians: Gaussians) -> tuple[NDArray[np.uint8], str]:
-        """A frame as the panel asks for it, with its legend."""
+        """Render a frame with the settings of the panel; return it with its legend."""
         assert self._renderer is not None
         if self._near is None and len(gaussians):  # once: the means may be on the device
             self._near = default_near(download(gaussians.means))
@@ -283,7 +283,7 @@ class Viewer:
             self._text.content, self._written = text, now
 
     def hold(self, gaussians: Gaussians, until: Callable[[], bool] = lambda: False) -> None:
-        """Show Gaussians that do not change, but for the edits of browsers, until `until` returns True or Ctrl-C.
+        """Show Gaussians that only browsers edit, until `until` returns True or Ctrl-C.
 
         Parameters
         ----------
@@ -322,7 +322,7 @@ class Viewer:
     def follow(self, gaussians: Gaussians, interrupted: Callable[[], bool]) -> None:
         """Draw the frames that browsers request, and wait while the training is paused.
 
-        A training calls this between two iterations. An error of the viewer becomes a warning, whatever its type.
+        A training calls this between two iterations. An error of the viewer of any type becomes a warning.
 
         Parameters
         ----------

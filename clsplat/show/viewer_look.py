@@ -46,5 +46,5 @@ class LookInputs:
         return red, green, blue
 
     def look(self) -> Look:
-        """What a frame shows."""
+        """Settings of a frame."""
         return Look(self._mode.value, self.background(), self._degree.value)

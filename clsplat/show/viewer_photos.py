@@ -36,7 +36,7 @@ PANEL_WIDTH = 320
 """Longer edge of the selected photo in the panel, px."""
 
 COMPARISONS = ("off", "overlay", "beside")
-"""How the selected photo is compared with the render: not, laid over it, or to the left of a line."""
+"""Comparisons of the selected photo with the render: none, the photo over the render, or to the left of a line."""
 
 SAME_ANGLE = 1e-3
 """Largest difference of two rotation matrices, per entry, up to which views are the same. Half a pixel of a window of

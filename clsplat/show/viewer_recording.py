@@ -37,7 +37,7 @@ class Recording:
     later : callable
         Takes a function of the Gaussians that the owner of the device calls.
     frame_of : callable
-        Renders a camera's frame of Gaussians as the panel asks for it; returns it with its legend.
+        Renders a camera's frame of Gaussians with the settings of the panel; returns it with its legend.
     """
 
     def __init__(

@@ -143,7 +143,7 @@ def is_own_page(headers: Headers) -> bool:
 
 
 def _checked(process_request: Any, token: str | None) -> Any:
-    """A `process_request` hook of websockets that refuses what is not admitted, and passes the rest on."""
+    """Hook `process_request` of websockets that refuses requests that are not admitted, and passes on the others."""
 
     def check(connection: ServerConnection, request: Request) -> Response | Any:
         if token is not None:

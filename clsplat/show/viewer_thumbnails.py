@@ -34,7 +34,7 @@ def scaled(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint
 
 
 class Thumbnails:
-    """Makes the grid when it is asked for, since it needs every photo.
+    """Make the grid on demand, because it needs every photo.
 
     viser has no buttons with pictures. So the grid is a group of buttons with the photos' names, and a style sheet
     gives them pictures.

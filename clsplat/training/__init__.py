@@ -4,7 +4,7 @@ Belongs here: the loop and its step, the state and its checkpoints, the optimise
 (`densify`), the search for the number of Gaussians (`autosize`) and whole configurations (`presets`). Does not belong
 here: loading photos, evaluation, and anything that writes a scene.
 
-What loops of one's own need can be imported from here.
+Your own training loops can import what they need from here.
 """
 
 from clsplat.training.densify import STRATEGIES, Strategy

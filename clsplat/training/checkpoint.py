@@ -112,7 +112,7 @@ def load_state(path: Path, extent: float, config: TrainConfig, inputs: Inputs | 
         Scale of the scene, world units.
     config : TrainConfig
     inputs : Inputs, optional
-        Those of the run that goes on from the state; None if none does.
+        Inputs of the run that continues from the state; None if no run does.
 
     Raises
     ------

@@ -42,7 +42,7 @@ class Photo(NamedTuple):
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a run trains on.
+    """Inputs of a run.
 
     train, test: photos by name; points: digest of points and colours, empty without points; device: its platform,
     name and driver version.
@@ -73,13 +73,13 @@ class Inputs:
         return cls(train, test, **{name: str(value) for name, value in saved.items()})
 
     def continued(self, now: "Inputs", path: Path) -> "Inputs":
-        """The inputs of a run that goes on from these.
+        """Inputs of a run that continues from these.
 
         Parameters
         ----------
         now : Inputs
             Those that are there now. A scene without points does not differ in them: only the start needed them, and
-            a run that goes on does not triangulate them again.
+            a run that continues does not triangulate them again.
         path : Path
             The checkpoint, for the message.
 

@@ -58,13 +58,13 @@ def train(
         Continue from the checkpoint in `out`, to the same bits as a run that was never interrupted.
     evaluate : callable, optional
         Called every `config.eval_every` iterations with the Gaussians, on the device, and at the end with those that
-        are returned; what it returns is logged. Its time does not count.
+        are returned. Its result is logged. The times in the log do not include it.
     evaluate_after : container of int, optional
         Iterations after which `evaluate` is called instead; not at the end.
     progress : callable
-        Called after every iteration with iteration, loss, num_gaussians and gaussians, which are the ones that train
-        and must not be changed. Its time does not count. If it raises KeyboardInterrupt, a checkpoint is written
-        before the run ends.
+        Called after every iteration with a dict of iteration, loss, num_gaussians and gaussians. These are the
+        Gaussians that train, and must not be changed. The times in the log do not include it. If it raises
+        KeyboardInterrupt, a checkpoint is written before the run ends.
 
     Returns
     -------
@@ -74,9 +74,9 @@ def train(
     Raises
     ------
     InputError
-        If a setting is out of range, the scene has no photos to train on, or `resume` finds no checkpoint, or one of
-        other photos, masks, cameras or points, or of another configuration, or another process or thread trains into
-        the folder.
+        If a setting is out of range, the scene has no photos to train on, or another process or thread trains into
+        the folder. With `resume`, if there is no checkpoint, or it was made with other photos, masks, cameras, points
+        or settings.
     DeviceError
         If the device's memory, or its limit, is exceeded.
     ClsplatError

@@ -85,14 +85,14 @@ def adam_settings(
 
 
 class Adam:
-    """Adam for loops of one's own, with the learning rates of training; parameters and moments stay on the device.
+    """Adam for your own training loops, with the learning rates of training; all arrays stay on the device.
 
     Parameters
     ----------
     gaussians : Gaussians
-        What is trained; its arrays are replaced by those of the device, which `step` changes in place.
+        Gaussians to train, pre-activation. Their arrays are copied to the device, where `step` changes them in place.
     renderer : Renderer
-        Where the gradients come from.
+        Renderer that computes the gradients.
     iterations : int
         Number of steps, over which the learning rate of the means falls.
     extent : float

@@ -51,7 +51,7 @@ def prepare(
     scene : Scene, optional
         The dataset, if `load_scene` has read it already with `config.data`.
     resume : bool
-        The result continues a run: points are not triangulated again, if only its start needed them.
+        Whether the result continues a run. Points that only its start needed are then not triangulated again.
     verbose : bool
         Show COLMAP's own messages.
     tell : callable
@@ -114,13 +114,13 @@ def check_memory(scene: Scene, config: TrainConfig, device: "Device", tell: Call
 
 
 def of_fixed_size(config: TrainConfig, gaussians: int, rate: float) -> TrainConfig:
-    """The configuration of a training that goes on with Gaussians that have been trained, and edits none.
+    """Configuration of a training that continues with trained Gaussians, and adds or removes none.
 
     Parameters
     ----------
     config : TrainConfig
     gaussians : int
-        Their number.
+        Number of the Gaussians.
     rate : float
         Factor on the first learning rate of the means.
     """
@@ -141,7 +141,7 @@ def open_device(config: TrainConfig) -> "Device":
     Raises
     ------
     InputError
-        If the limit is no number of bytes.
+        If the limit is not a number of bytes.
     DeviceError
         If there is no such device.
     """

@@ -15,7 +15,7 @@ from clsplat.training.session import Training
 
 
 class Recorder:
-    """What happens after each iteration of a training.
+    """Log, checkpoints and evaluations after the iterations of a training.
 
     Parameters
     ----------

@@ -24,9 +24,9 @@ HOLDER = ".lock.json"
 def held(out: Path) -> Iterator[None]:
     """Hold the folder of a run while the block runs, against other processes and threads.
 
-    The system ends the lock when the process dies, by whatever means. A thread may hold a folder more than once. The
-    folder is created if it is missing, and removed again if the block leaves nothing in it. What processes left that
-    died while they wrote a file is removed.
+    The system ends the lock when the process ends, even if it is killed. A thread may hold a folder more than once.
+    The folder is created if it is missing, and removed again if the block leaves nothing in it. Files that killed
+    processes left half written are removed.
 
     Raises
     ------
@@ -68,14 +68,14 @@ def held(out: Path) -> Iterator[None]:
 
 
 def _sign(out: Path) -> None:
-    """Write who holds the folder."""
+    """Write the process that holds the folder, its host and the time to the folder."""
     since = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
     with replacing(out / HOLDER) as file:
         file.write(json.dumps({"process": os.getpid(), "host": socket.gethostname(), "since": since}).encode())
 
 
 def _holder(out: Path) -> str:
-    """Who holds the folder, as far as it is known: a process signs after it has locked."""
+    """Process that holds the folder, if it is known: a process signs after it has locked."""
     try:
         signed = json.loads((out / HOLDER).read_text())
         return f"process {signed['process']} on {signed['host']} (since {signed['since']})"

@@ -41,7 +41,7 @@ class Training:
     config : TrainConfig
     device : Device
     state : State
-        The state to go on from.
+        State from which the training continues.
     backdrop : Gaussians, optional
         Gaussians that are drawn in every image and do not train, such as the surroundings of a block.
     """
@@ -75,7 +75,7 @@ class Training:
         return viewpoints(cameras), steepest_slope(cameras)
 
     def fork(self, state: State) -> "Training":
-        """A training of the same scene that goes on from another state."""
+        """Make a training of the same scene that continues from another state."""
         result = copy(self)
         result.state = state
         return result
@@ -103,7 +103,7 @@ class Training:
         return loss
 
     def _view(self, iteration: int) -> View:
-        """The view of an iteration; those of the next ones are read meanwhile, if they stream."""
+        """View of an iteration. If photos stream, those of the next iterations are read at the same time."""
         view = view_at(iteration, self._views, self.config.seed)
         for later in range(iteration, iteration + view.ahead + 1) if view.ahead else ():
             self.photos.prefetch(view_at(later, self._views, self.config.seed))
@@ -204,7 +204,7 @@ def step(training: Training, view: View) -> float:
 
 
 def view_at(iteration: int, views: list[View], seed: int) -> View:
-    """The view of an iteration, counted from 1: every epoch takes all views in an order of its own."""
+    """View of an iteration, counted from 1. Every epoch takes all views, in another random order."""
     epoch, position = divmod(iteration - 1, len(views))
     return views[_order(seed, epoch, len(views))[position]]
 

@@ -64,7 +64,7 @@ def test_one_block_is_todays_training(dataset: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--blocks", 2, "--poses"), "--poses: expected not with --blocks"),
+        (("--blocks", 2, "--poses"), "--poses: expected a training without --blocks"),
         (("--blocks", 99), "--blocks: expected at most 3, as the coarse scene has 60 Gaussians, found 99"),
         (("--blocks", 0), "--blocks"),
         (("--print-jobs",), "expected with --blocks, found --blocks 1"),

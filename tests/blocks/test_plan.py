@@ -61,7 +61,7 @@ def test_too_many_blocks() -> None:
 
 @pytest.mark.parametrize("name", ["poses", "exposure"])
 def test_what_photos_learn_is_not_trained_in_blocks(name: str) -> None:
-    with pytest.raises(InputError, match=f"^--{name}: expected not with --blocks"):
+    with pytest.raises(InputError, match=f"^--{name}: expected a training without --blocks"):
         check_blocks(replace(TrainConfig(), **{name: True}))
 
 

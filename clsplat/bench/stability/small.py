@@ -26,7 +26,7 @@ CONFIG = TrainConfig(
     checkpoint_every=100,
     max_gaussians=80,
     init=InitConfig(sh_degree=1),
-    # The original's rates, but for the means: the points are off by 0.05, which is 600 times the original's step.
+    # The original's rates, except for the means: the points are off by 0.05, which is 600 times the original's step.
     optim=replace(load_preset("paper-7k").optim, means_lr=1.6e-3, means_lr_final=1e-4, sh_degree_every=2333),
     coarse=CoarseConfig(factor=1),
     adc=AdcConfig(every=50, reset_every=1000, grad_threshold=1e-5),

@@ -50,7 +50,7 @@ while True:
 """
 """Program that repeatedly prints the number of rows of a table, summed over databases.
 
-It must run in a process of its own. File locks belong to processes: within one process, Python's SQLite and
+It must run in a separate process. File locks belong to processes: within one process, Python's SQLite and
 pycolmap's do not see each other's locks, and the memory that they share can be truncated while COLMAP uses it, which
 ends in a bus error. In another process, and with the database in WAL mode, it never makes COLMAP wait."""
 

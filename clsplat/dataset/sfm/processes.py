@@ -47,7 +47,7 @@ def child(
 
 
 def apart(what: str, function: str, work: Path, **arguments: Any) -> Any:
-    """Call a function in a process of its own, since COLMAP ends its process where it cannot go on.
+    """Call a function in a separate process, because COLMAP ends its process if it cannot continue.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def apart(what: str, function: str, work: Path, **arguments: Any) -> Any:
 
 
 def how_it_ended(status: int) -> str:
-    """How a process ended that gave no answer."""
+    """Sentence on the end of a process that gave no answer."""
     if status >= 0:
         return f"the process of COLMAP ended with status {status}; its output is above"
     name = signal.Signals(-status).name

@@ -290,7 +290,7 @@ def _readable(folder: Path, names: list[str], work: Path, edge_max: int) -> Path
 
 
 def _solved(work: Path, folder: Path, names: list[str], config: SfmConfig, verbose: bool) -> int:
-    """Run `solve` in a process of its own."""
+    """Run `solve` in a separate process."""
     registered: int = apart(
         "recover the cameras",
         "clsplat.dataset.sfm.solving:solve",

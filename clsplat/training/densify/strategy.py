@@ -44,7 +44,7 @@ Survey = Callable[[int], Contributions]
 class Edit(NamedTuple):
     """New rows in exchange for old ones.
 
-    gaussians: the M rows after the edit, but for their spherical harmonics, which are those of the old rows; rows
+    gaussians: the M rows after the edit, without their spherical harmonics, which are those of the old rows; rows
     (M,): the old row that each new one continues; fresh (M,) bool: whether the optimiser's moments of a new row start
     at 0; reset_opacities: whether the moments of all opacities do.
     """
