@@ -114,7 +114,7 @@ def test_an_answer_that_comes_too_late_is_asked_for_again(
     with workers(1, APART + IMPATIENT) as cluster:
         run(cluster.scheduler_address, planned)
     found = [result_of(job).read_bytes() for job in planned.jobs]
-    assert asked.count(asked[3]) == 2
+    assert asked.count(asked[3]) >= 2, "on a busy machine the second answer may be late, too"
     for job in planned.jobs:
         result_of(job).unlink()
     assert found == [train_block(job, planned.scene.train, device).read_bytes() for job in planned.jobs]
