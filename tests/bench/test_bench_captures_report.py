@@ -112,6 +112,11 @@ def test_the_noise_of_the_noise_is_right():
     assert 0.02 * 300 < wins < 0.12 * 300
 
 
+def test_errors_of_counts_are_whole_numbers():
+    """45.8k ± 0.333 would read as 333 Gaussians."""
+    assert Figure(45_772, 0.333).text(QUANTITIES["num_gaussians"]) == "45.8k ± 0"
+
+
 @pytest.mark.parametrize(
     ("value", "error", "expected"),
     [(0.3, 0.1, "win"), (0.2, 0.1, "tie"), (-0.2, 0.1, "tie"), (-0.3, 0.1, "loss"), (9.0, None, "noise unknown")],
