@@ -75,6 +75,24 @@ typedef int16 mask16;
 #define TO_INT4(x)  convert_int4(x)
 #define TO_INT16(x) ((int16)(TO_INT8((x).lo), TO_INT8((x).hi)))
 
+// Square roots and fused multiply-adds of 8 reals. A call of PoCL's functions would spill all vector registers, so that
+// instructions are named where there are any; both results are correctly rounded, as those of the functions.
+#if !defined(USE_DOUBLE) && defined(__clang__) && defined(__AVX__) && defined(__FMA__)
+typedef float Lanes8 __attribute__((vector_size(32))); // built-in functions of Clang take no float8
+#define AS_LANES8(x)  __builtin_astype(x, Lanes8)
+#define ROOT8(x)      __builtin_astype(__builtin_ia32_sqrtps256(AS_LANES8(x)), real8)
+#define FMA8(a, b, c) __builtin_astype(__builtin_ia32_vfmaddps256(AS_LANES8(a), AS_LANES8(b), AS_LANES8(c)), real8)
+#else
+#define ROOT8(x) OF8(sqrt, x)
+#ifdef USE_DOUBLE
+#define FMA8(a, b, c) ((real8)(fma((a).lo, (b).lo, (c).lo), fma((a).hi, (b).hi, (c).hi)))
+#else
+#define FMA8(a, b, c) fma(a, b, c)
+#endif
+#endif
+#define ROOT(x)   sqrt(x)
+#define ROOT16(x) ((real16)(ROOT8((x).lo), ROOT8((x).hi)))
+
 // Prefetches memory to read or to write, where addresses are random. Only for kernels on the host's processor, where addresses are ordinary pointers.
 #if defined(__clang__) && (defined(__x86_64__) || defined(__aarch64__))
 #define FETCH_TO_READ(p)  __builtin_prefetch((const void *)(size_t)(p))

@@ -13,11 +13,11 @@
 #elif defined(USE_DOUBLE)
 #define REALS_OF(x)  IN_HALVES(real8, convert_double4, x)
 #define MASKS_OF(x)  IN_HALVES(mask8, convert_long4, x)
-#define FMA(a, b, c) ((real8)(fma((a).lo, (b).lo, (c).lo), fma((a).hi, (b).hi, (c).hi)))
+#define FMA(a, b, c) FMA8(a, b, c)
 #else
 #define REALS_OF(x)  convert_float8(x)
 #define MASKS_OF(x)  (x)
-#define FMA(a, b, c) fma(a, b, c)
+#define FMA(a, b, c) FMA8(a, b, c)
 #endif
 
 // r2 in the unit of 2 sigma, including EXTENT_SLACK (clsplat/constants.py). If it is not positive, the splat is
@@ -72,8 +72,8 @@ static inline masks ellipse_ranges(const Ellipses *e, reals lo, reals hi, reals 
     const reals t_left = left * e->inv_half_height, t_right = right * e->inv_half_height;
     const reals rest_left = FMA(-t_left, t_left, one), rest_right = FMA(-t_right, t_right, one);
     const reals sq_left = e->half_sq * GREATER(rest_left, zero), sq_right = e->half_sq * GREATER(rest_right, zero);
-    *x_min = FMA(e->slope, left, -OF_LANES(sqrt, sq_left));
-    *x_max = FMA(e->slope, right, OF_LANES(sqrt, sq_right));
+    *x_min = FMA(e->slope, left, -ROOTS(sq_left));
+    *x_max = FMA(e->slope, right, ROOTS(sq_right));
     return lo <= hi;
 }
 

@@ -60,7 +60,7 @@ static inline mat3 axes_around(reals3 n) {
 
 // Components without the blur: the scales are smaller by sqrt(kept).
 static inline reals3 unblurred(const Footprint *f, reals3 b) {
-    return vector3(b.x * OF_LANES(sqrt, f->kept.x), b.y * OF_LANES(sqrt, f->kept.y), b.z * OF_LANES(sqrt, f->kept.z));
+    return vector3(b.x * ROOTS(f->kept.x), b.y * ROOTS(f->kept.y), b.z * ROOTS(f->kept.z));
 }
 
 static inline Footprint footprint(const Camera *camera, reals3 mean, reals3 scales, reals4 unit_quat) {
@@ -85,7 +85,7 @@ static inline Footprint footprint(const Camera *camera, reals3 mean, reals3 scal
     f.blur = (real)BLUR * f.lens.depth * f.lens.depth / (camera->fx * camera->fy);
     const reals3 wider = vector3(squares.x + f.blur, squares.y + f.blur, squares.z + f.blur);
     f.kept = vector3(squares.x / wider.x, squares.y / wider.y, squares.z / wider.z);
-    f.scales = vector3(OF_LANES(sqrt, wider.x), OF_LANES(sqrt, wider.y), OF_LANES(sqrt, wider.z));
+    f.scales = vector3(ROOTS(wider.x), ROOTS(wider.y), ROOTS(wider.z));
     f.rotation = rotation_from_quat(unit_quat);
     f.t0 = camera_rotate_back(camera, f.lens.j0);
     f.t1 = camera_rotate_back(camera, f.lens.j1);
@@ -218,7 +218,7 @@ typedef struct {
 static inline reals2 shadow(reals r2, reals open, reals xx, reals xz) {
     const reals zero = 0, beyond = (real)1e30;
     const reals lean = r2 * (xz < zero ? -xz : xz), square = lean * lean + open * r2 * xx;
-    const reals reach = lean + OF_LANES(sqrt, GREATER(square, zero));
+    const reals reach = lean + ROOTS(GREATER(square, zero));
     const reals near = square < zero ? beyond : r2 * xx / reach;
     const reals far = open > zero ? reach / open : beyond;
     const reals2 range = {xz < zero ? -near : -far, xz < zero ? far : near};
@@ -249,7 +249,7 @@ static inline Outline ray_outline(const Camera *camera, const Footprint *f, real
     const reals det = inv * (f->det * inv + (f->yy * dx * dx - 2 * f->xy * dx * dy + f->xx * dy * dy) / r2);
     const masks closed = open > (reals)OPEN_MIN;
     const reals2 middle = {closed ? centre.x + dx : box_x.x, closed ? centre.y + dy : box_y.x};
-    const reals2 extent = {closed ? OF_LANES(sqrt, r2 * xx) : box_x.y, closed ? OF_LANES(sqrt, r2 * yy) : box_y.y};
+    const reals2 extent = {closed ? ROOTS(r2 * xx) : box_x.y, closed ? ROOTS(r2 * yy) : box_y.y};
     const Outline outline = {middle, extent,
                              vector3(closed ? yy / det : zero, closed ? -xy / det : zero, closed ? xx / det : zero)};
     return outline;

@@ -23,6 +23,7 @@ typedef real8 reals;
 typedef mask8 masks; // results of comparisons of reals: all bits of a lane are set if it is true
 typedef int8 ints;
 #define OF_LANES(f, x) OF8(f, x)
+#define ROOTS(x)       ROOT8(x)
 #define TO_INTS(x)     TO_INT8(x) // of reals or masks
 #define LANE_NUMBERS   ((reals)(0, 1, 2, 3, 4, 5, 6, 7))
 DEFINE_POWER(8)
@@ -34,6 +35,7 @@ typedef real reals;
 typedef int masks;
 typedef int ints;
 #define OF_LANES(f, x) f(x)
+#define ROOTS(x)       ROOT(x)
 #define TO_INTS(x)     ((int)(x))
 #define LANE_NUMBERS   ((reals)0)
 DEFINE_POWER()

@@ -78,17 +78,17 @@ static inline void add_outer(reals3 a, reals3 b, mat3 *m) {
 }
 
 static inline reals3 normalized3(reals3 v) {
-    const reals norm = OF_LANES(sqrt, dot3(v, v));
+    const reals norm = ROOTS(dot3(v, v));
     return vector3(v.x / norm, v.y / norm, v.z / norm);
 }
 
 static inline reals4 normalized4(reals4 v) {
-    const reals norm = OF_LANES(sqrt, dot4(v, v));
+    const reals norm = ROOTS(dot4(v, v));
     return vector4(v.x / norm, v.y / norm, v.z / norm, v.w / norm);
 }
 
 static inline reals3 normalize_vjp(reals3 v, reals3 v_unit) {
-    const reals inv_norm = 1 / OF_LANES(sqrt, dot3(v, v));
+    const reals inv_norm = 1 / ROOTS(dot3(v, v));
     const reals3 unit = scaled3(inv_norm, v);
     return combined3(inv_norm, v_unit, -inv_norm * dot3(unit, v_unit), unit);
 }
@@ -112,7 +112,7 @@ static inline reals4 rotation_from_quat_vjp(reals4 q, const mat3 *v) {
 }
 
 static inline reals4 normalize_quat_vjp(reals4 q, reals4 v_unit) {
-    const reals inv_norm = 1 / OF_LANES(sqrt, dot4(q, q));
+    const reals inv_norm = 1 / ROOTS(dot4(q, q));
     const reals4 unit = scaled4(inv_norm, q);
     const reals along = dot4(unit, v_unit);
     return scaled4(inv_norm, vector4(v_unit.x - along * unit.x, v_unit.y - along * unit.y, v_unit.z - along * unit.z,

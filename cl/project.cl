@@ -179,7 +179,7 @@ static inline void footprint_vjp(const Camera *camera, const Footprint *f, reals
 static inline reals compensation(reals det0, reals det) {
 #if ANTIALIASED
     const reals ratio = det0 / det, least = COMPENSATION_MIN * COMPENSATION_MIN;
-    return OF_LANES(sqrt, GREATER(ratio, least));
+    return ROOTS(GREATER(ratio, least));
 #else
     return 1;
 #endif
@@ -189,7 +189,7 @@ static inline reals2 compensation_vjp(reals det0, reals det, reals v_factor) {
     reals2 v = {0, 0};
 #if ANTIALIASED
     const reals ratio = det0 / det, least = COMPENSATION_MIN * COMPENSATION_MIN, zero = 0;
-    const reals v_ratio = ratio > least ? v_factor * (real)0.5 / OF_LANES(sqrt, ratio) : zero;
+    const reals v_ratio = ratio > least ? v_factor * (real)0.5 / ROOTS(ratio) : zero;
     v.x = v_ratio / det;
     v.y = -v_ratio * ratio / det;
 #endif
@@ -220,8 +220,20 @@ static inline masks shows_pixel(reals lo, reals hi, int size) {
 // The coefficients k with first <= k < last of the Gaussians from i on: values[3 (k - first) + c] for channel c.
 static inline void load_coefficients(const __global real *sh, size_t i, size_t n, int stride, int first, int last,
                                      reals *values) {
+#if LANES == 8
+    // Without the tests of each chunk: loads go straight to the registers that are transposed.
+    if (i + LANES <= n && last - first == COEFFICIENTS) {
+        const __global real *row = sh + 3 * (i * stride + first);
+        for (int k = 0; k < CHUNKS; ++k) {
+            for (int lane = 0; lane < LANES; ++lane)
+                values[LANES * k + lane] = load8(row + 3 * lane * stride + LANES * k);
+            transpose(values + LANES * k);
+        }
+        return;
+    }
+#endif
     for (int lane = 0; lane < LANES; ++lane) {
-        const size_t row = min(i + lane, n - 1) * stride;
+        const size_t row = LESSER(i + lane, n - 1) * stride;
         for (int k = 0; k < CHUNKS; ++k)
             load_chunks(sh, 3 * (row + first) + LANES * k, 3 * (row + last), 1, values + LANES * k + lane);
     }
@@ -261,7 +273,7 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
     const reals3 conic = outline.conic;
 #else
     const reals2 centre = lens_centre(&camera, f.p);
-    const reals2 extent = {OF_LANES(sqrt, r2 * f.xx), OF_LANES(sqrt, r2 * f.yy)};
+    const reals2 extent = {ROOTS(r2 * f.xx), ROOTS(r2 * f.yy)};
     const reals3 conic = vector3(f.yy / f.det, -f.xy / f.det, f.xx / f.det);
 #endif
     reals basis[16];
@@ -273,7 +285,7 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
 #endif
     FOR_COEFFICIENTS(first, active) {
         reals values[3 * COEFFICIENTS];
-        const int last = min(first + COEFFICIENTS, active);
+        const int last = LESSER(first + COEFFICIENTS, active);
         load_coefficients(sh, i, n, sh_stride, first, last, values);
         for (int k = first; k < last; ++k) {
             const reals *c = values + 3 * (k - first);
@@ -419,7 +431,7 @@ INLINED GaussianGrad gaussian_vjp(size_t i, size_t n, const Camera *camera, int 
 #endif
     FOR_COEFFICIENTS(first, active) {
         reals values[3 * COEFFICIENTS];
-        const int last = min(first + COEFFICIENTS, active);
+        const int last = LESSER(first + COEFFICIENTS, active);
         load_coefficients(gaussians.sh, i, n, sh_stride, first, last, values);
         for (int k = first; k < last; ++k) {
             const reals *c = values + 3 * (k - first);
@@ -547,18 +559,24 @@ typedef struct {
     __global real *parameters, *first, *second;
 } AdamArrays;
 
+#if LANES == 8
+static inline void update_whole_chunk(const Adam *adam, reals rates, reals g, size_t begin, AdamArrays a) {
+    reals m = load8(a.first + begin), v = load8(a.second + begin);
+    store8(a.parameters + begin, adam_update8(adam, rates, load8(a.parameters + begin), g, &m, &v));
+    store8(a.first + begin, m);
+    store8(a.second + begin, v);
+}
+#endif
+
 // Updates a chunk of adjacent parameters from `begin` on. Those from `end` on are left as they are.
 static inline void update_chunk(const Adam *adam, reals rates, reals g, size_t begin, size_t end, AdamArrays a) {
 #if LANES == 8
     if (begin + LANES <= end) {
-        reals m = load8(a.first + begin), v = load8(a.second + begin);
-        store8(a.parameters + begin, adam_update8(adam, rates, load8(a.parameters + begin), g, &m, &v));
-        store8(a.first + begin, m);
-        store8(a.second + begin, v);
+        update_whole_chunk(adam, rates, g, begin, a);
         return;
     }
 #endif
-    for (size_t i = begin; i < min(begin + LANES, end); ++i) {
+    for (size_t i = begin; i < LESSER(begin + LANES, end); ++i) {
         real m = a.first[i], v = a.second[i];
         a.parameters[i] = adam_update(adam, LANE(rates, i - begin), a.parameters[i], LANE(g, i - begin), &m, &v);
         a.first[i] = m;
@@ -648,6 +666,19 @@ __kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const 
     FOR_COEFFICIENTS(first, active) {
         reals values[3 * COEFFICIENTS];
         coefficients_grad(basis, v.color, first, values);
+#if LANES == 8
+        if (i + LANES <= n && first + COEFFICIENTS <= active) {
+            for (int lane = 0; lane < LANES; ++lane) {
+                const size_t begin = 3 * ((i + lane) * sh_stride + first);
+                for (int k = 0; k < CHUNKS; ++k) {
+                    const reals number = LANE_NUMBERS + (3 * first + LANES * k);
+                    update_whole_chunk(&adam, number < 3 ? sh0 : sh_rest, values[LANES * k + lane],
+                                       begin + LANES * k, of_sh);
+                }
+            }
+            continue;
+        }
+#endif
         for (int lane = 0; lane < LANES && i + lane < n; ++lane) {
             const size_t row = (i + lane) * sh_stride;
             for (int k = 0; k < CHUNKS; ++k) {
