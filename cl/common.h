@@ -78,6 +78,12 @@ typedef int16 mask16;
 // Square roots and fused multiply-adds of 8 reals. A call of PoCL's functions would spill all vector registers, so that
 // instructions are named where there are any; both results are correctly rounded, as those of the functions.
 #if !defined(USE_DOUBLE) && defined(__clang__) && defined(__AVX__) && defined(__FMA__)
+// Compilers drop such built-in functions when they find general ones for them.
+#define NAMED_INSTRUCTIONS (__has_builtin(__builtin_ia32_sqrtps256) && __has_builtin(__builtin_ia32_vfmaddps256))
+#else
+#define NAMED_INSTRUCTIONS 0
+#endif
+#if NAMED_INSTRUCTIONS
 typedef float Lanes8 __attribute__((vector_size(32))); // built-in functions of Clang take no float8
 #define AS_LANES8(x)  __builtin_astype(x, Lanes8)
 #define ROOT8(x)      __builtin_astype(__builtin_ia32_sqrtps256(AS_LANES8(x)), real8)
@@ -93,7 +99,8 @@ typedef float Lanes8 __attribute__((vector_size(32))); // built-in functions of 
 #define ROOT(x)   sqrt(x)
 #define ROOT16(x) ((real16)(ROOT8((x).lo), ROOT8((x).hi)))
 
-// Prefetches memory to read or to write, where addresses are random. Only for kernels on the host's processor, where addresses are ordinary pointers.
+// Prefetches memory to read or to write, where addresses are random. Only for kernels on the host's processor, where
+// addresses are ordinary pointers.
 #if defined(__clang__) && (defined(__x86_64__) || defined(__aarch64__))
 #define FETCH_TO_READ(p)  __builtin_prefetch((const void *)(size_t)(p))
 #define FETCH_TO_WRITE(p) __builtin_prefetch((const void *)(size_t)(p), 1)
