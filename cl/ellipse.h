@@ -10,14 +10,15 @@
 #define REALS_OF(x)  ((real)(x))
 #define MASKS_OF(x)  (x)
 #define FMA(a, b, c) fma(a, b, c)
-#elif defined(USE_DOUBLE)
-#define REALS_OF(x)  IN_HALVES(real8, convert_double4, x)
-#define MASKS_OF(x)  IN_HALVES(mask8, convert_long4, x)
-#define FMA(a, b, c) FMA8(a, b, c)
 #else
-#define REALS_OF(x)  convert_float8(x)
-#define MASKS_OF(x)  (x)
 #define FMA(a, b, c) FMA8(a, b, c)
+#ifdef USE_DOUBLE
+#define REALS_OF(x) IN_HALVES(real8, convert_double4, x)
+#define MASKS_OF(x) IN_HALVES(mask8, convert_long4, x)
+#else
+#define REALS_OF(x) convert_float8(x)
+#define MASKS_OF(x) (x)
+#endif
 #endif
 
 // r2 in the unit of 2 sigma, including EXTENT_SLACK (clsplat/constants.py). If it is not positive, the splat is
