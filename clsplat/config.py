@@ -113,6 +113,8 @@ class InitConfig:
 
     triangulate: bool = True
     """Triangulate points from the photos if the dataset has poses but no points; otherwise the start is random."""
+    dense: bool = True
+    """Add points where neighbouring photos agree on a depth, if there are few sparse points for the photos' size."""
     random_points: Annotated[int | None, within(least=1, most=UINT32_MAX)] = None
     """Number of Gaussians of a random start, if there are no points. Default: 100 000 (original), or 10 000 with
     --size auto, which adds more where they are needed."""
@@ -311,8 +313,7 @@ class TrainConfig:
     dropout: PartialFraction = 0.0
     """Fraction of the splats left out of each image at the end of the training; it rises from 0."""
     exposure: bool = False
-    """Learn an affine map of the colours of each training photo, for photos with different exposure or white
-    balance."""
+    """Learn an affine map of each training photo's colours, for photos of different exposure or white balance."""
     response: bool = False
     """With --exposure, also learn a contrast curve for each photo and the vignetting that all photos share: for
     cameras that change the contrast, and for lenses that darken the corners."""

@@ -85,3 +85,11 @@ doi:10.1109/TIP.2003.819861). Borders are padded with zeros, as in the training 
 _WINDOW = [exp(-0.5 * (i - SSIM_WINDOW // 2) ** 2 / SSIM_SIGMA**2) for i in range(SSIM_WINDOW)]
 SSIM_TAPS = tuple(w / sum(_WINDOW) for w in _WINDOW)
 """Weights of SSIM's window along one axis. Their sum is 1."""
+
+SWEEP_RADIUS = 2
+"""Half of the window in which the stage sweep compares photos, px: 5x5 pixels, as small as noise allows, since a
+window across an edge of depth has the depth of neither side."""
+
+SWEEP_VARIANCE_MIN = (3 / 255) ** 2
+"""Least variance of grey values in such a window: 3 levels of 8 bits, the noise of a photo. Flat windows are alike at
+all depths."""

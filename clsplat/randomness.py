@@ -19,6 +19,7 @@ PURPOSES = (
     "pixels of a batch",
     "offsets of samples",
     "points of the grid",
+    "dense points",
 )
 """Uses of random numbers. The index is part of the stream: new purposes are added at the end."""
 

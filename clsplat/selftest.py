@@ -1,7 +1,5 @@
-"""A test of a device: every stage on a small scene, against its twin, within seconds.
-
-`clsplat devices` runs it in a separate process for each device, because a faulty driver can end the process.
-"""
+"""A test of a device: every stage on a small scene, against its twin. `clsplat devices` runs it in a separate process
+for each device, because a faulty driver can end the process."""
 
 from collections.abc import Callable, Iterator
 from multiprocessing import get_context
@@ -171,10 +169,8 @@ def test_exposure(b: Bench) -> Found:
     for affine in (first, np.concatenate([first, first[:, :2]], axis=1)):
         yield b.stages.exposure_fwd(b.up(image), affine, b.up(photo)), reference.exposure_fwd(image, affine, photo)
         found, expected = b.up(v), v.copy()
-        yield (
-            b.stages.exposure_bwd(b.up(image), affine, b.up(photo), found),
-            reference.exposure_bwd(image, affine, photo, expected),
-        )
+        v_affine = reference.exposure_bwd(image, affine, photo, expected)
+        yield b.stages.exposure_bwd(b.up(image), affine, b.up(photo), found), v_affine
         yield found, expected
 
 
@@ -273,6 +269,15 @@ def test_sort(b: Bench) -> Found:
         keys = b.rng.integers(0, 2**16, count).astype(np.uint32)
         _, order = b.stages.argsort(b.up(keys), 16)
         yield order, np.argsort(keys, kind="stable")
+
+
+def test_sweep(b: Bench) -> Found:
+    grey, planes = b.random(HEIGHT, WIDTH), np.array([1.0, 2, 3])
+    maps = np.array([[1, 0, 0, 0, 1, 0, 0, 0, 1, x, 0.4, 0] for x in (0.3, -0.3)])
+    found = b.stages.sweep_similarities(b.up(grey), [b.up(grey)] * 2, b.up(maps), b.up(planes))
+    expected = reference.sweep_similarities(grey, [grey] * 2, maps, planes)
+    yield found, expected
+    yield from zip(b.stages.sweep_best(found, b.up(planes)), reference.sweep_best(expected, planes), strict=True)
 
 
 TESTS: dict[str, Callable[[Bench], Found]] = {

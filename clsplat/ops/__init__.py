@@ -43,6 +43,7 @@ from clsplat.ops.rays import rays_bwd, rays_fwd
 from clsplat.ops.removal import removal, removal_residuals, removal_sums
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
+from clsplat.ops.sweep import sweep_best, sweep_similarities
 from clsplat.ops.take import take_rows
 from clsplat.ops.voxels import voxels_bwd, voxels_fwd, voxels_tv
 from clsplat.ops.weights import weights_bwd, weights_fwd
@@ -73,6 +74,8 @@ class Launches:
         self.removal_residuals = partial(removal_residuals, device)
         self.disparity_loss = partial(disparity_loss, device)
         self.disparity_grad = partial(disparity_grad, device)
+        self.sweep_similarities = partial(sweep_similarities, device)
+        self.sweep_best = partial(sweep_best, device)
         self.exposure_fwd = partial(exposure_fwd, device)
         self.exposure_bwd = partial(exposure_bwd, device)
         self.l1_ssim = partial(l1_ssim, device)

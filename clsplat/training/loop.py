@@ -1,5 +1,6 @@
 """Training on a scene's photos, from the first Gaussians or a checkpoint to the scene that is saved."""
 
+import time
 from collections.abc import Callable, Container
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from clsplat.training.autosize.reduction import without_useless_bands
 from clsplat.training.autosize.search import search_size
 from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
+from clsplat.training.dense_start import first_points
 from clsplat.training.inputs import Inputs
 from clsplat.training.preparation import open_device
 from clsplat.training.recorder import Recorder
@@ -96,7 +98,9 @@ def train(
         if resume:
             state = load_state(out / CHECKPOINT, scene.extent, config, inputs)
         else:
-            state = replace(initial_state(scene, config), inputs=inputs)
+            started = time.perf_counter()
+            state = replace(initial_state(first_points(scene, config, device), config), inputs=inputs)
+            state.seconds = time.perf_counter() - started
         state.inputs.demand(scene)
         training = Training(scene, config, device, state)
         return complete(training, out, evaluate=evaluate, evaluate_after=evaluate_after, progress=progress)

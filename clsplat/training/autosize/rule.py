@@ -231,10 +231,14 @@ def growth_window(config: TrainConfig) -> int:
 
 def start(scene: Scene, n: int, config: TrainConfig) -> "Search":
     """The search before the first iteration, with n Gaussians."""
-    pixels = largest_photo(scene)
-    reach = PER_PIXEL * min(pixels, sqrt(pixels * SMALL_PHOTO))
     growing = max(1, len(growth_bounds(config)) - 1)  # the first window has the first Gaussians
-    return Search(n, max(PACE, reach / n) ** (1 / growing))
+    return Search(n, max(PACE, reach(scene) / n) ** (1 / growing))
+
+
+def reach(scene: Scene) -> float:
+    """Number of Gaussians that growth may reach by its end, by the photos."""
+    pixels = largest_photo(scene)
+    return PER_PIXEL * min(pixels, sqrt(pixels * SMALL_PHOTO))
 
 
 def validation_times(config: TrainConfig) -> set[int]:

@@ -1,0 +1,262 @@
+"""Points between the sparse ones, where several photos agree on a depth: a denser start than features give.
+
+Each photo is compared with its neighbours on planes of constant depth (stage sweep). A depth counts if the windows
+are alike, and if the depths of other photos agree. Features leave gaps, where few large Gaussians would have to be
+split many times; with a denser start, growth begins where surfaces are (Kotovenko et al. 2025, "EDGS", begin with
+dense matches of a network). Measured: docs/howto/strategies.md.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from clsplat.camera import Camera
+from clsplat.config import TrainConfig
+from clsplat.randomness import stream
+from clsplat.renderer import Renderer, download
+from clsplat.scene import Scene, View, evenly_spaced, in_turn
+from clsplat.training.autosize.rule import reach
+from clsplat.training.memory import Footprint
+
+if TYPE_CHECKING:
+    from clsplat.device import Device
+
+Array = NDArray[Any]
+
+SHARE = 0.5
+"""Fraction of the Gaussians that growth may reach, up to which dense points are added. Growth adds the others where
+the errors of the photos are."""
+
+EDGE = 240
+"""Longer edge to which photos are reduced, px."""
+
+PLANES = 96
+"""Number of planes. Neighbouring ones shift a photo of `EDGE` pixels by about one pixel."""
+
+BYTES = 4 * 3 * PLANES
+"""Bytes of the device's memory per pixel, in single precision: a photo on each plane, and two similarities."""
+
+SOURCES = 5
+"""Number of photos with which each is compared."""
+
+MOST_PHOTOS = 100
+"""Largest number of photos that are compared, evenly spaced, which bounds the time."""
+
+ANGLE = 8.0
+"""Best angle between the directions to a point from two photos, degrees: smaller ones tell little of the depth, at
+larger ones windows look different (Yao et al. 2018, "MVSNet", has a similar rule)."""
+
+NARROWER, WIDER = 4.0, 12.0
+"""Standard deviations of the weight of angles below and above `ANGLE`, degrees."""
+
+COMMON = 20
+"""Fewest sparse points that both photos of a pair show."""
+
+SCORE = 0.6
+"""Least score of a depth that becomes a point."""
+
+SUPPORT = 0.4
+"""Least score of a depth that supports that of another photo."""
+
+AGREEMENT = 0.01
+"""Largest relative difference of depths that agree."""
+
+SUPPORTERS = 2
+"""Fewest photos whose depths agree with that of a point."""
+
+DEPTHS = 1, 99
+"""Percentiles of the depths of the sparse points between which planes lie."""
+
+NEARER, FARTHER = 0.8, 1.3
+"""Factors on these depths: surfaces reach beyond the sparse points."""
+
+BISECTIONS = 14
+"""Steps in which `thinned` finds the size of its cells: to a thousandth of their logarithm."""
+
+
+@dataclass(frozen=True)
+class Small:
+    """A reduced photo: its camera, RGB in [0, 1] (H, W, 3), and a mask (H, W) or None."""
+
+    camera: Camera
+    rgb: NDArray[np.float32]
+    mask: NDArray[np.bool_] | None
+
+    @property
+    def grey(self) -> NDArray[np.float32]:
+        """Luma (ITU-R BT.601), (H, W)."""
+        return self.rgb @ np.float32([0.299, 0.587, 0.114])
+
+
+@dataclass(frozen=True)
+class Depths:
+    """Depths (H, W) of a photo, world units, and their scores (H, W)."""
+
+    depth: Array
+    score: Array
+
+
+def first_points(scene: Scene, config: TrainConfig, device: "Device") -> Scene:
+    """The scene with the points from which a training starts: dense ones, if the configuration asks for them.
+
+    They are left out where the memory of the device does not allow them.
+    """
+    wanted = round(SHARE * reach(scene))
+    if config.max_gaussians is not None:
+        wanted = min(wanted, round(SHARE * config.max_gaussians))
+    wanted = min(wanted, Footprint.of(scene, config, device).most_gaussians(device.memory_limit))
+    if not config.init.dense or BYTES * EDGE**2 > device.memory_limit:
+        return scene
+    return with_dense_points(scene, Renderer(device), wanted, config.seed)
+
+
+def with_dense_points(scene: Scene, renderer: Renderer, most: int, seed: int) -> Scene:
+    """Add points on surfaces where several photos agree.
+
+    Parameters
+    ----------
+    scene : Scene
+    renderer : Renderer
+        Its stages compare the photos.
+    most : int
+        Largest number of points afterwards. If the scene has as many, it is returned as it is.
+    seed : int
+        Seed of the choice among too many points.
+
+    Returns
+    -------
+    Scene
+        With the sparse points first. Photos that are neither pinhole nor large enough add none, and neither does a
+        scene without sparse points, which tell at what depths to search.
+    """
+    wanted = most - len(scene.points)
+    usable = [view for view in scene.train if view.camera.model == "pinhole"]
+    if wanted <= 0 or len(usable) < SUPPORTERS + 1 or not len(scene.points):
+        return scene
+    photos = [small(view) for view in in_turn(evenly_spaced(usable, MOST_PHOTOS))]
+    sources = neighbours([photo.camera for photo in photos], scene.points)
+    maps = [depths_of(i, photos, sources[i], scene.points, renderer) for i in range(len(photos))]
+    found = [agreed(i, photos, sources[i], maps) for i in range(len(photos))]
+    points, colors, sizes = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    rows = thinned(points, sizes, wanted, seed)
+    return replace(
+        scene,
+        points=np.concatenate([scene.points, points[rows]]),
+        colors=np.concatenate([scene.colors, np.rint(255 * colors[rows]).astype(np.uint8)]),
+    )
+
+
+def small(view: View) -> Small:
+    """Reduce a photo to `EDGE` pixels."""
+    camera = view.camera
+    factor = max(1.0, max(camera.width, camera.height) / EDGE)
+    size = max(2, round(camera.width / factor)), max(2, round(camera.height / factor))
+
+    def reduced(array: Array) -> Array:
+        return np.asarray(Image.fromarray(array).resize(size, Image.Resampling.BOX))
+
+    mask = None if view.mask is None else reduced(np.where(view.mask, 255, 0).astype(np.uint8)) == 255
+    return Small(camera.resized(*size), reduced(view.image).astype(np.float32) / 255, mask)
+
+
+def projected(camera: Camera, points: Array) -> tuple[Array, Array, Array]:
+    """Positions x and y, px, and depths of points (..., 3) in a pinhole photo."""
+    x, y, z = np.moveaxis(points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3], -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, z
+
+
+def shown(camera: Camera, points: Array) -> NDArray[np.bool_]:
+    """Whether points (..., 3) are in the frame of a photo."""
+    x, y, z = projected(camera, points)
+    return (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+
+
+def neighbours(cameras: list[Camera], points: Array) -> list[list[int]]:
+    """Up to `SOURCES` photos for each, which have many of its points in their frame, seen at a good angle."""
+    seen = np.array([shown(camera, points) for camera in cameras])
+    towards = np.array([points - camera.position for camera in cameras])
+    towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-12)
+    result = []
+    for i in range(len(cameras)):
+        weights = np.zeros(len(cameras))
+        for j in range(len(cameras)):
+            both = seen[i] & seen[j]
+            if j != i and both.sum() >= COMMON:
+                cosines = (towards[i, both] * towards[j, both]).sum(axis=1)
+                angle = np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1))))
+                spread = NARROWER if angle < ANGLE else WIDER
+                weights[j] = both.sum() * np.exp(-0.5 * ((angle - ANGLE) / spread) ** 2)
+        order = np.argsort(-weights, kind="stable")[:SOURCES]
+        result.append([int(j) for j in order if weights[j] > 0])
+    return result
+
+
+def depths_of(i: int, photos: list[Small], sources: list[int], points: Array, renderer: Renderer) -> Depths:
+    """Depths of photo `i`, by comparison with its sources."""
+    camera, shape = photos[i].camera, photos[i].rgb.shape[:2]
+    near_far = projected(camera, points[shown(camera, points)])[2]
+    if len(sources) < 2 or not len(near_far):
+        return Depths(np.ones(shape), np.full(shape, -1.0))
+    nearest, farthest = np.percentile(near_far, DEPTHS)
+    planes = np.linspace(1 / (FARTHER * farthest), 1 / (NEARER * nearest), PLANES)
+    maps = np.array([between(camera, photos[s].camera) for s in sources])
+    grey, *others = (renderer.upload("photo to sweep", photos[s].grey) for s in (i, *sources))
+    planes_there = renderer.upload("planes", planes)
+    pairs = renderer.stages.sweep_similarities(grey, others, renderer.upload("maps", maps), planes_there)
+    inverse, scores = renderer.stages.sweep_best(pairs, planes_there)
+    depth, score = 1 / download(inverse).astype(np.float64), download(scores)
+    if photos[i].mask is not None:
+        score = np.where(photos[i].mask, score, -1)
+    return Depths(depth, score)
+
+
+def between(camera: Camera, other: Camera) -> Array:
+    """The twelve numbers that take a pixel of a camera and an inverse depth to the other photo (stage sweep)."""
+    motion = other.viewmat @ np.linalg.inv(camera.viewmat)
+    a = other.K @ motion[:3, :3] @ np.linalg.inv(camera.K)
+    return np.concatenate([a.ravel(), other.K @ motion[:3, 3]])
+
+
+def agreed(i: int, photos: list[Small], sources: Iterable[int], maps: list[Depths]) -> tuple[Array, Array, Array]:
+    """Points of photo `i` with whose depth those of other photos agree, their colours in [0, 1], and the size of a
+    pixel at each, world units."""
+    camera, depth = photos[i].camera, maps[i].depth
+    height, width = depth.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
+    points = (rays * depth[:, :, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    supporters = np.zeros(depth.shape, int)
+    for j in sources:
+        there = photos[j].camera
+        inside = shown(there, points)
+        u, v, z = (values[inside] for values in projected(there, points))
+        row, column = v.astype(int), u.astype(int)
+        alike = np.abs(maps[j].depth[row, column] - z) < AGREEMENT * z
+        supporters[inside] += alike & (maps[j].score[row, column] > SUPPORT)
+    kept = (maps[i].score > SCORE) & (supporters >= SUPPORTERS)
+    return points[kept], photos[i].rgb[kept], depth[kept] / camera.fx
+
+
+def thinned(points: Array, sizes: Array, most: int, seed: int) -> NDArray[np.intp]:
+    """Choose up to `most` points: one of each cell of a grid whose cells are proportional to the points' `sizes`."""
+    order = stream(seed, "dense points").permutation(len(points))
+    if len(points) <= most:
+        return np.sort(order)
+
+    def one_per_cell(factor: float) -> NDArray[np.intp]:
+        # Cells of powers of two, so that neighbours of similar size share a grid.
+        levels = np.round(np.log2(factor * sizes[order]))
+        cells = np.floor(points[order] / 2.0 ** levels[:, None])
+        _, first = np.unique(np.column_stack([levels, cells]).astype(np.int64), axis=0, return_index=True)
+        return np.sort(order[first])
+
+    low, high = 0.0, np.log2(np.ptp(points, axis=0).max() / sizes.min()) + 1  # of the factor, as logarithms
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if len(one_per_cell(2.0**middle)) > most else (low, middle)
+    return one_per_cell(2.0**high)[:most]
