@@ -250,6 +250,7 @@ DEFINES = {
         **{"KEY_BITS": 64, "DIGIT_BITS": 8, "GROUP": 32, "SEGMENT_BITS": 4, "SEGMENT_GROUP": 16},
         **{"BITONIC": 64, "BITONIC_GROUP": 32},
     },
+    "sweep": {"RADIUS": 2, "VARIANCE_MIN": 1e-4, "LANES": 8},
 }
 FORBIDDEN = [
     ("absgrad", "BATCH", 0),
@@ -315,6 +316,8 @@ FORBIDDEN = [
     ("sort", "SEGMENT_GROUP", 0),
     ("sort", "BITONIC", 100),
     ("sort", "BITONIC_GROUP", 64),
+    ("sweep", "LANES", 4),
+    ("sweep", "RADIUS", 8),
 ]
 EACH_KERNEL = pytest.mark.parametrize("name", sorted(p.stem for p in kernel_folder().glob("*.cl")))
 

@@ -83,13 +83,13 @@ class Small:
     """A reduced photo: its camera, RGB in [0, 1] (H, W, 3), and a mask (H, W) or None."""
 
     camera: Camera
-    rgb: NDArray[np.float32]
+    rgb: Array
     mask: NDArray[np.bool_] | None
 
     @property
-    def grey(self) -> NDArray[np.float32]:
+    def grey(self) -> Array:
         """Luma (ITU-R BT.601), (H, W)."""
-        return self.rgb @ np.float32([0.299, 0.587, 0.114])
+        return self.rgb @ np.array([0.299, 0.587, 0.114], np.float32)
 
 
 @dataclass(frozen=True)
@@ -210,8 +210,8 @@ def depths_of(i: int, photos: list[Small], sources: list[int], points: Array, re
     pairs = renderer.stages.sweep_similarities(grey, others, renderer.upload("maps", maps), planes_there)
     inverse, scores = renderer.stages.sweep_best(pairs, planes_there)
     depth, score = 1 / download(inverse).astype(np.float64), download(scores)
-    if photos[i].mask is not None:
-        score = np.where(photos[i].mask, score, -1)
+    if (mask := photos[i].mask) is not None:
+        score = np.where(mask, score, -1)
     return Depths(depth, score)
 
 

@@ -21,13 +21,14 @@ from clsplat.training.autosize.search import search_size
 from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
 from clsplat.training.dense_start import first_points
+from clsplat.training.initialize import initialize
 from clsplat.training.inputs import Inputs
 from clsplat.training.preparation import open_device
 from clsplat.training.recorder import Recorder
 from clsplat.training.run_folder import held
 from clsplat.training.run_length import with_length
 from clsplat.training.session import Training
-from clsplat.training.state import initial_state
+from clsplat.training.state import initial_state, start_config
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -99,7 +100,9 @@ def train(
             state = load_state(out / CHECKPOINT, scene.extent, config, inputs)
         else:
             started = time.perf_counter()
-            state = replace(initial_state(first_points(scene, config, device), config), inputs=inputs)
+            start = first_points(scene, config, device)
+            gaussians = initialize(start, start_config(config), config.seed, config.max_gaussians)
+            state = replace(initial_state(scene, config, gaussians), inputs=inputs)
             state.seconds = time.perf_counter() - started
         state.inputs.demand(scene)
         training = Training(scene, config, device, state)

@@ -10,6 +10,7 @@ from clsplat.config import InitConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
+from clsplat.training.autosize import rule
 from clsplat.training.dense_start import first_points, neighbours, thinned, with_dense_points
 from clsplat.training.loop import train
 
@@ -132,3 +133,13 @@ def test_training_starts_with_dense_points(device: Device, tmp_path) -> None:
     counts = []
     train(wall(), config, tmp_path, device, progress=lambda now: counts.append(now["num_gaussians"]))
     assert 300 < counts[0] <= 400
+
+
+def test_growth_reaches_no_more_from_a_dense_start() -> None:
+    """48x64 pixels: 3072 Gaussians at most, from 60 points or from 1536; but never fewer than there are."""
+    scene, config = wall(), TrainConfig(iterations=3000)
+    windows = len(rule.growth_bounds(config)) - 1
+    for first, reached in ((60, 3072), (1536, 3072), (4000, 4000)):
+        assert rule.start(scene, first, config).pace ** windows * first == pytest.approx(reached)
+    many = replace(scene, points=np.zeros((2000, 3)))
+    assert rule.start(many, 2000, config).pace ** windows * 2000 == pytest.approx(6000)

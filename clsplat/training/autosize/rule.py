@@ -48,8 +48,8 @@ PATIENCE = 2.0
 """Factor by which the number of Gaussians grows without paying before growth ends."""
 
 PACE = 3.0
-"""Multiple of the first Gaussians that growth reaches by its end, unless `PER_PIXEL` allows more. Faster growth ends
-worse (measured: docs/size.md)."""
+"""Multiple of the first Gaussians, or of the sparse points if these are fewer, that growth reaches by its end, unless
+`PER_PIXEL` allows more. Faster growth ends worse (measured: docs/size.md)."""
 
 PER_PIXEL = 1.0
 """Gaussians per pixel of a small photo that growth reaches by its end, unless `PACE` allows more. Larger photos allow
@@ -232,7 +232,8 @@ def growth_window(config: TrainConfig) -> int:
 def start(scene: Scene, n: int, config: TrainConfig) -> "Search":
     """The search before the first iteration, with n Gaussians."""
     growing = max(1, len(growth_bounds(config)) - 1)  # the first window has the first Gaussians
-    return Search(n, max(PACE, reach(scene) / n) ** (1 / growing))
+    sparse = min(n, len(scene.points) or n)  # dense points fill what growth may reach, and do not extend it
+    return Search(n, max(PACE * sparse / n, reach(scene) / n, 1.0) ** (1 / growing))
 
 
 def reach(scene: Scene) -> float:
