@@ -126,3 +126,46 @@ def test_rays_and_splats_composite_the_same_image(any_device):
     given = np.tile(sigmas, rays), np.tile(colors, (rays, 1)), np.tile(deltas, rays), first
     rgb = by_kernel(any_device, *given)[0].reshape(height, width, 3)
     assert_matches("image", image, rgb.astype(np.float64), DOUBLE if any_device.real == np.float64 else FLOAT)
+
+
+def distortion_by_kernel(device, sigmas, deltas, first, transmittances, v_sigmas):
+    sigmas, deltas, transmittances, v = (device.upload("a", a) for a in (sigmas, deltas, transmittances, v_sigmas))
+    place = device.upload("first", first, np.uint32)
+    losses = ops.rays_distortion(device, sigmas, deltas, place, transmittances, 0.7, v)
+    return losses.get(), v.get()
+
+
+@pytest.mark.parametrize("density", [3.0, 60.0], ids=["thin", "opaque"])
+def test_distortion_matches_twin(any_device, density):
+    """The gradient is added to the one that is there."""
+    sigmas, colors, deltas, first = samples(density=density)
+    before = np.random.default_rng(1).normal(size=len(sigmas)).astype(np.float32).astype(np.float64)
+    reaching = by_kernel(any_device, sigmas, colors, deltas, first)[1].astype(np.float64)
+    expected = before.copy()
+    losses = reference.rays_distortion(sigmas, deltas, first, reaching, 0.7, expected)
+    found = distortion_by_kernel(any_device, sigmas, deltas, first, reaching, before)
+    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    assert_matches("losses of rays", found[0], losses, tolerances)
+    assert_matches("v_sigmas", found[1], expected, tolerances)
+
+
+def test_distortion_is_that_of_intervals(device64):
+    """The sum of the stage histograms, for rays of equally many samples."""
+    rng = np.random.default_rng(4)
+    sigmas, deltas = rng.exponential(2.0, (5, 8)), rng.uniform(0.05, 0.2, (5, 8))
+    first, edges = np.arange(6) * 8, np.concatenate([np.zeros((5, 1)), np.cumsum(deltas, axis=1)], axis=1)
+    given = sigmas.ravel(), np.zeros((40, 3)), deltas.ravel(), first.astype(np.uint32)
+    reaching = by_kernel(device64, *given)[1]
+    weights = reaching * -np.expm1(-given[0] * given[2])
+    losses, _ = distortion_by_kernel(device64, given[0], given[2], given[3], reaching, np.zeros(40))
+    np.testing.assert_allclose(losses, reference.histograms_distortion(edges, weights, 1.0)[0], rtol=1e-12)
+
+
+def test_gradients_of_distortion_by_central_differences(device64):
+    sigmas, colors, deltas, first = samples(rays=9)
+
+    def run(sigmas):
+        reaching = by_kernel(device64, sigmas, colors, deltas, first)[1]
+        return distortion_by_kernel(device64, sigmas, deltas, first, reaching, np.zeros(len(sigmas)))
+
+    gradcheck(lambda sigmas: 0.7 * float(run(sigmas)[0].sum()), {"sigmas": sigmas}, {"sigmas": run(sigmas)[1]})

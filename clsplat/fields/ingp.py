@@ -24,13 +24,18 @@ padded to 16."""
 LEVELS, COARSEST = 16, 16
 """Number of levels, and cells along an edge of the coarsest (Müller et al. 2022, table 1)."""
 
-CELL_PIXELS = 0.4
-"""Edge of a cell of the finest level, in widths of a pixel at the middle of the scene. The paper's 2048 cells are so
-wide for photos of 800 x 800 pixels (Müller et al. 2022, section 5.4). Finer cells are seen by single pixels."""
+CELL_PIXELS, SPACE_CELL_PIXELS = 0.4, 1.0
+"""Edge of a cell of the finest level, in widths of a pixel at the middle of the scene: in the unit cube, and where
+there is a background. The paper's 2048 cells are as wide as the former for photos of 800 x 800 pixels (Müller et al.
+2022, section 5.4). Finer cells are seen by single pixels."""
 
-RATE, RATE_FINAL = 1e-2, 1e-2 / 30
-"""Learning rates at the start (Müller et al. 2022, section 4) and at the end; exponential in between, over a training
-of any length."""
+RATE, SPACE_RATE, RATE_FALL = 1e-2, 2e-2, 30.0
+"""Learning rates at the start, in the unit cube (Müller et al. 2022, section 4) and where there is a background, and
+by what they are divided at the end; exponential in between, over a training of any length."""
+
+DISTORTION = 0.01
+"""Weight of the distortion loss where there is a background: that of Barron et al. 2022, section 4. The code of Müller
+et al. 2022 has none; reimplementations have one. Effect: docs/howto/fields.md."""
 
 BETA1, BETA2, EPS = 0.9, 0.99, 1e-15
 """Constants of Adam (Müller et al. 2022, section 4)."""
@@ -74,7 +79,8 @@ class IngpBase(Field):
 
     def __init__(self, space: Space, device: "Device", seed: int):
         super().__init__(space, device, seed)
-        finest = max(round(space.edge / (CELL_PIXELS * space.pixel)), COARSEST)
+        cell = (SPACE_CELL_PIXELS if space.contracted else CELL_PIXELS) * space.pixel
+        finest = max(round(space.edge / cell), COARSEST)
         self.levels = HashLevels.geometric(LEVELS, COARSEST, finest, self.entries)
         rng = stream(seed, "parameters of a field")
         table = rng.uniform(-TABLE_RANGE, TABLE_RANGE, (self.levels.offsets[-1], 2))
@@ -110,6 +116,9 @@ class IngpBase(Field):
         errors = image.rgb.get() - batch.colors
         v_rgb = upload("v_rgb", errors * (2 / errors.size))
         v_sigmas, v_colors = self.stages.rays_bwd(*composited, image.transmittances, v_rgb)
+        if self.space.contracted:
+            weights = run.sigmas, samples.deltas, samples.first, image.transmittances
+            self.stages.rays_distortion(*weights, DISTORTION / len(errors), v_sigmas)
         self._descend(samples, run, v_sigmas, v_colors, progress)
         return float(np.mean(errors**2))
 
@@ -134,7 +143,7 @@ class IngpBase(Field):
             run.encoded, density, DENSITY_WIDTHS, run.density_hidden, v_features, DENSITY_WIDTHS[0]
         )
         v_table = stages.hashgrid_bwd(samples.positions, v_encoded, self.levels)
-        rate = RATE * (RATE_FINAL / RATE) ** progress
+        rate = (SPACE_RATE if self.space.contracted else RATE) * RATE_FALL**-progress
         step = AdamStep(self.iteration, {}, BETA1, BETA2, EPS, 0)
         for name, gradient in (("table", v_table), ("density", v_density), ("color", v_color)):
             p = parameters[name]

@@ -9,6 +9,11 @@ from clsplat.camera import Camera, focus_point
 from clsplat.field_stages import Marching, Span
 from clsplat.scene import View
 
+NEAR_FACTOR = 8 / 3
+"""Distance at which rays begin where there is a background, in near planes of the camera with the nearest one. Where
+a dataset has points, that is 0.8 of the depth of the nearest points (`clsplat.dataset.near_planes`): rays that begin
+closer to the cameras learn a haze in front of each. Effect: docs/howto/fields.md."""
+
 BOX_SHARE = 0.375
 """Half edge of the cube of a scene without a background, as a fraction of the cameras' mean distance from the point
 they look at: 1.5 for NeRF-synthetic scenes, whose cameras are 4 away (Mildenhall et al. 2020)."""
@@ -64,7 +69,8 @@ class Space:
             scale = 2 * BOX_SHARE * float(np.mean(distances))
             return cls(centre, scale, False, 0.0, pixel / scale)
         scale = max(distances)
-        return cls(centre, scale, True, min(camera.near_depth for camera in cameras) / scale, pixel / scale)
+        near = NEAR_FACTOR * min(camera.near_depth for camera in cameras)
+        return cls(centre, scale, True, near / scale, pixel / scale)
 
     @property
     def marching(self) -> Marching:
