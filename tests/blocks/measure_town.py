@@ -80,7 +80,7 @@ def measure(folder: Path, count: int) -> dict[str, Any]:
     data, out = folder / f"town-{count}", folder / f"run-{count}"
     if not (data / "transforms.json").exists():
         write_town(data, count, WIDTH, HEIGHT)
-    command = [sys.executable, "-P", __file__, str(data), "-o", str(out), str(count), "--train"]
+    command = [sys.executable, __file__, str(data), "-o", str(out), str(count), "--train"]
     printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
     found: dict[str, Any] = json.loads(printed.splitlines()[-1])
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
