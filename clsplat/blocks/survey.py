@@ -124,7 +124,7 @@ def seen_by_block(
     shown : (N,) bool
         The Gaussians that have a weight in any of them.
     """
-    placed, marks = renderer.place(gaussians), renderer.place(marked(gaussians, trains))
+    placed, marks = renderer.place(gaussians), renderer.place(marks_of(gaussians, trains))
     black = Renderer(renderer.device or "reference", renderer.config)
     shown = np.zeros(len(gaussians), bool)
     result = []
@@ -140,7 +140,7 @@ def seen_by_block(
     return result, shown
 
 
-def marked(gaussians: Gaussians, trains: NDArray[np.bool_]) -> Gaussians:
+def marks_of(gaussians: Gaussians, trains: NDArray[np.bool_]) -> Gaussians:
     """The Gaussians in white where they train and in black elsewhere, without view dependence."""
     color = np.where(trains, 0.5, -0.5) / SH_C0
     return replace(gaussians, sh=np.repeat(color[:, None, None], 3, axis=2).astype(gaussians.sh.dtype))

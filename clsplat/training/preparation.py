@@ -104,11 +104,16 @@ def photo_memory(config: TrainConfig) -> int | None:
 
 
 def check_memory(scene: Scene, config: TrainConfig, device: "Device", tell: Callable[[str], None]) -> None:
-    """Check that the first Gaussians fit the device, and tell what the training takes."""
+    """Check that the first Gaussians fit the device, and tell what the training takes.
+
+    With blocks, the points need not fit: the coarse run starts from as many of them as do.
+    """
     limit = device.memory_limit
     if config.memory_limit is not None:
         limit = min(limit, parse_bytes(config.memory_limit, "--memory-limit"))
     need, start = Footprint.of(scene, config, device), start_count(scene, start_config(config), config.max_gaussians)
+    if config.blocks != 1:
+        start = min(start, max(1, need.most_gaussians(limit)))
     need.check(start, limit)
     tell(need.describe(start, config.max_gaussians, limit))
 

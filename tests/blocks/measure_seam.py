@@ -5,8 +5,8 @@ Usage: python tests/blocks/measure_seam.py DATA BLOCKS ONCE [-o PICTURE.png]
 DATA is the dataset of the runs BLOCKS (with `--blocks`) and ONCE. In each held-out photo, each pixel belongs to the
 block whose Gaussians have most of its compositing weight. The band is what lies at most `BAND` px from a pixel of
 another block. Prints PSNR and SSIM of both runs in the band, elsewhere and in all, pooled over all held-out photos;
-then the same for the pixels of which no block has `ALONE` of the weight. The picture shows, of the photo whose band is
-largest, the photo with the borders, both renders, and both renders' absolute differences from the photo, `GAIN` times.
+then the same for the pixels of which no block has `ALONE` of the weight. The picture shows the photo whose band is
+largest: with the borders, both renders, and below them the photo and the absolute differences of both, `GAIN` times.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from PIL import Image
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from clsplat.blocks.jobs import read_job
-from clsplat.blocks.survey import marked
+from clsplat.blocks.survey import marks_of
 from clsplat.blocks.whole import BLOCKS
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset import load_scene
@@ -54,7 +54,7 @@ def shares(gaussians: Gaussians, cut: list[Any], renderer: Renderer, view: View)
     """Shares (B, H, W) of blocks in the compositing weight of pixels."""
     black, found = Renderer(renderer.device, renderer.config), []
     for box in cut:
-        image = black.forward(marked(gaussians, box.contains(gaussians.means)), view.camera, gradients=False).image
+        image = black.forward(marks_of(gaussians, box.contains(gaussians.means)), view.camera, gradients=False).image
         found.append(np.asarray(download(image.rgb)[:, :, 0], np.float64))
     return np.array(found) / np.maximum(np.sum(found, axis=0), 1e-6)
 
@@ -70,7 +70,9 @@ def rendered(run: Gaussians, renderer: Renderer, view: View) -> NDArray[np.uint8
     return to_uint8(np.asarray(download(renderer.forward(run, view.camera, gradients=False).image.rgb), np.float64))
 
 
-def measured(views: list[View], runs: list[Gaussians], cut: list[Any], renderer: Renderer) -> Iterator[dict[str, Any]]:
+def measured(
+    views: list[View], runs: list[Gaussians], cut: list[Any], renderer: Renderer
+) -> Iterator[dict[str, Any]]:
     """Yield each photo with both renders, the squared errors of their pixels, its blocks and its bands."""
     for view in views:
         weight = shares(runs[0], cut, renderer, view)

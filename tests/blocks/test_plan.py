@@ -15,6 +15,7 @@ from clsplat.errors import InputError
 from clsplat.renderer import Renderer
 from clsplat.testing import synthetic_scene
 from clsplat.training.memory import Footprint
+from clsplat.training.preparation import check_memory
 
 SIZE = 40_000
 
@@ -42,6 +43,18 @@ def test_auto_takes_the_fewest_blocks_that_fit() -> None:
     steps = count * 40 + round(count * 40 * REFINING_LENGTH)
     assert text.startswith(f"blocks: {count}, each with 8 to ") and " of 12 photos" in text
     assert f"about {SIZE} Gaussians in all, {steps} iterations, {round(steps / 60)} minutes" in text
+
+
+def test_points_need_not_fit_if_blocks_do() -> None:
+    scene, config = known_scene(), replace(CONFIG, max_gaussians=None)
+    need = Footprint.of(scene, config, Device())
+    fitting = len(scene.points) // 2
+    device = Device(memory_limit=need.total(fitting))
+    with pytest.raises(InputError, match=r"^--memory-limit: expected at least"):
+        check_memory(scene, config, device, lambda text: None)
+    told: list[str] = []
+    check_memory(scene, replace(config, blocks="auto"), device, told.append)
+    assert f" for {fitting} Gaussians, if" in told[0]
 
 
 def test_nothing_fits() -> None:
