@@ -159,8 +159,11 @@ def small(view: View) -> Small:
     def reduced(array: Array) -> Array:
         return np.asarray(Image.fromarray(array).resize(size, Image.Resampling.BOX))
 
-    mask = None if view.mask is None else reduced(np.where(view.mask, 255, 0).astype(np.uint8)) == 255
-    return Small(camera.resized(*size), reduced(view.image).astype(np.float32) / 255, mask)
+    image, mask = view.image, view.mask
+    if mask is not None:
+        image = np.where(mask[:, :, None], image, np.uint8(0))  # what a mask hides shows in no window
+        mask = reduced(np.where(mask, 255, 0).astype(np.uint8)) == 255
+    return Small(camera.resized(*size), reduced(image).astype(np.float32) / 255, mask)
 
 
 def projected(camera: Camera, points: Array) -> tuple[Array, Array, Array]:

@@ -21,7 +21,7 @@ import tyro
 
 from clsplat import cli
 from clsplat.dataset.sfm import reconstruction
-from clsplat.training import recorder
+from clsplat.training import loop, recorder
 
 SOLVED = "solved"
 """Folder of the model that structure from motion finds, each time without its seconds of computation."""
@@ -80,7 +80,8 @@ def outside(root: Path, seconds: float = HANG) -> Iterator[list[str]]:
         patch.setattr("matplotlib.figure.Figure.savefig", blank)
         if (root / SOLVED).is_dir():  # pycolmap takes seconds, and threads of its own
             patch.setattr(reconstruction, "_solved", solved)
-        patch.setattr(recorder, "time", SimpleNamespace(perf_counter=lambda: 0.0))
+        for module in (loop, recorder):
+            patch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: 0.0))
         patch.setattr(threading, "excepthook", lambda about: stray.append(f"{about.exc_type}: {about.exc_value}"))
         patch.setattr(sys, "unraisablehook", lambda about: stray.append(f"{about.exc_value!r} {about.object!r}"))
         signal.signal(signal.SIGALRM, hang)

@@ -23,7 +23,7 @@ CONFIG = with_rounds(
         size="fixed",
         iterations=60,
         checkpoint_every=25,
-        init=InitConfig(sh_degree=1),
+        init=InitConfig(sh_degree=1, dense=False),  # the numbers of Gaussians are those of the points
         optim=OptimConfig(sh_degree_every=2333),
         coarse=CoarseConfig(factor=1),  # what `with_length` would choose: checkpoints have it
         # Small enough to see a clone, a split and a reset within 60 iterations.

@@ -82,6 +82,27 @@ def test_masked_pixels_add_no_points(device: Device) -> None:
     assert len(dense(masked, device).points) < len(dense(scene, device).points)
 
 
+def test_what_a_mask_hides_does_not_matter(device: Device) -> None:
+    scene = wall()
+    mask = np.ones((48, 64), bool)
+    mask[:, :20] = False
+    black, white = (
+        dense(
+            replace(
+                scene,
+                train=[
+                    replace(v, image=np.where(mask[:, :, None], v.image, np.uint8(fill)), mask=mask)
+                    for v in scene.train
+                ],
+            ),
+            device,
+        )
+        for fill in (0, 255)
+    )
+    np.testing.assert_array_equal(black.points, white.points)
+    np.testing.assert_array_equal(black.colors, white.colors)
+
+
 def test_scenes_that_tell_no_depths_stay_as_they_are(device: Device) -> None:
     scene = wall()
     without = replace(scene, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8))

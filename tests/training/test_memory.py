@@ -13,7 +13,7 @@ from every_strategy import with_rounds
 
 from clsplat.buffers import Buffers
 from clsplat.camera import Camera
-from clsplat.config import AdcConfig, OptimConfig, RenderConfig, TrainConfig
+from clsplat.config import AdcConfig, InitConfig, OptimConfig, RenderConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
@@ -82,6 +82,7 @@ def test_what_is_predicted_is_allocated(
         adc=FIXED_N,
         render=RenderConfig(sort=sort),
         exposure=gpu,
+        init=InitConfig(dense=False),  # dense points are found before the training, in a memory of their own
     )
 
     def evaluate(gaussians: Gaussians) -> dict[str, float]:
@@ -189,7 +190,8 @@ def test_a_start_that_does_not_fit_says_what_would() -> None:
 def test_growth_stops_where_memory_ends(tmp_path: Path, strategy: str) -> None:
     scene = make_scene(1500, 96, 64)
     adc = AdcConfig(grad_threshold=1e-7)
-    config = TrainConfig(size="fixed", iterations=30, strategy=strategy, max_gaussians=12_000, adc=adc)
+    init = InitConfig(dense=False)
+    config = TrainConfig(size="fixed", iterations=30, strategy=strategy, max_gaussians=12_000, adc=adc, init=init)
     config = with_rounds(config, start=1, every=5, stop_fraction=1)
     still, free = Device(), Device()
     train(scene, with_rounds(config, stop_fraction=0), tmp_path, still)

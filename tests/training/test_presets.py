@@ -46,7 +46,7 @@ def test_the_papers_presets_are_its_strategy_and_iterations():
         sh_rest_lr=2.5e-3 / 20,
         rates_final=1.0,
     )
-    paper = TrainConfig(strategy="adc", size="fixed", init=InitConfig(triangulate=False), optim=rates)
+    paper = TrainConfig(strategy="adc", size="fixed", init=InitConfig(triangulate=False, dense=False), optim=rates)
     assert load_preset("paper-7k") == replace(paper, iterations=7000)
     assert load_preset("paper-30k") == replace(paper, iterations=30_000)
 
