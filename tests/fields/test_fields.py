@@ -177,9 +177,8 @@ def test_photos_without_transparency_have_a_contracted_space(scene):
 def test_rays_begin_before_the_nearest_points(scene):
     """At 0.8 of their depth, of which the near plane of the nearest photo is a share: nothing learns a haze there."""
     nears = [NEAR_SHARE * depth for depth in np.linspace(2.0, 3.0, len(scene.train))]
-    views = [
-        replace(v, clear=None, camera=replace(v.camera, near=near)) for v, near in zip(scene.train, nears, strict=True)
-    ]
+    cameras = [replace(v.camera, near=near) for v, near in zip(scene.train, nears, strict=True)]
+    views = [replace(v, clear=None, camera=camera) for v, camera in zip(scene.train, cameras, strict=True)]
     space = Space.of(views)
     assert space.near * space.scale == pytest.approx(0.8 * 2.0)
     assert space.marching.near == space.span.near == space.near
