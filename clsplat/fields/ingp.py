@@ -34,8 +34,8 @@ RATE, SPACE_RATE, RATE_FALL = 1e-2, 2e-2, 30.0
 by what they are divided at the end; exponential in between, over a training of any length."""
 
 DISTORTION = 0.01
-"""Weight of the distortion loss where there is a background: that of Barron et al. 2022, section 4. The code of Müller
-et al. 2022 has none; reimplementations have one. Effect: docs/howto/fields.md."""
+"""Weight of the distortion loss where there is a background: that of Barron et al. 2022, section 4. Müller et al.
+2022 have none. Effect: docs/howto/fields.md."""
 
 BETA1, BETA2, EPS = 0.9, 0.99, 1e-15
 """Constants of Adam (Müller et al. 2022, section 4)."""

@@ -9,6 +9,7 @@ from ball_photos import ball
 from small_fields import SmallIngp, SmallMipNerf360, SmallNerf, SmallPlenoxels
 
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
+from clsplat.dataset.near_planes import NEAR_SHARE
 from clsplat.errors import InputError
 from clsplat.fields import METHODS
 from clsplat.fields.field_files import MODEL, load_checkpoint, load_field
@@ -171,6 +172,16 @@ def test_photos_without_transparency_have_a_contracted_space(scene):
     assert np.linalg.norm(positions, axis=1).max() <= 1 + 1e-9
     background = Pixels(views, space, WHITE).draw(stream(0, "pixels of a batch"), 5).background
     assert background == WHITE
+
+
+def test_rays_begin_before_the_nearest_points(scene):
+    """At 0.8 of their depth, of which the near plane of the nearest photo is a share: nothing learns a haze there."""
+    nears = [NEAR_SHARE * depth for depth in np.linspace(2.0, 3.0, len(scene.train))]
+    cameras = [replace(v.camera, near=near) for v, near in zip(scene.train, nears, strict=True)]
+    views = [replace(v, clear=None, camera=camera) for v, camera in zip(scene.train, cameras, strict=True)]
+    space = Space.of(views)
+    assert space.near * space.scale == pytest.approx(0.8 * 2.0)
+    assert space.marching.near == space.span.near == space.near
 
 
 def test_occupancy_forgets_and_finds():
