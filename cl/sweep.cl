@@ -7,16 +7,15 @@
 //   q = that of the largest score, refined by the parabola through it and its neighbours
 // See docs/stages/sweep.md; clsplat/reference/sweep.py is the twin.
 //
-// Mapping: sweep_pad: one work-item per number; sweep_warp: one per pixel and plane. sweep_similarity: one per LANES pixels of a row and plane.
-// sweep_best: one per pixel.
+// Mapping: one work-item per number (sweep_pad), per number of each plane (sweep_warp), per LANES pixels of a row on
+// each plane (sweep_similarity), and per pixel (sweep_best).
 //
 // Buffers, H x W pixels, S sources, D planes; rows have `stride` numbers, of which the first PAD and the last are 0:
-//   in   photo[H,W], grey in [0, 1], to padded[H,stride]; source[rows,columns] grey; maps[S,12], A (row-major) and b for positions in
-//        pixels, with centres at +0.5; planes[D] inverse depths, ascending
-//   out  warped[D,H,stride], grey, or OUTSIDE where the source does not show the position;
-//        pairs[2,D,H,W], the two largest similarities so far; they are -1 where the window leaves the photo or the
-//        source, or the photo is flat;
-//        inverse[H,W]; scores[H,W], -1 where the best plane is the first or the last one
+//   in   photo[H,W], grey in [0, 1]; source[rows,columns] grey; maps[S,12], A (row-major) and b for positions in pixels,
+//        with centres at +0.5; planes[D] inverse depths, ascending
+//   out  padded[H,stride], the photo; warped[D,H,stride], grey, or OUTSIDE where the source does not show the position;
+//        pairs[2,D,H,W], the two largest similarities so far, -1 where the window leaves the photo or the source, or
+//        the photo is flat; inverse[H,W]; scores[H,W], -1 where the best plane is the first or the last one
 // -DRADIUS        half of the window, px, less than PAD
 // -DVARIANCE_MIN  least variance of the photo in a window, and e
 // -DLANES=1|8     pixels per work-item of sweep_similarity

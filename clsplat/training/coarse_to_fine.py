@@ -23,7 +23,7 @@ def factor_at(iteration: int, config: TrainConfig) -> int:
     return config.coarse.factor >> int((iteration - 1) / span * halvings)
 
 
-def shrunk(view: View, factor: int) -> View:
+def shrunk(view: View, factor: float) -> View:
     """Reduce a view: divide its edges by `factor` (rounded), average boxes of pixels, and adapt the camera.
 
     A pixel counts if all the pixels that it averages count.

@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
+from clsplat.dataset.coverage import projected
 from clsplat.randomness import stream
 from clsplat.renderer import Renderer, download
 from clsplat.scene import Scene, View, evenly_spaced, in_turn
 from clsplat.training.autosize.rule import reach
+from clsplat.training.coarse_to_fine import shrunk
 from clsplat.training.memory import Footprint
 
 if TYPE_CHECKING:
@@ -34,17 +35,21 @@ the errors of the photos are."""
 EDGE = 240
 """Longer edge to which photos are reduced, px."""
 
-PLANES = 96
-"""Number of planes. Neighbouring ones shift a photo of `EDGE` pixels by about one pixel."""
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Weights of red, green and blue in a grey value (ITU-R BT.601)."""
 
-BYTES = 4 * 3 * PLANES
-"""Bytes of the device's memory per pixel, in single precision: a photo on each plane, and two similarities."""
+PLANES = 96
+"""Number of planes, equally spaced in inverse depth."""
 
 SOURCES = 5
 """Number of photos with which each is compared."""
 
 MOST_PHOTOS = 100
 """Largest number of photos that are compared, evenly spaced, which bounds the time."""
+
+BYTES = 4 * (3 * PLANES + MOST_PHOTOS)
+"""Bytes of the device's memory per pixel, in single precision: a photo on each plane, two similarities there, and all
+photos."""
 
 ANGLE = 8.0
 """Best angle between the directions to a point from two photos, degrees: smaller ones tell little of the depth, at
@@ -76,20 +81,6 @@ NEARER, FARTHER = 0.8, 1.3
 
 BISECTIONS = 14
 """Steps in which `thinned` finds the size of its cells: to a thousandth of their logarithm."""
-
-
-@dataclass(frozen=True)
-class Small:
-    """A reduced photo: its camera, RGB in [0, 1] (H, W, 3), and a mask (H, W) or None."""
-
-    camera: Camera
-    rgb: Array
-    mask: NDArray[np.bool_] | None
-
-    @property
-    def grey(self) -> Array:
-        """Luma (ITU-R BT.601), (H, W)."""
-        return self.rgb @ np.array([0.299, 0.587, 0.114], np.float32)
 
 
 @dataclass(frozen=True)
@@ -139,49 +130,28 @@ def with_dense_points(scene: Scene, renderer: Renderer, most: int, seed: int) ->
         return scene
     photos = [small(view) for view in in_turn(evenly_spaced(usable, MOST_PHOTOS))]
     sources = neighbours([photo.camera for photo in photos], scene.points)
-    maps = [depths_of(i, photos, sources[i], scene.points, renderer) for i in range(len(photos))]
+    greys = [renderer.upload("photo to sweep", photo.image @ LUMA / 255) for photo in photos]
+    maps = [depths_of(i, photos, sources[i], greys, scene.points, renderer) for i in range(len(photos))]
     found = [agreed(i, photos, sources[i], maps) for i in range(len(photos))]
     points, colors, sizes = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     rows = thinned(points, sizes, wanted, seed)
     return replace(
         scene,
         points=np.concatenate([scene.points, points[rows]]),
-        colors=np.concatenate([scene.colors, np.rint(255 * colors[rows]).astype(np.uint8)]),
+        colors=np.concatenate([scene.colors, colors[rows]]),
     )
 
 
-def small(view: View) -> Small:
-    """Reduce a photo to `EDGE` pixels."""
-    camera = view.camera
-    factor = max(1.0, max(camera.width, camera.height) / EDGE)
-    size = max(2, round(camera.width / factor)), max(2, round(camera.height / factor))
-
-    def reduced(array: Array) -> Array:
-        return np.asarray(Image.fromarray(array).resize(size, Image.Resampling.BOX))
-
-    image, mask = view.image, view.mask
-    if mask is not None:
-        image = np.where(mask[:, :, None], image, np.uint8(0))  # what a mask hides shows in no window
-        mask = reduced(np.where(mask, 255, 0).astype(np.uint8)) == 255
-    return Small(camera.resized(*size), reduced(image).astype(np.float32) / 255, mask)
-
-
-def projected(camera: Camera, points: Array) -> tuple[Array, Array, Array]:
-    """Positions x and y, px, and depths of points (..., 3) in a pinhole photo."""
-    x, y, z = np.moveaxis(points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3], -1, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, z
-
-
-def shown(camera: Camera, points: Array) -> NDArray[np.bool_]:
-    """Whether points (..., 3) are in the frame of a photo."""
-    x, y, z = projected(camera, points)
-    return (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+def small(view: View) -> View:
+    """Reduce a photo to `EDGE` pixels. What a mask hides becomes black, so that it shows in no window."""
+    if view.mask is not None:
+        view = replace(view, image=np.where(view.mask[:, :, None], view.image, np.uint8(0)))
+    return shrunk(view.with_depth(None), max(1.0, max(view.camera.width, view.camera.height) / EDGE))
 
 
 def neighbours(cameras: list[Camera], points: Array) -> list[list[int]]:
     """Up to `SOURCES` photos for each, which have many of its points in their frame, seen at a good angle."""
-    seen = np.array([shown(camera, points) for camera in cameras])
+    seen = np.array([projected(camera, points)[2] for camera in cameras])
     towards = np.array([points - camera.position for camera in cameras])
     towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-12)
     result = []
@@ -199,23 +169,22 @@ def neighbours(cameras: list[Camera], points: Array) -> list[list[int]]:
     return result
 
 
-def depths_of(i: int, photos: list[Small], sources: list[int], points: Array, renderer: Renderer) -> Depths:
-    """Depths of photo `i`, by comparison with its sources."""
-    camera, shape = photos[i].camera, photos[i].rgb.shape[:2]
-    near_far = projected(camera, points[shown(camera, points)])[2]
-    if len(sources) < 2 or not len(near_far):
+def depths_of(
+    i: int, photos: list[View], sources: list[int], greys: list[Any], points: Array, renderer: Renderer
+) -> Depths:
+    """Depths of photo `i`, by comparison with its sources. `greys` are the photos' grey values on the device."""
+    camera = photos[i].camera
+    _, depths, inside = projected(camera, points)
+    if len(sources) < SUPPORTERS:  # otherwise the photo has points in its frame
+        shape = camera.height, camera.width
         return Depths(np.ones(shape), np.full(shape, -1.0))
-    nearest, farthest = np.percentile(near_far, DEPTHS)
-    planes = np.linspace(1 / (FARTHER * farthest), 1 / (NEARER * nearest), PLANES)
-    maps = np.array([between(camera, photos[s].camera) for s in sources])
-    grey, *others = (renderer.upload("photo to sweep", photos[s].grey) for s in (i, *sources))
-    planes_there = renderer.upload("planes", planes)
-    pairs = renderer.stages.sweep_similarities(grey, others, renderer.upload("maps", maps), planes_there)
-    inverse, scores = renderer.stages.sweep_best(pairs, planes_there)
-    depth, score = 1 / download(inverse).astype(np.float64), download(scores)
-    if (mask := photos[i].mask) is not None:
-        score = np.where(mask, score, -1)
-    return Depths(depth, score)
+    nearest, farthest = np.percentile(depths[inside], DEPTHS)
+    planes = renderer.upload("planes", np.linspace(1 / (FARTHER * farthest), 1 / (NEARER * nearest), PLANES))
+    maps = renderer.upload("maps", np.array([between(camera, photos[s].camera) for s in sources]))
+    pairs = renderer.stages.sweep_similarities(greys[i], [greys[s] for s in sources], maps, planes)
+    inverse, scores = map(download, renderer.stages.sweep_best(pairs, planes))
+    mask = photos[i].mask
+    return Depths(1 / inverse.astype(np.float64), scores if mask is None else np.where(mask, scores, -1))
 
 
 def between(camera: Camera, other: Camera) -> Array:
@@ -225,24 +194,21 @@ def between(camera: Camera, other: Camera) -> Array:
     return np.concatenate([a.ravel(), other.K @ motion[:3, 3]])
 
 
-def agreed(i: int, photos: list[Small], sources: Iterable[int], maps: list[Depths]) -> tuple[Array, Array, Array]:
-    """Points of photo `i` with whose depth those of other photos agree, their colours in [0, 1], and the size of a
-    pixel at each, world units."""
-    camera, depth = photos[i].camera, maps[i].depth
-    height, width = depth.shape
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
-    points = (rays * depth[:, :, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-    supporters = np.zeros(depth.shape, int)
+def agreed(i: int, photos: list[View], sources: Iterable[int], maps: list[Depths]) -> tuple[Array, Array, Array]:
+    """Points of photo `i` with whose depth those of other photos agree, their colours, and the size of a pixel at
+    each, world units."""
+    camera = photos[i].camera
+    rows, columns = np.nonzero(maps[i].score > SCORE)
+    depth, rays = maps[i].depth[rows, columns], camera.rays(columns + 0.5, rows + 0.5)
+    points = (rays / rays[:, 2:] * depth[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    supporters = np.zeros(len(points), int)
     for j in sources:
-        there = photos[j].camera
-        inside = shown(there, points)
-        u, v, z = (values[inside] for values in projected(there, points))
-        row, column = v.astype(int), u.astype(int)
-        alike = np.abs(maps[j].depth[row, column] - z) < AGREEMENT * z
+        places, depths, inside = projected(photos[j].camera, points)
+        column, row = places[inside].astype(int).T
+        alike = np.abs(maps[j].depth[row, column] - depths[inside]) < AGREEMENT * depths[inside]
         supporters[inside] += alike & (maps[j].score[row, column] > SUPPORT)
-    kept = (maps[i].score > SCORE) & (supporters >= SUPPORTERS)
-    return points[kept], photos[i].rgb[kept], depth[kept] / camera.fx
+    kept = supporters >= SUPPORTERS
+    return points[kept], photos[i].image[rows, columns][kept], depth[kept] / camera.fx
 
 
 def thinned(points: Array, sizes: Array, most: int, seed: int) -> NDArray[np.intp]:
