@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from clsplat.scene import Scene
     from clsplat.show.viewer import Viewer
 
-WAITING = "compiling kernels, which are kept for the next run, and waiting for the first step"
+WAITING = "compiling kernels, which are kept for the next run, adding points, and waiting for the first step"
 """Text of the progress bar before the first step. Drivers compile some kernels only when they first run."""
 
 PAUSE = 1.0
