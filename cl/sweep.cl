@@ -35,19 +35,21 @@
 typedef real8 reals;
 typedef mask8 masks;
 #define COLUMNS_FROM(x) ((reals)(0, 1, 2, 3, 4, 5, 6, 7) + (x))
-#ifdef USE_DOUBLE
-#define LOAD(p) ((reals)(vload4(0, p), vload4(1, p)))
-#else
-#define LOAD(p) vload8(0, p)
-#endif
+#define ROOTS(x)        ROOT8(x)
 #elif LANES == 1
 typedef real reals;
 typedef int masks;
 #define COLUMNS_FROM(x) ((reals)(x))
-#define LOAD(p)         (*(p))
+#define ROOTS(x)        ROOT(x)
 #else
 #error "-DLANES must be 1 or 8"
 #endif
+
+// The vector at any address. PoCL 3.0 calls vload8 as a function, which doubles the time.
+typedef struct __attribute__((packed)) {
+    reals v;
+} Vector;
+#define LOAD(p) (((const __global Vector *)(p))->v)
 
 __kernel void sweep_pad(const int width, const int stride, const __global real *photo, __global real *padded) {
     const int x = (int)get_global_id(0) - PAD, y = get_global_id(1);
@@ -91,8 +93,8 @@ __kernel void sweep_similarity(const int width, const int height, const int stri
         const __global real *a_rows = padded + y * stride + x + PAD;
         const __global real *b_rows = warped + (d * height + y) * stride + x + PAD;
         reals sum_a = 0, sum_b = 0, sum_aa = 0, sum_ab = 0, sum_bb = 0;
-        for (int j = -RADIUS; j <= RADIUS; ++j) {
-            for (int i = -RADIUS; i <= RADIUS; ++i) {
+        _Pragma("unroll") for (int j = -RADIUS; j <= RADIUS; ++j) {
+            _Pragma("unroll") for (int i = -RADIUS; i <= RADIUS; ++i) {
                 const reals a = LOAD(a_rows + j * stride + i), b = LOAD(b_rows + j * stride + i);
                 sum_a += a;
                 sum_b += b;
@@ -104,12 +106,7 @@ __kernel void sweep_similarity(const int width, const int height, const int stri
         const real share = 1 / (real)((2 * RADIUS + 1) * (2 * RADIUS + 1));
         const reals mean_a = share * sum_a, mean_b = share * sum_b, least = (real)VARIANCE_MIN;
         const reals var_a = share * sum_aa - mean_a * mean_a, var_b = share * sum_bb - mean_b * mean_b;
-        const reals product = GREATER(var_a, least) * GREATER(var_b, least);
-#if LANES == 8
-        const reals root = ROOT8(product);
-#else
-        const reals root = ROOT(product);
-#endif
+        const reals root = ROOTS(GREATER(var_a, least) * GREATER(var_b, least));
         const reals column = COLUMNS_FROM((real)x);
         const masks known = (column >= (real)RADIUS) & (column < (real)(width - RADIUS)) & (var_a >= least) &
                             (sum_b < (reals)(real)(OUTSIDE / 2));
