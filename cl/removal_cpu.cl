@@ -19,7 +19,8 @@
 // Buffers: N, M, T, C and splats as in composite_cpu.cl, first_slots[N+1], slots[M] as in bin.cl
 //   in   splats[N], gauss_ids[M], tile_ranges[T,2], slots[M], background[C]; residuals[H,W,C], image - target;
 //        mask[H,W] uchar, 1 where pixels count
-//   out  records[M,4+C]; sums[N,4+C]: change of the squared error, sums of |D|^2, of w, of w^2, of w r
+//   out  records[M,5+C]; sums[N,5+C]: change of the squared error, sums of |D|^2, of w, of w^2, number of pixels in
+//        which the splat is composited, sums of w r
 // -DTILE=8|16|32   edge of a tile, px; 32 only with -DLANES=16
 // -DCHANNELS    number of colour channels, 1 or more
 // -DLANES=8|16  number of pixels of a block
@@ -78,7 +79,7 @@ __kernel void removal(const int width, const int height, const __global Splat *s
         for (uint j = 0; j < count; ++j) {
             const Splat *s = &batch.splats[j];
             const Corner corner = corner_from(s, x0, y0);
-            REALV difference = 0, agreement = 0, weights = 0, squares = 0, pulls[CHANNELS];
+            REALV difference = 0, agreement = 0, weights = 0, squares = 0, pairs = 0, pulls[CHANNELS];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pulls[k] = 0;
             for (Blocks blocks = unfinished & blocks_of(&batch, j); blocks;) {
                 const uint b = take_block(&blocks);
@@ -101,13 +102,15 @@ __kernel void removal(const int width, const int height, const __global Splat *s
                 const REALV counted = weight * counts[b];
                 weights += counted;
                 squares += weight * counted;
+                pairs += weight > 0 ? counts[b] : (REALV)0;
             }
             __global real *record = records + (size_t)SUMS * slots[first + j];
             record[0] = sum_lanes(difference - 2 * agreement);
             record[1] = sum_lanes(difference);
             record[2] = sum_lanes(weights);
             record[3] = sum_lanes(squares);
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[4 + k] = sum_lanes(pulls[k]);
+            record[4] = sum_lanes(pairs);
+            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[5 + k] = sum_lanes(pulls[k]);
         }
     }
     for (uint i = first; i < end; ++i) {

@@ -60,7 +60,7 @@ removal(const int width, const int height, const __global Splat *splats, const _
         const uint count = min((uint)BATCH, length - first);
         const uint i = begin + first + lane;
         Splat s;
-        real difference = 0, agreement = 0, weights = 0, squares = 0, pulls[CHANNELS];
+        real difference = 0, agreement = 0, weights = 0, squares = 0, pairs = 0, pulls[CHANNELS];
         int any_live = 0;
         if (lane < count)
             s = splats[gauss_ids[i]];
@@ -91,6 +91,7 @@ removal(const int width, const int height, const __global Splat *splats, const _
                     }
                     weights += counts[p] ? weight : 0;
                     squares += counts[p] ? weight * weight : 0;
+                    pairs += counts[p] ? 1 : 0;
                 }
             }
             hand_on();
@@ -102,8 +103,9 @@ removal(const int width, const int height, const __global Splat *splats, const _
             record[1] = difference;
             record[2] = weights;
             record[3] = squares;
+            record[4] = pairs;
             for (int k = 0; k < CHANNELS; ++k)
-                record[4 + k] = pulls[k];
+                record[5 + k] = pulls[k];
         }
         if (lane == count - 1)
             unfinished = any_live;

@@ -148,21 +148,22 @@ class Removal(NamedTuple):
 
     errors (N,): by how much it grows if the splat is removed; differences (N,): the squared difference that this
     makes to the image, the same if the image is its own target; weights (N,), squares (N,): sums of the weight
-    w = alpha T and of w^2; pulls (N, C): sums of w r with r = image - target. Another colour c + d makes the error
-    grow by squares |d|^2 + 2 pulls . d. All are 0 for what is not seen.
+    w = alpha T and of w^2; pairs (N,): pixels in which the splat is composited; pulls (N, C): sums of w r with
+    r = image - target. Another colour c + d makes the error grow by squares |d|^2 + 2 pulls . d. All are 0 for what
+    is not seen.
     """
 
     errors: Any
     differences: Any
     weights: Any
     squares: Any
+    pairs: Any
     pulls: Any
 
     @classmethod
     def of(cls, sums: Any) -> "Removal":
-        """The fields from their columns in (N, 4 + C) on the host, as `Stages.removal_sums` returns them."""
-        errors, differences, weights, squares = sums.T[:4]
-        return cls(errors, differences, weights, squares, sums[:, 4:])
+        """The fields from their columns in (N, 5 + C) on the host, as `Stages.removal_sums` returns them."""
+        return cls(*sums.T[:5], sums[:, 5:])
 
 
 class AdamStep(NamedTuple):

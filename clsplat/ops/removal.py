@@ -40,7 +40,7 @@ def removal_sums(
 
     Returns
     -------
-    (N, 4 + C) real
+    (N, 5 + C) real
         The fields of `Removal` as columns, on the device.
 
     Raises
@@ -55,8 +55,8 @@ def removal_sums(
     n, channels = splats.colors.shape
     m, (tiles, _) = bins.gauss_ids.shape[0], bins.tile_ranges.shape
     size = bins.height, bins.width
-    records = device.empty("prices per intersection", (max(m, 1), 4 + channels))
-    sums = device.empty("prices", (n, 4 + channels))
+    records = device.empty("prices per intersection", (max(m, 1), 5 + channels))
+    sums = device.empty("prices", (n, 5 + channels))
     if residuals is None:
         residuals = device.zeros("residuals", (*size, channels))
     pixels = [

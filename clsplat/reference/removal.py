@@ -25,7 +25,7 @@ def removal(splats: AnySplats, bins: Bins, background: Any, residuals: Any = Non
         behind[hit.box] += weight[:, :, None] * splats.colors[hit.splat]
     behind += transmittance[:, :, None] * np.asarray(background, dtype=np.float64)
 
-    out = Removal(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, channels)))
+    out = Removal(*(np.zeros(n) for _ in range(5)), np.zeros((n, channels)))
     for hit in hits(splats, bins, transmittance, STOP):
         g, alpha = hit.splat, np.minimum(hit.alpha, ALPHA_MAX)
         weight = alpha * hit.before
@@ -37,6 +37,7 @@ def removal(splats: AnySplats, bins: Bins, background: Any, residuals: Any = Non
         out.differences[g] += difference
         out.weights[g] += (weight * counts[hit.box]).sum()
         out.squares[g] += (weight**2 * counts[hit.box]).sum()
+        out.pairs[g] += ((weight > 0) * counts[hit.box]).sum()
         out.pulls[g] += np.einsum("hw,hwc->c", weight, r[hit.box])
     return out
 

@@ -36,7 +36,7 @@ def contributions(
     -------
     Contributions
     """
-    names = "weights", "errors", "prices", "differences"
+    names = "weights", "errors", "prices", "differences", "pairs"
     sums = {name: renderer.zeros(f"sums of {name}", (len(gaussians), 2)) for name in names}
     for measured in measure_removals(renderer, gaussians, views, sh_degree):
         _add(renderer, measured, sums)
@@ -47,5 +47,5 @@ def contributions(
 def _add(renderer: Renderer, measured: Measured, sums: dict[str, Any]) -> None:
     v = Image(measured.errors, renderer.no_alpha_gradient(measured.view.camera))
     renderer.stages.add_column(renderer.backward_to_splats(measured.run, v).colors, 0, sums["errors"])
-    for name, field in (("weights", "weights"), ("prices", "errors"), ("differences", "differences")):
+    for name, field in (("weights", "weights"), ("prices", "errors"), ("differences", "differences"), ("pairs", "pairs")):
         renderer.stages.add_column(measured.sums, Removal._fields.index(field), sums[name])

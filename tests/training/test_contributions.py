@@ -32,7 +32,7 @@ def test_weights_and_errors_are_those_of_the_pixels(device: Device, on_device: b
     found = contributions(Renderer(device, background=BACKGROUND), given, views, 3)
 
     run = Renderer("reference", background=BACKGROUND).forward(gaussians, camera, 3)
-    expected = Contributions(*(np.zeros(N) for _ in range(4)))
+    expected = Contributions(*(np.zeros(N) for _ in range(5)))
     for view in views:
         residuals = run.image.rgb - view.image / 255
         counted = np.ones(residuals.shape[:2]) if view.mask is None else view.mask.astype(float)
@@ -42,6 +42,7 @@ def test_weights_and_errors_are_those_of_the_pixels(device: Device, on_device: b
             weight = hit.alpha * hit.before
             expected.weights[hit.splat] += (weight * counted[hit.box]).sum()
             expected.errors[hit.splat] += (weight * squares[hit.box]).sum()
+            expected.pairs[hit.splat] += ((weight > 0) * counted[hit.box]).sum()
         for i in range(0, N, 7):
             without = gaussians.take(np.delete(np.arange(N), i))
             image = render(without, camera, background=BACKGROUND, device="reference").rgb
@@ -49,6 +50,6 @@ def test_weights_and_errors_are_those_of_the_pixels(device: Device, on_device: b
             expected.differences[i] += (((image - run.image.rgb) ** 2).sum(axis=2) * counted).sum()
     assert (expected.weights > 0).any()
     # float32: sums over some thousand pixels; of each a fraction of the largest.
-    for actual, wanted in zip(found[:4], expected[:4], strict=True):
-        some = slice(None) if wanted is expected.weights or wanted is expected.errors else slice(0, N, 7)
+    for actual, wanted in zip(found[:5], expected[:5], strict=True):
+        some = slice(0, N, 7) if wanted is expected.prices or wanted is expected.differences else slice(None)
         np.testing.assert_allclose(actual[some], wanted[some], rtol=1e-4, atol=1e-5 * np.abs(wanted).max())

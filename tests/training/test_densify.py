@@ -32,7 +32,7 @@ def scene() -> Gaussians:
 def survey(views: int) -> Contributions:
     """As of photos that see each Gaussian the better the later it stands."""
     assert views > 0
-    return Contributions(np.arange(N) / 2.0, np.arange(N) ** 2 / 100.0, np.arange(N) - 9.0, np.zeros(N))
+    return Contributions(np.arange(N) / 2.0, np.arange(N) ** 2 / 100.0, np.arange(N) - 9.0, np.zeros(N), np.ones(N))
 
 
 def observed(

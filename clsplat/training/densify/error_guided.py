@@ -29,9 +29,9 @@ the render less the photo, k + 1 of them change the squared error by 2 r d + (k 
 MEMORY = 0.9
 """Factor per round on the differences of earlier surveys. Ten rounds, which survey 100 photos, leave a third."""
 
-HARM = 1.0
-"""Fall of the error, in even shares of it, above which a Gaussian is removed while others grow (measured:
-docs/howto/strategies.md)."""
+TOLL = 1.0
+"""Squared error that a Gaussian must explain for each pair of it and a pixel, in even shares of the error per pair:
+compositing takes the same time for every pair (measured: docs/howto/strategies.md)."""
 
 SHARE_MIN = 0.1
 """Fraction of the training photos that must be surveyed for Gaussians to be removed by price: a Gaussian that few
@@ -74,17 +74,16 @@ class ErrorGuided(Strategy):
         n = len(gaussians)
         if not self.schedule.due(iteration):
             return Edit(gaussians, np.arange(n), np.zeros(n, bool))
-        weights, errors, prices, differences, share = survey(self.config.views)
+        weights, errors, prices, differences, pairs, share = survey(self.config.views)
         known = np.maximum(differences, MEMORY * self.statistics["differences"])
         # Of many that are too bright in one place, each alone promises the gain that only the first removal brings.
-        prices = prices + OTHERS * known
+        prices = prices + OTHERS * known - TOLL * errors.sum() / max(pairs.sum(), 1) * pairs
         target = self.schedule.count_after(iteration, n, cap)
         doomed = gaussians.opacities <= self.config.opacity_min
         # Gaussians that no photo of the survey shows may be needed by the others.
         seen = np.flatnonzero((weights > 0) & (share >= SHARE_MIN))
-        full = target >= cap
-        harmful = (prices[seen] <= (0 if full else -HARM * errors.sum() / n)).sum()
-        count = np.clip(harmful, self.config.replaced * n if full else 0, self.config.replaced_most * n)
+        least = self.config.replaced * n if target >= cap else 0
+        count = np.clip((prices[seen] <= 0).sum(), least, self.config.replaced_most * n)
         doomed[seen[np.argsort(prices[seen], kind="stable")[: int(count)]]] = True
         live = np.flatnonzero(~doomed)
         if len(live) == 0:

@@ -26,14 +26,15 @@ class Contributions(NamedTuple):
 
     weights (N,): sums of the compositing weights; errors (N,): sums of weight times the pixel's squared error; prices
     (N,): change of the squared error if the Gaussian alone is removed, negative if the error falls; differences (N,):
-    squared difference that this makes to the images. Squares are summed over RGB. share: fraction of the training
-    photos that these are.
+    squared difference that this makes to the images; pairs (N,): pixels in which the Gaussian is composited. Squares
+    are summed over RGB. share: fraction of the training photos that these are.
     """
 
     weights: Array
     errors: Array
     prices: Array
     differences: Array
+    pairs: Array
     share: float = 1.0
 
 
