@@ -163,7 +163,8 @@ class Removal(NamedTuple):
     @classmethod
     def of(cls, sums: Any) -> "Removal":
         """The fields from their columns in (N, 5 + C) on the host, as `Stages.removal_sums` returns them."""
-        return cls(*sums.T[:5], sums[:, 5:])
+        errors, differences, weights, squares, pairs = sums.T[:5]
+        return cls(errors, differences, weights, squares, pairs, sums[:, 5:])
 
 
 class AdamStep(NamedTuple):

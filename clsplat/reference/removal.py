@@ -25,7 +25,8 @@ def removal(splats: AnySplats, bins: Bins, background: Any, residuals: Any = Non
         behind[hit.box] += weight[:, :, None] * splats.colors[hit.splat]
     behind += transmittance[:, :, None] * np.asarray(background, dtype=np.float64)
 
-    out = Removal(*(np.zeros(n) for _ in range(5)), np.zeros((n, channels)))
+    errors, differences, weights, squares, pairs = np.zeros((5, n))
+    out = Removal(errors, differences, weights, squares, pairs, np.zeros((n, channels)))
     for hit in hits(splats, bins, transmittance, STOP):
         g, alpha = hit.splat, np.minimum(hit.alpha, ALPHA_MAX)
         weight = alpha * hit.before

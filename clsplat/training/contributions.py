@@ -47,5 +47,6 @@ def contributions(
 def _add(renderer: Renderer, measured: Measured, sums: dict[str, Any]) -> None:
     v = Image(measured.errors, renderer.no_alpha_gradient(measured.view.camera))
     renderer.stages.add_column(renderer.backward_to_splats(measured.run, v).colors, 0, sums["errors"])
-    for name, field in (("weights", "weights"), ("prices", "errors"), ("differences", "differences"), ("pairs", "pairs")):
+    fields = {"weights": "weights", "prices": "errors", "differences": "differences", "pairs": "pairs"}
+    for name, field in fields.items():
         renderer.stages.add_column(measured.sums, Removal._fields.index(field), sums[name])
