@@ -9,7 +9,7 @@ from clsplat.config import TrainConfig
 from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations
 from clsplat.training.densify.schedule import Schedule
-from clsplat.training.densify.strategy import Edit, Strategy, Survey
+from clsplat.training.densify.strategy import Contributions, Edit, Strategy, Survey
 
 Array = NDArray[Any]
 
@@ -34,8 +34,8 @@ TOLL = 1.0
 compositing takes the same time for every pair (measured: docs/howto/strategies.md)."""
 
 SHARE_MIN = 0.1
-"""Fraction of the training photos that must be surveyed for Gaussians to be removed by price: a Gaussian that few
-photos show seems useless in most surveys (measured: docs/howto/strategies.md)."""
+"""Fraction of the training photos below which a survey decides only on Gaussians with more pairs than most: one that
+few photos show, or in few pixels, seems useless in most surveys (measured: docs/howto/strategies.md)."""
 
 
 class ErrorGuided(Strategy):
@@ -74,17 +74,12 @@ class ErrorGuided(Strategy):
         n = len(gaussians)
         if not self.schedule.due(iteration):
             return Edit(gaussians, np.arange(n), np.zeros(n, bool))
-        weights, errors, prices, differences, pairs, share = survey(self.config.views)
-        known = np.maximum(differences, MEMORY * self.statistics["differences"])
-        # Of many that are too bright in one place, each alone promises the gain that only the first removal brings.
-        prices = prices + OTHERS * known - TOLL * errors.sum() / max(pairs.sum(), 1) * pairs
+        seen = survey(self.config.views)
+        errors = seen.errors
+        known = np.maximum(seen.differences, MEMORY * self.statistics["differences"])
         target = self.schedule.count_after(iteration, n, cap)
         doomed = gaussians.opacities <= self.config.opacity_min
-        # Gaussians that no photo of the survey shows may be needed by the others.
-        seen = np.flatnonzero((weights > 0) & (share >= SHARE_MIN))
-        least = self.config.replaced * n if target >= cap else 0
-        count = np.clip((prices[seen] <= 0).sum(), least, self.config.replaced_most * n)
-        doomed[seen[np.argsort(prices[seen], kind="stable")[: int(count)]]] = True
+        doomed[self._not_worth_it(seen, known, target >= cap)] = True
         live = np.flatnonzero(~doomed)
         if len(live) == 0:
             self.statistics = {"differences": known.astype(np.float32)}
@@ -99,6 +94,21 @@ class ErrorGuided(Strategy):
         # A child has half of the parent's effect on the image, and a quarter of its square.
         self.statistics = {"differences": np.where(fresh, known[rows] / 4, known[rows]).astype(np.float32)}
         return Edit(result, rows, fresh)
+
+    def _not_worth_it(self, seen: Contributions, known: Array, full: bool) -> Array:
+        """Rows of the Gaussians that are removed by their prices, with the largest differences known of each."""
+        # Of many that are too bright in one place, each alone promises the gain that only the first removal brings.
+        toll = TOLL * seen.errors.sum() / max(seen.pairs.sum(), 1)
+        prices = seen.prices + OTHERS * known - toll * seen.pairs
+        # Gaussians that no photo of the survey shows may be needed by the others.
+        judged, least = seen.weights > 0, self.config.replaced if full else 0.0
+        if seen.share < SHARE_MIN:
+            judged &= seen.pairs > seen.pairs.sum() / max(np.count_nonzero(seen.pairs), 1)
+            least = 0.0
+        rows = np.flatnonzero(judged)
+        n = len(prices)
+        count = np.clip((prices[rows] <= 0).sum(), least * n, self.config.replaced_most * n)
+        return rows[np.argsort(prices[rows], kind="stable")[: int(count)]]
 
 
 def split(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
