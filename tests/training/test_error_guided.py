@@ -157,16 +157,15 @@ def test_children_inherit_a_quarter_of_the_squared_effect() -> None:
     np.testing.assert_array_equal(strategy.statistics["differences"], expected.astype(np.float32))
 
 
-@pytest.mark.parametrize(("share", "gone"), [(SHARE_MIN, [0, 1, 2, 3, 4]), (0.99 * SHARE_MIN, [3])])
-def test_a_survey_of_few_photos_removes_only_large_ones(share: float, gone: list[int]) -> None:
-    """Neither the least useful nor those that do harm in few pixels: the other photos may need them. Those that the
-    survey does not show are not part of the mean."""
-    prices, pairs, weights = np.full(N, 100.0), np.full(N, 10.0), np.ones(N)
-    prices[:5], pairs[3], pairs[50:], weights[50:] = -2, 11, 0, 0
+@pytest.mark.parametrize(("share", "gone"), [(SHARE_MIN, 5), (0.99 * SHARE_MIN, 0)])
+def test_none_makes_room_by_a_survey_of_few_photos(share: float, gone: int) -> None:
+    """Neither the least useful nor those that do harm in it: the other photos may need them."""
     for cap in (N, 2 * N):
-        seen = seeing(weights, np.ones(N), prices, share, pairs=pairs)
-        edit = ErrorGuided(CONFIG, 1.0, N).edit(200, scene(), cap, seen)
-        assert np.setdiff1d(np.arange(N), edit.rows).tolist() == gone
+        strategy = ErrorGuided(CONFIG, 1.0, N)
+        prices = np.full(N, 1.0)
+        prices[:5] = -2
+        edit = strategy.edit(200, scene(), cap, seeing(np.ones(N), np.ones(N), prices, share))
+        assert len(np.setdiff1d(np.arange(N), edit.rows)) == gone
 
 
 def test_what_has_no_error_is_not_split() -> None:

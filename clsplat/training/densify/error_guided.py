@@ -34,8 +34,8 @@ TOLL = 1.0
 compositing takes the same time for every pair (measured: docs/howto/strategies.md)."""
 
 SHARE_MIN = 0.1
-"""Fraction of the training photos below which a survey decides only on Gaussians with more pairs than most: one that
-few photos show, or in few pixels, seems useless in most surveys (measured: docs/howto/strategies.md)."""
+"""Fraction of the training photos that must be surveyed for Gaussians to be removed by price: a Gaussian that few
+photos show seems useless in most surveys (measured: docs/howto/strategies.md)."""
 
 
 class ErrorGuided(Strategy):
@@ -101,12 +101,8 @@ class ErrorGuided(Strategy):
         toll = TOLL * seen.errors.sum() / max(seen.pairs.sum(), 1)
         prices = seen.prices + OTHERS * known - toll * seen.pairs
         # Gaussians that no photo of the survey shows may be needed by the others.
-        judged, least = seen.weights > 0, self.config.replaced if full else 0.0
-        if seen.share < SHARE_MIN:
-            judged &= seen.pairs > seen.pairs.sum() / max(np.count_nonzero(seen.pairs), 1)
-            least = 0.0
-        rows = np.flatnonzero(judged)
-        n = len(prices)
+        rows = np.flatnonzero((seen.weights > 0) & (seen.share >= SHARE_MIN))
+        n, least = len(prices), self.config.replaced if full else 0.0
         count = np.clip((prices[rows] <= 0).sum(), least * n, self.config.replaced_most * n)
         return rows[np.argsort(prices[rows], kind="stable")[: int(count)]]
 
