@@ -7,6 +7,7 @@ import pytest
 
 from clsplat.config import TrainConfig
 from clsplat.training.autosize.rule import (
+    LATER_GAIN,
     Search,
     SmallSide,
     Trial,
@@ -32,14 +33,17 @@ def trial(grows: bool, gains: list[float], price: float = 0.1) -> Trial:
 
 
 def test_a_change_is_earned_beyond_chance() -> None:
-    """Growth must gain more than its price by the standard error; what pruning loses must be below it by as much."""
+    """Growth must gain more than its price by the standard error; what pruning loses until the end of the run must be
+    below it by as much."""
     found = trial(True, [0.1, 0.3])
     assert (found.gain, found.margin, found.price) == pytest.approx((0.2, 0.1, 0.1))
     assert trial(True, [-9.0, 0.1, 0.3, 0.4]).margin == pytest.approx(1.4826 * 0.15 / 2), (
         "one photo is far from all others"
     )
     assert not trial(True, [0.11, 0.4]).takes_smaller and trial(True, [0.09, 0.4]).takes_smaller
-    assert trial(False, [-0.3, 0.09]).takes_smaller and not trial(False, [-0.3, 0.11]).takes_smaller
+    least = 0.1 - LATER_GAIN
+    assert trial(False, [-0.3, least - 0.01]).takes_smaller and not trial(False, [-0.3, least + 0.01]).takes_smaller
+    assert trial(False, [-0.3, 0.09], price=0.1 + LATER_GAIN).takes_smaller
     assert trial(True, [0.09, 0.09]).takes_smaller and not trial(True, [0.11, 0.11]).takes_smaller
     assert not trial(True, [-3.7, 0.72, 0.74, 0.87]).takes_smaller, "one photo does not decide"
 

@@ -66,6 +66,10 @@ FEWEST_PRUNING = 4
 HALVING = 0.5
 """Fraction of the Gaussians that a trial of pruning leaves."""
 
+LATER_GAIN = 0.12
+"""Gain, dB, that twice the Gaussians still make between a trial of pruning and the end of the run: few Gaussians learn
+faster. The least of three captures (docs/size.md)."""
+
 RANDOM_START = 10_000
 """Gaussians of a random start. Few are enough, since they only have to fill the scene before growth adds detail."""
 
@@ -141,10 +145,12 @@ class Trial(NamedTuple):
     def takes_smaller(self) -> bool:
         """Whether the smaller candidate continues.
 
-        A change must be earned: growth has to gain more than its price beyond chance, and what pruning loses must be
-        below the price beyond chance.
+        A change must be earned: growth has to gain more than its price beyond chance, and what pruning loses until
+        the end of the run must be below the price beyond chance.
         """
-        return self.gain <= self.price + (self.margin if self.grows else -self.margin)
+        if self.grows:
+            return self.gain <= self.price + self.margin
+        return self.gain + LATER_GAIN <= self.price - self.margin
 
 
 class SmallSide(NamedTuple):
