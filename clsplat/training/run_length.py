@@ -1,7 +1,6 @@
 """Length of a training, and size of its first photos, by the number and the size of the photos."""
 
 from dataclasses import replace
-from math import sqrt
 from typing import Final, Literal
 
 from clsplat.config import TrainConfig
@@ -14,8 +13,8 @@ FEWEST_ITERATIONS = 3000
 """Fewest iterations with photos of at most `SMALL_PHOTO` pixels: few photos, too, need time for growth."""
 
 SMALL_PHOTO = 90_000
-"""Pixels up to which photos count as small. With larger ones the fewest iterations grow in proportion to their edges:
-they show more detail, which takes more rounds of growth and longer training (measured: docs/benchmarks.md)."""
+"""Pixels up to which photos count as small. With larger ones the fewest iterations grow in proportion to the root of
+their edges: they show more detail, which takes longer training (measured: docs/benchmarks.md)."""
 
 MOST_ITERATIONS = 30_000
 """Most iterations, those of the paper's longer setting."""
@@ -45,7 +44,7 @@ def with_length(config: TrainConfig, scene: Scene) -> TrainConfig:
     """
     pixels = largest_photo(scene)
     if not config.iterations:
-        fewest = round(FEWEST_ITERATIONS * sqrt(max(1.0, pixels / SMALL_PHOTO)))
+        fewest = round(FEWEST_ITERATIONS * max(1.0, pixels / SMALL_PHOTO) ** 0.25)
         wanted = max(fewest, VISITS * len(scene.train))
         config = replace(config, iterations=min(MOST_ITERATIONS, wanted))
     if not config.coarse.factor:

@@ -29,7 +29,7 @@ def with_photos(width: int, height: int, count: int) -> Scene:
 
 @pytest.mark.parametrize(
     ("size", "count", "iterations", "factor"),
-    [((300, 300), 3, 3000, 1), ((600, 600), 3, 6000, 4), ((600, 600), 300, 9000, 4), ((6000, 4000), 3, 30_000, 4)],
+    [((300, 300), 3, 3000, 1), ((600, 600), 3, 4243, 4), ((600, 600), 300, 9000, 4), ((6000, 4000), 3, 12_123, 4)],
 )
 def test_larger_photos_take_more_iterations_and_start_smaller(size, count, iterations, factor):
     scene = with_photos(*size, 1)
