@@ -19,8 +19,8 @@
 // Buffers: N, M, T, C and splats as in composite_cpu.cl, first_slots[N+1], slots[M] as in bin.cl
 //   in   splats[N], gauss_ids[M], tile_ranges[T,2], slots[M], background[C]; residuals[H,W,C], image - target;
 //        mask[H,W] uchar, 1 where pixels count
-//   out  records[M,5+C]; sums[N,5+C]: change of the squared error, sums of |D|^2, of w, of w^2, number of pixels in
-//        which the splat is composited, sums of w r
+//   out  records[M,6+C]; sums[N,6+C]: change of the squared error, sums of |D|^2, of w, of w^2, of w |r|^2, number of
+//        pixels in which the splat is composited, sums of w r
 // -DTILE=8|16|32   edge of a tile, px; 32 only with -DLANES=16
 // -DCHANNELS    number of colour channels, 1 or more
 // -DLANES=8|16  number of pixels of a block
@@ -43,10 +43,10 @@ __kernel void removal(const int width, const int height, const __global Splat *s
     Grid grid = pixel_grid();
     LOAD_DIRECTIONS(grid)
     BlockPixels pixels[BLOCKS]; // with the colour behind the present splat, after composite_tile
-    REALV residual[BLOCKS][CHANNELS], counts[BLOCKS];
+    REALV residual[BLOCKS][CHANNELS], squared[BLOCKS], counts[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) {
         pixels[b] = pixels_at_first(&grid, b, rows, columns);
-        counts[b] = 0;
+        squared[b] = counts[b] = 0;
         _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) residual[b][k] = 0;
     }
     for (int r = 0; r < rows; ++r) {
@@ -56,8 +56,11 @@ __kernel void removal(const int width, const int height, const __global Splat *s
             if (!mask[first + x])
                 continue;
             ((real *)&counts[b])[lane] = 1;
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k)((real *)&residual[b][k])[lane] =
-                residuals[CHANNELS * (first + x) + k];
+            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
+                const real r = residuals[CHANNELS * (first + x) + k];
+                ((real *)&residual[b][k])[lane] = r;
+                ((real *)&squared[b])[lane] += r * r;
+            }
         }
     }
 
@@ -79,7 +82,8 @@ __kernel void removal(const int width, const int height, const __global Splat *s
         for (uint j = 0; j < count; ++j) {
             const Splat *s = &batch.splats[j];
             const Corner corner = corner_from(s, x0, y0);
-            REALV difference = 0, agreement = 0, weights = 0, squares = 0, pairs = 0, pulls[CHANNELS];
+            REALV difference = 0, agreement = 0, weights = 0, squares = 0, shares = 0, pairs = 0;
+            REALV pulls[CHANNELS];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pulls[k] = 0;
             for (Blocks blocks = unfinished & blocks_of(&batch, j); blocks;) {
                 const uint b = take_block(&blocks);
@@ -102,6 +106,7 @@ __kernel void removal(const int width, const int height, const __global Splat *s
                 const REALV counted = weight * counts[b];
                 weights += counted;
                 squares += weight * counted;
+                shares += weight * squared[b];
                 pairs += weight > 0 ? counts[b] : (REALV)0;
             }
             __global real *record = records + (size_t)SUMS * slots[first + j];
@@ -109,8 +114,9 @@ __kernel void removal(const int width, const int height, const __global Splat *s
             record[1] = sum_lanes(difference);
             record[2] = sum_lanes(weights);
             record[3] = sum_lanes(squares);
-            record[4] = sum_lanes(pairs);
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[5 + k] = sum_lanes(pulls[k]);
+            record[4] = sum_lanes(shares);
+            record[5] = sum_lanes(pairs);
+            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[6 + k] = sum_lanes(pulls[k]);
         }
     }
     for (uint i = first; i < end; ++i) {

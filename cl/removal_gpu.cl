@@ -60,7 +60,7 @@ removal(const int width, const int height, const __global Splat *splats, const _
         const uint count = min((uint)BATCH, length - first);
         const uint i = begin + first + lane;
         Splat s;
-        real difference = 0, agreement = 0, weights = 0, squares = 0, pairs = 0, pulls[CHANNELS];
+        real difference = 0, agreement = 0, weights = 0, squares = 0, shares = 0, pairs = 0, pulls[CHANNELS];
         int any_live = 0;
         if (lane < count)
             s = splats[gauss_ids[i]];
@@ -88,6 +88,7 @@ removal(const int width, const int height, const __global Splat *splats, const _
                         difference += counts[p] ? less * less : 0;
                         agreement += less * residual[k][p];
                         pulls[k] += weight * residual[k][p];
+                        shares += weight * residual[k][p] * residual[k][p];
                     }
                     weights += counts[p] ? weight : 0;
                     squares += counts[p] ? weight * weight : 0;
@@ -103,9 +104,10 @@ removal(const int width, const int height, const __global Splat *splats, const _
             record[1] = difference;
             record[2] = weights;
             record[3] = squares;
-            record[4] = pairs;
+            record[4] = shares;
+            record[5] = pairs;
             for (int k = 0; k < CHANNELS; ++k)
-                record[5 + k] = pulls[k];
+                record[6 + k] = pulls[k];
         }
         if (lane == count - 1)
             unfinished = any_live;

@@ -5,7 +5,7 @@
 #define CLSPLAT_REMOVAL_SUMS_H
 
 // Number of reals of a record.
-#define SUMS (5 + CHANNELS)
+#define SUMS (6 + CHANNELS)
 
 __kernel void removal_sum(const uint n, const __global uint *first_slots, const __global real *records,
                           __global real *sums) {

@@ -148,23 +148,24 @@ class Removal(NamedTuple):
 
     errors (N,): by how much it grows if the splat is removed; differences (N,): the squared difference that this
     makes to the image, the same if the image is its own target; weights (N,), squares (N,): sums of the weight
-    w = alpha T and of w^2; pairs (N,): pixels in which the splat is composited; pulls (N, C): sums of w r with
-    r = image - target. Another colour c + d makes the error grow by squares |d|^2 + 2 pulls . d. All are 0 for what
-    is not seen.
+    w = alpha T and of w^2; shares (N,): sums of w |r|^2 with r = image - target; pairs (N,): pixels in which the
+    splat is composited; pulls (N, C): sums of w r. Another colour c + d makes the error grow by
+    squares |d|^2 + 2 pulls . d. All are 0 for what is not seen.
     """
 
     errors: Any
     differences: Any
     weights: Any
     squares: Any
+    shares: Any
     pairs: Any
     pulls: Any
 
     @classmethod
     def of(cls, sums: Any) -> "Removal":
-        """The fields from their columns in (N, 5 + C) on the host, as `Stages.removal_sums` returns them."""
-        errors, differences, weights, squares, pairs = sums.T[:5]
-        return cls(errors, differences, weights, squares, pairs, sums[:, 5:])
+        """The fields from their columns in (N, 6 + C) on the host, as `Stages.removal_sums` returns them."""
+        errors, differences, weights, squares, shares, pairs = sums.T[:6]
+        return cls(errors, differences, weights, squares, shares, pairs, sums[:, 6:])
 
 
 class AdamStep(NamedTuple):
@@ -268,9 +269,7 @@ class Stages(FieldStages, Protocol):
     def removal_sums(
         self, splats: AnySplats, bins: Bins, background: Any, residuals: Any = None, mask: Any = None
     ) -> Array: ...
-    def removal_residuals(
-        self, image: Array, photo: Array, mask: Array = None, *, clamped: bool = False
-    ) -> tuple[Array, Array]: ...
+    def removal_residuals(self, image: Array, photo: Array, *, clamped: bool = False) -> Array: ...
     def disparity_loss(self, image: Array, target: Array, weight: float) -> tuple[float, Array]: ...
     def disparity_grad(self, image: Array, target: Array, weight: float, v_rgb: Array) -> Array: ...
     def sweep_similarities(self, photo: Array, sources: list[Array], maps: Array, planes: Array) -> Array: ...

@@ -40,7 +40,7 @@ def removal_sums(
 
     Returns
     -------
-    (N, 5 + C) real
+    (N, 6 + C) real
         The fields of `Removal` as columns, on the device.
 
     Raises
@@ -55,8 +55,8 @@ def removal_sums(
     n, channels = splats.colors.shape
     m, (tiles, _) = bins.gauss_ids.shape[0], bins.tile_ranges.shape
     size = bins.height, bins.width
-    records = device.empty("prices per intersection", (max(m, 1), 5 + channels))
-    sums = device.empty("prices", (n, 5 + channels))
+    records = device.empty("prices per intersection", (max(m, 1), 6 + channels))
+    sums = device.empty("prices", (n, 6 + channels))
     if residuals is None:
         residuals = device.zeros("residuals", (*size, channels))
     pixels = [
@@ -81,30 +81,23 @@ def removal_sums(
     return sums
 
 
-def removal_residuals(
-    device: Device, image: Array, photo: Array, mask: Array | None = None, *, clamped: bool = False
-) -> tuple[Array, Array]:
-    """Residuals of an image, and its squared error in each pixel.
+def removal_residuals(device: Device, image: Array, photo: Array, *, clamped: bool = False) -> Array:
+    """Residuals of an image.
 
     Parameters
     ----------
     image : (H, W, 3) real
     photo : (H, W, 3) uint8
-    mask : (H, W) uint8, optional
-        Not 0 where errors count. Default: everywhere.
     clamped : bool
         Clamp the image to [0, 1] as a screen does: values above white are then no error.
 
     Returns
     -------
-    residuals : (H, W, 3) real
+    (H, W, 3) real
         Image minus photo / 255.
-    errors : (H, W, 3) real
-        The squared residuals summed over RGB, where the mask counts, in the first channel; 0 in the others.
     """
-    residuals, errors = device.empty("residuals", image.shape), device.empty("squared errors", image.shape)
-    pixels = image.shape[0] * image.shape[1]
-    pair = [image, photo, photo if mask is None else mask]
-    arguments = [pixels, int(clamped), int(mask is not None), *pair, residuals, errors]
-    device.launch("removal_residuals", "removal_residuals", (pixels,), arguments)
-    return residuals, errors
+    residuals = device.empty("residuals", image.shape)
+    device.launch(
+        "removal_residuals", "removal_residuals", (image.size,), [image.size, int(clamped), image, photo, residuals]
+    )
+    return residuals

@@ -56,13 +56,12 @@ class Prices(NamedTuple):
 class Measured(NamedTuple):
     """Removal of each Gaussian measured in one view.
 
-    errors (H, W, 3): squared error of each pixel in the first channel, 0 in the others; sums: those of the stage
-    removal. Both are where the stages run. The rows of the backdrop, if there is one, follow those of the Gaussians.
+    sums: those of the stage removal, where the stages run. The rows of the backdrop, if there is one, follow those of
+    the Gaussians.
     """
 
     view: View
     run: Pass
-    errors: Any
     sums: Any
 
     @property
@@ -113,10 +112,10 @@ def _measured(renderer: Renderer, placed: Gaussians, view: View, sh_degree: int 
     run = renderer.forward(placed, view.camera, sh_degree)
     photo = renderer.upload("photo", view.image, np.uint8)
     mask = None if view.mask is None else renderer.upload("mask", view.mask, np.uint8)
-    residuals, errors = renderer.stages.removal_residuals(run.image.rgb, photo, mask, clamped=clamped)
+    residuals = renderer.stages.removal_residuals(run.image.rgb, photo, clamped=clamped)
     background = np.array(renderer.background)
     sums = renderer.stages.removal_sums(run.drawn, run.bins, background, residuals, mask)
-    return Measured(view, run, errors, sums)
+    return Measured(view, run, sums)
 
 
 def price(gaussians: Gaussians, views: list[View], renderer: Renderer, *, bands: bool = True) -> Prices:

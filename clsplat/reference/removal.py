@@ -25,8 +25,8 @@ def removal(splats: AnySplats, bins: Bins, background: Any, residuals: Any = Non
         behind[hit.box] += weight[:, :, None] * splats.colors[hit.splat]
     behind += transmittance[:, :, None] * np.asarray(background, dtype=np.float64)
 
-    errors, differences, weights, squares, pairs = np.zeros((5, n))
-    out = Removal(errors, differences, weights, squares, pairs, np.zeros((n, channels)))
+    errors, differences, weights, squares, shares, pairs = np.zeros((6, n))
+    out = Removal(errors, differences, weights, squares, shares, pairs, np.zeros((n, channels)))
     for hit in hits(splats, bins, transmittance, STOP):
         g, alpha = hit.splat, np.minimum(hit.alpha, ALPHA_MAX)
         weight = alpha * hit.before
@@ -38,6 +38,7 @@ def removal(splats: AnySplats, bins: Bins, background: Any, residuals: Any = Non
         out.differences[g] += difference
         out.weights[g] += (weight * counts[hit.box]).sum()
         out.squares[g] += (weight**2 * counts[hit.box]).sum()
+        out.shares[g] += (weight[:, :, None] * r[hit.box] ** 2).sum()
         out.pairs[g] += ((weight > 0) * counts[hit.box]).sum()
         out.pulls[g] += np.einsum("hw,hwc->c", weight, r[hit.box])
     return out
@@ -48,9 +49,6 @@ def removal_sums(splats: AnySplats, bins: Bins, background: Any, residuals: Any 
     return np.column_stack(removal(splats, bins, background, residuals, mask))
 
 
-def removal_residuals(image: Any, photo: Any, mask: Any = None, *, clamped: bool = False) -> tuple[Any, Any]:
-    """Residuals and squared errors. Arguments and result as for `clsplat.ops.removal_residuals`."""
-    residuals = (np.clip(image, 0, 1) if clamped else image) - photo / 255
-    errors = np.zeros_like(residuals)
-    errors[:, :, 0] = (residuals**2).sum(axis=2) * (1 if mask is None else np.asarray(mask) != 0)
-    return residuals, errors
+def removal_residuals(image: Any, photo: Any, *, clamped: bool = False) -> Any:
+    """Residuals. Arguments and result as for `clsplat.ops.removal_residuals`."""
+    return (np.clip(image, 0, 1) if clamped else image) - photo / 255

@@ -67,8 +67,8 @@ HALVING = 0.5
 """Fraction of the Gaussians that a trial of pruning leaves."""
 
 LATER_GAIN = 0.12
-"""Gain, dB, that twice the Gaussians still make between a trial of pruning and the end of the run: few Gaussians learn
-faster. The least of three captures (docs/size.md)."""
+"""Gain, dB, that twice the Gaussians still make between a trial of pruning and the end of the run: few Gaussians
+learn faster. The least of three captures (docs/size.md)."""
 
 RANDOM_START = 10_000
 """Gaussians of a random start. Few are enough, since they only have to fill the scene before growth adds detail."""
