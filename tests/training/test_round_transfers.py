@@ -23,7 +23,7 @@ ROWS = 2 * REAL
 """The rows that harmonics and moments continue."""
 
 STATISTICS = {"error": 1 * REAL, "adc": 2 * REAL, "mcmc": 0}
-SURVEYS = {"error": 4 * 2 * REAL}
+SURVEYS = {"error": 5 * 2 * REAL}
 """Sums of twice the precision, whatever the number of photos."""
 
 WIDTH, HEIGHT, VIEWS = 40, 32, 3
