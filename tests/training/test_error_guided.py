@@ -10,7 +10,7 @@ from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations
 from clsplat.testing import synthetic_scene
 from clsplat.training.densify import Contributions, Survey
-from clsplat.training.densify.error_guided import MEMORY, SHARE_MIN, TOLL, ErrorGuided, split
+from clsplat.training.densify.error_guided import HARM, MEMORY, SHARE_MIN, TOLL, ErrorGuided, split
 
 N = 100
 CONFIG = TrainConfig(size="fixed", iterations=2000, strategy="error", max_gaussians=N)
@@ -105,21 +105,30 @@ def test_at_the_cap_those_of_least_price_make_room(harmful: int, gone: int) -> N
     assert np.unique(edit.rows[edit.fresh]).tolist() == sorted(split_most)
 
 
-@pytest.mark.parametrize("cap", [N, 2 * N])
-def test_those_go_that_explain_less_than_their_share_per_pair(cap: int) -> None:
-    """An even share of the error per pair of a Gaussian and a pixel, and no more than 5 % at once."""
+def test_while_there_is_room_only_real_harm_goes() -> None:
+    """Not what would lower the error a little by going, and no more than 5 % at once."""
+    share = 2.0
+    prices, errors = np.full(N, 1.0), np.full(N, share)
+    prices[:5] = -HARM * share * np.array([0.9, 0.5, 0.1, 1.1, 3])
+    strategy = ErrorGuided(CONFIG, 1.0, N)
+    gone = np.setdiff1d(np.arange(N), strategy.edit(200, scene(), 2 * N, seeing(np.ones(N), errors, prices)).rows)
+    assert gone.tolist() == [3, 4]
+    prices[:] = -share
+    strategy = ErrorGuided(CONFIG, 1.0, N)
+    edit = strategy.edit(200, scene(), 2 * N, seeing(np.ones(N), errors, prices))
+    assert len(np.setdiff1d(np.arange(N), edit.rows)) == CONFIG.error.replaced_most * N
+
+
+@pytest.mark.parametrize("harmful", [0, 3])
+def test_those_go_that_explain_least_for_their_pairs(harmful: int) -> None:
+    """As many as without tolls, but those of the lowest prices less an even share of the error per pair."""
     rng = np.random.default_rng(0)
-    pairs, errors = rng.uniform(1, 100, N), rng.uniform(1, 3, N)
-    toll = TOLL * errors.sum() / pairs.sum() * pairs
-    prices = toll * 1.01
-    prices[[3, 50, 90]] = toll[[3, 50, 90]] * np.array([0.99, 0.5, -1])
-    config = replace(CONFIG, error=ErrorConfig(replaced=0.0))
-    seen = seeing(np.ones(N), errors, prices, pairs=pairs)
-    edit = ErrorGuided(config, 1.0, N).edit(200, scene(), cap, seen)
-    assert np.setdiff1d(np.arange(N), edit.rows).tolist() == [3, 50, 90]
-    edit = ErrorGuided(config, 1.0, N).edit(200, scene(), cap, seeing(np.ones(N), errors, 0 * prices, pairs=pairs))
-    most = sorted(np.argsort(-pairs)[: round(config.error.replaced_most * N)])
-    assert np.setdiff1d(np.arange(N), edit.rows).tolist() == most
+    pairs, errors, prices = rng.uniform(1, 100, N), rng.uniform(1, 3, N), rng.uniform(1, 3, N)
+    prices[:harmful] = -0.1
+    edit = ErrorGuided(CONFIG, 1.0, N).edit(200, scene(), N, seeing(np.ones(N), errors, prices, pairs=pairs))
+    left = prices - TOLL * errors.sum() / pairs.sum() * pairs
+    count = max(harmful, round(CONFIG.error.replaced * N))
+    assert np.setdiff1d(np.arange(N), edit.rows).tolist() == sorted(np.argsort(left)[:count])
 
 
 def test_removals_are_priced_together() -> None:
@@ -163,7 +172,7 @@ def test_none_makes_room_by_a_survey_of_few_photos(share: float, gone: int) -> N
     for cap in (N, 2 * N):
         strategy = ErrorGuided(CONFIG, 1.0, N)
         prices = np.full(N, 1.0)
-        prices[:5] = -2
+        prices[:5] = -2 * HARM
         edit = strategy.edit(200, scene(), cap, seeing(np.ones(N), np.ones(N), prices, share))
         assert len(np.setdiff1d(np.arange(N), edit.rows)) == gone
 

@@ -29,8 +29,12 @@ the render less the photo, k + 1 of them change the squared error by 2 r d + (k 
 MEMORY = 0.9
 """Factor per round on the differences of earlier surveys. Ten rounds, which survey 100 photos, leave a third."""
 
+HARM = 1.0
+"""Fall of the error, in even shares of it, above which Gaussians are removed while others grow (measured:
+docs/howto/strategies.md)."""
+
 TOLL = 1.0
-"""Squared error that a Gaussian must explain for each pair of it and a pixel, in even shares of the error per pair:
+"""Squared error that a Gaussian pays for each pair of it and a pixel, in even shares of the error per pair:
 compositing takes the same time for every pair (measured: docs/howto/strategies.md)."""
 
 SHARE_MIN = 0.1
@@ -96,15 +100,19 @@ class ErrorGuided(Strategy):
         return Edit(result, rows, fresh)
 
     def _not_worth_it(self, seen: Contributions, known: Array, full: bool) -> Array:
-        """Rows of the Gaussians that are removed by their prices, with the largest differences known of each."""
+        """Rows of the Gaussians that are removed by their prices, with the largest differences known of each.
+
+        How many is decided by the prices, and which by the prices less the tolls.
+        """
         # Of many that are too bright in one place, each alone promises the gain that only the first removal brings.
-        toll = TOLL * seen.errors.sum() / max(seen.pairs.sum(), 1)
-        prices = seen.prices + OTHERS * known - toll * seen.pairs
+        prices, error = seen.prices + OTHERS * known, seen.errors.sum()
+        tolls = TOLL * error / max(seen.pairs.sum(), 1) * seen.pairs
         # Gaussians that no photo of the survey shows may be needed by the others.
         rows = np.flatnonzero((seen.weights > 0) & (seen.share >= SHARE_MIN))
-        n, least = len(prices), self.config.replaced if full else 0.0
-        count = np.clip((prices[rows] <= 0).sum(), least * n, self.config.replaced_most * n)
-        return rows[np.argsort(prices[rows], kind="stable")[: int(count)]]
+        n = len(prices)
+        harmful = (prices[rows] <= (0 if full else -HARM * error / n)).sum()
+        count = np.clip(harmful, self.config.replaced * n if full else 0, self.config.replaced_most * n)
+        return rows[np.argsort((prices - tolls)[rows], kind="stable")[: int(count)]]
 
 
 def split(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
