@@ -49,7 +49,8 @@ class ErrorGuided(Strategy):
     densification in Gaussian splatting"). Those with the largest sums over some photos are split along their longest
     axis (Deng et al. 2025, "Improving densification in 3D Gaussian splatting", have such a split; the children here
     keep the parent's moments), up to a budget (Mallick et al. 2024, "Taming 3DGS"). At the cap, the Gaussians whose
-    removal raises the error least make room for others; their prices come from the stage removal.
+    removal raises the error least for the pixels that they cover make room for others; their prices come from the
+    stage removal.
 
     Statistics: differences (N,), the largest that the removal of a Gaussian made to the photos of a survey; earlier
     surveys count less. They keep what only photos outside the present survey show.
@@ -83,7 +84,7 @@ class ErrorGuided(Strategy):
         known = np.maximum(seen.differences, MEMORY * self.statistics["differences"])
         target = self.schedule.count_after(iteration, n, cap)
         doomed = gaussians.opacities <= self.config.opacity_min
-        doomed[self._not_worth_it(seen, known, target >= cap)] = True
+        doomed[self._removed_by_price(seen, known, target >= cap)] = True
         live = np.flatnonzero(~doomed)
         if len(live) == 0:
             self.statistics = {"differences": known.astype(np.float32)}
@@ -99,7 +100,7 @@ class ErrorGuided(Strategy):
         self.statistics = {"differences": np.where(fresh, known[rows] / 4, known[rows]).astype(np.float32)}
         return Edit(result, rows, fresh)
 
-    def _not_worth_it(self, seen: Contributions, known: Array, full: bool) -> Array:
+    def _removed_by_price(self, seen: Contributions, known: Array, full: bool) -> Array:
         """Rows of the Gaussians that are removed by their prices, with the largest differences known of each.
 
         How many is decided by the prices, and which by the prices less the tolls.
