@@ -47,8 +47,8 @@ TV_DENSITY, TV_HARMONICS = 1e-5, 1e-3
 refinement. If photos have few pixels for each cell, trainings then overfit. Here the penalty therefore stays until
 the end, as in that code's settings for users' own captures."""
 
-SPACE_TV_DENSITY, SPACE_TV_HARMONICS = 2e-3, 2e-2
-"""The same where there is a background: four times those of the paper for photos that face forward, since the few
+SPACE_TV_DENSITY, SPACE_TV_HARMONICS = 1e-3, 1e-2
+"""The same where there is a background: twice those of the paper for photos that face forward, since the few
 steps here visit a corner 15 to 30 times, and the paper's 1280 times. Effect: docs/howto/fields.md."""
 
 TV_SHARE = 100
