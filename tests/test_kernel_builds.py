@@ -45,7 +45,7 @@ DEFINES = {
         **{"KEY_BITS": 64, "DIGIT_BITS": 8, "GROUP": 32, "SEGMENT_BITS": 4, "SEGMENT_GROUP": 16},
         **{"BITONIC": 64, "BITONIC_GROUP": 32},
     },
-    "sweep": {"RADIUS": 2, "VARIANCE_MIN": 1e-4, "LANES": 8},
+    "sweep": {"RADIUS": 2, "VARIANCE_MIN": 1e-4, "LANES": 8, "ROWS": 16},
 }
 FORBIDDEN = [
     ("absgrad", "BATCH", 0),

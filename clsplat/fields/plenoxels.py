@@ -34,6 +34,10 @@ raises the rate of the densities from a hundredth during its first 15 000 steps,
 FIRST_DENSITY = 0.2
 """Density at the start, in inverse edges of the unit cube: 0.1 of the paper, whose cube has edges of 2."""
 
+SPACE_DENSITY_SCALE, SPACE_FIRST_DENSITY = 150.0, 0.05
+"""The same two where there is a background. The first steps do not depend on the size of the gradients: at higher
+rates they make cells close to the cameras opaque. Effect: docs/howto/fields.md."""
+
 BETA2, EPS = 0.95, 1e-8
 """Constants of RMSProp (code of Fridovich-Keil et al. 2022). It is Adam without a mean of the gradients."""
 
@@ -42,6 +46,10 @@ TV_DENSITY, TV_HARMONICS = 1e-5, 1e-3
 (Fridovich-Keil et al. 2022, section 4 of the supplement). The paper's code ends this penalty with the first
 refinement. If photos have few pixels for each cell, trainings then overfit. Here the penalty therefore stays until
 the end, as in that code's settings for users' own captures."""
+
+SPACE_TV_DENSITY, SPACE_TV_HARMONICS = 2e-3, 2e-2
+"""The same where there is a background: four times those of the paper for photos that face forward, since the few
+steps here visit a corner 15 to 30 times, and the paper's 1280 times. Effect: docs/howto/fields.md."""
 
 TV_SHARE = 100
 """Number of steps after which each corner has had the total variation in its gradient once (section 3.4)."""
@@ -81,8 +89,12 @@ class Plenoxels(Field):
     def __init__(self, space: Space, device: "Device", seed: int):
         super().__init__(space, device, seed)
         self._rays, self._events = self.samples // FIRST_SAMPLES, 0
+        first, self._density_scale, self._variation = FIRST_DENSITY, DENSITY_SCALE, (TV_DENSITY, TV_HARMONICS)
+        if space.contracted:
+            first, self._density_scale = SPACE_FIRST_DENSITY, SPACE_DENSITY_SCALE
+            self._variation = SPACE_TV_DENSITY, SPACE_TV_HARMONICS
         table = np.zeros(((self.cells + 1) ** 3, FEATURES))
-        table[:, 0] = FIRST_DENSITY / DENSITY_SCALE
+        table[:, 0] = first / self._density_scale
         self._place(np.ones((self.cells,) * 3, np.uint8), table)
 
     def _place(self, occupied: NDArray[np.uint8], table: Array) -> None:
@@ -124,7 +136,7 @@ class Plenoxels(Field):
             return float(np.mean((np.array(batch.background) - batch.colors) ** 2))
         self._rays = int(np.clip(len(offsets) * self.samples / samples.total, 64, RAYS_MAX))
         features = stages.voxels_fwd(samples.positions, self._index, self.table)
-        head = features, rays[1], samples.rays_of, DENSITY_SCALE
+        head = features, rays[1], samples.rays_of, self._density_scale
         sigmas, colors = stages.heads_sh_fwd(*head)
         composited = sigmas, colors, samples.deltas, samples.first, batch.background
         image = stages.rays_fwd(*composited)
@@ -139,7 +151,8 @@ class Plenoxels(Field):
         gradient = self.stages.voxels_bwd(samples.positions, self._index, rows, v_features)
         count = -(-rows // TV_SHARE)
         scale = len(self.occupied) / TV_CELLS / count
-        weights = TV_DENSITY * scale * DENSITY_SCALE / 2, TV_HARMONICS * scale
+        density, harmonics = self._variation
+        weights = density * scale * self._density_scale / 2, harmonics * scale
         variation = self._index, self._corners, self.table, gradient
         self.stages.voxels_tv(*variation, weights, self.iteration * count % rows, count)
         rate = RATE * (RATE_FINAL / RATE) ** progress
@@ -157,7 +170,7 @@ class Plenoxels(Field):
 
         cells, table = len(self.occupied), self.table.get()
         densities = np.zeros((cells + 1) ** 3, np.float32)
-        densities[self.corners] = DENSITY_SCALE * table[:, 0]
+        densities[self.corners] = self._density_scale * table[:, 0]
         dense = densities.reshape((cells + 1,) * 3) * (STEP_CELLS / cells) > OCCUPIED_DEPTH
         kept = maximum_filter(cells_of(dense), 3, mode="constant") & (self.occupied != 0)
         if not kept.any():  # a field that is empty may still become dense
@@ -179,7 +192,7 @@ class Plenoxels(Field):
         offsets = self.device.upload("offsets", np.full(len(rays.radii), 0.5))
         samples = self.stages.march(*rays[:2], offsets, self._occupied, self._marching)
         features = self.stages.voxels_fwd(samples.positions, self._index, self.table)
-        sigmas, colors = self.stages.heads_sh_fwd(features, rays.directions, samples.rays_of, DENSITY_SCALE)
+        sigmas, colors = self.stages.heads_sh_fwd(features, rays.directions, samples.rays_of, self._density_scale)
         return self.stages.rays_fwd(sigmas, colors, samples.deltas, samples.first, background).rgb
 
     def model(self) -> dict[str, Array]:

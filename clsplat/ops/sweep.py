@@ -10,10 +10,13 @@ from clsplat.device import Device
 # Zeros before and after each row (cl/sweep.cl), so that windows of vectors may begin outside the photo.
 PAD = 8
 
+# Rows of a work-item of sweep_similarity: windows share the sums of rows, so that more rows save additions.
+ROWS = 16
+
 
 def _defines(device: Device) -> dict[str, Any]:
     lanes = 8 if device.is_cpu else 1
-    return {"RADIUS": SWEEP_RADIUS, "VARIANCE_MIN": SWEEP_VARIANCE_MIN, "LANES": lanes}
+    return {"RADIUS": SWEEP_RADIUS, "VARIANCE_MIN": SWEEP_VARIANCE_MIN, "LANES": lanes, "ROWS": ROWS}
 
 
 def sweep_similarities(device: Device, photo: Array, sources: list[Array], maps: Array, planes: Array) -> Array:
@@ -40,15 +43,18 @@ def sweep_similarities(device: Device, photo: Array, sources: list[Array], maps:
     stride = -(-width // 8) * 8 + 2 * PAD
     padded = device.empty("photo with margins", (height, stride))
     device.launch("sweep", "sweep_pad", (stride, height), [width, stride, photo, padded], defines=defines)
+    windows = device.empty("windows of the photo", (2, height, stride))
+    arguments: list[Any] = [width, height, stride, padded, windows]
+    device.launch("sweep", "sweep_windows", (stride, height), arguments, defines=defines)
     warped = device.empty("photo on planes", (count, height, stride))
     pairs = device.empty("similarities", (2, count, height, width))
     for s, source in enumerate(sources):
         rows, columns = source.shape
-        arguments: list[Any] = [width, height, stride, columns, rows, source, s, maps, planes, warped]
-        device.launch("sweep", "sweep_warp", (stride, height, count), arguments, defines=defines)
-        arguments = [width, height, stride, s, count, padded, warped, pairs]
-        chunks = -(-width // defines["LANES"])
-        device.launch("sweep", "sweep_similarity", (chunks, height, count), arguments, defines=defines)
+        arguments = [width, height, stride, columns, rows, source, s, maps, planes, warped]
+        device.launch("sweep", "sweep_warp", (stride // defines["LANES"], height, count), arguments, defines=defines)
+        arguments = [width, height, stride, s, count, padded, windows, warped, pairs]
+        chunks = -(-width // defines["LANES"]), -(-height // ROWS), count
+        device.launch("sweep", "sweep_similarity", chunks, arguments, defines=defines)
     return pairs
 
 

@@ -82,6 +82,10 @@ NEARER, FARTHER = 0.8, 1.3
 BISECTIONS = 14
 """Steps in which `thinned` finds the size of its cells: to a thousandth of their logarithm."""
 
+HASH = np.array([-0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15, 1])
+"""Factors of a cell's level and position, whose sum modulo 2^64 stands for the cell: three of the constants that
+Steele et al. 2014, "Fast splittable pseudorandom number generators", multiply with, as signed integers."""
+
 
 @dataclass(frozen=True)
 class Depths:
@@ -217,15 +221,17 @@ def thinned(points: Array, sizes: Array, most: int, seed: int) -> NDArray[np.int
     if len(points) <= most:
         return np.sort(order)
 
-    def one_per_cell(factor: float) -> NDArray[np.intp]:
-        # Cells of powers of two, so that neighbours of similar size share a grid.
-        levels = np.round(np.log2(factor * sizes[order]))
-        cells = np.floor(points[order] / 2.0 ** levels[:, None])
-        _, first = np.unique(np.column_stack([levels, cells]).astype(np.int64), axis=0, return_index=True)
-        return np.sort(order[first])
+    widths, places = np.log2(sizes[order]), points[order]
 
-    low, high = 0.0, np.log2(np.ptp(points, axis=0).max() / sizes.min()) + 1  # of the factor, as logarithms
+    def cells(factor: float) -> NDArray[np.int64]:
+        # Cells of powers of two, so that neighbours of similar size share a grid.
+        levels = np.round(factor + widths).astype(np.int64)
+        return np.column_stack([levels, np.floor(np.ldexp(places, -levels[:, None])).astype(np.int64)]) @ HASH
+
+    low, high = 0.0, np.log2(np.ptp(points, axis=0).max() / sizes.min()) + 1  # of cells over sizes, as logarithms
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        low, high = (middle, high) if len(one_per_cell(2.0**middle)) > most else (low, middle)
-    return one_per_cell(2.0**high)[:most]
+        count = 1 + np.count_nonzero(np.diff(np.sort(cells(middle))))
+        low, high = (middle, high) if count > most else (low, middle)
+    _, first = np.unique(cells(high), return_index=True)
+    return np.sort(order[first])[:most]

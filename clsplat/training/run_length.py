@@ -13,8 +13,8 @@ FEWEST_ITERATIONS = 3000
 """Fewest iterations with photos of at most `SMALL_PHOTO` pixels: few photos, too, need time for growth."""
 
 SMALL_PHOTO = 90_000
-"""Pixels up to which photos count as small. With larger ones the fewest iterations grow in proportion to the root of
-their edges: they show more detail, which takes longer training (measured: docs/benchmarks.md)."""
+"""Pixels up to which photos count as small. With larger ones the fewest iterations, and the number of Gaussians that
+growth may reach, are in proportion to the root of their edges (measured: docs/benchmarks.md)."""
 
 MOST_ITERATIONS = 30_000
 """Most iterations, those of the paper's longer setting."""
@@ -26,6 +26,11 @@ FIRST_FACTOR: Final = 4
 def largest_photo(scene: Scene) -> int:
     """Pixels of the largest training photo."""
     return max(view.camera.width * view.camera.height for view in scene.train)
+
+
+def detail(scene: Scene) -> float:
+    """Factor by which larger photos take more iterations and Gaussians than small ones: the root of their edges."""
+    return max(1.0, largest_photo(scene) / SMALL_PHOTO) ** 0.25
 
 
 def with_length(config: TrainConfig, scene: Scene) -> TrainConfig:
@@ -42,12 +47,11 @@ def with_length(config: TrainConfig, scene: Scene) -> TrainConfig:
         With a number of iterations, and a divisor of the photos' edges at the start: 1 for small photos and where the
         size is fixed.
     """
-    pixels = largest_photo(scene)
     if not config.iterations:
-        fewest = round(FEWEST_ITERATIONS * max(1.0, pixels / SMALL_PHOTO) ** 0.25)
+        fewest = round(FEWEST_ITERATIONS * detail(scene))
         wanted = max(fewest, VISITS * len(scene.train))
         config = replace(config, iterations=min(MOST_ITERATIONS, wanted))
     if not config.coarse.factor:
-        factor: Literal[1, 4] = FIRST_FACTOR if config.size == "auto" and pixels > SMALL_PHOTO else 1
+        factor: Literal[1, 4] = FIRST_FACTOR if config.size == "auto" and detail(scene) > 1 else 1
         config = replace(config, coarse=replace(config.coarse, factor=factor))
     return config

@@ -156,7 +156,7 @@ def test_growth_has_a_pace(device: Device) -> None:
     assert start(many, 5000, CONFIG).pace ** growing == pytest.approx(3)
     camera = Camera.look_at((0, 0, -5), (0, 0, 0), (0, 1, 0), 900, 900, 400)
     large = replace(scene, train=[View("large", camera, np.zeros((400, 900, 3), np.uint8))])
-    assert start(large, 1000, CONFIG).pace ** growing == pytest.approx(180), "half of one per pixel"
+    assert start(large, 1000, CONFIG).pace ** growing == pytest.approx(90 * 2**0.5), "the root of edges twice as long"
     assert most_grown(search, CONFIG) == np.ceil(1000 * search.pace)
     assert most_grown(search, replace(CONFIG, max_gaussians=1100)) == 1100
     assert most_grown(replace(search, grows=False), CONFIG) == 1000

@@ -21,7 +21,7 @@ from clsplat.scene import Scene
 from clsplat.training.densify.schedule import WINDOW
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.rows import Rows
-from clsplat.training.run_length import SMALL_PHOTO, largest_photo
+from clsplat.training.run_length import SMALL_PHOTO, detail, largest_photo
 
 GROWTH_END = 0.4
 """Fraction of the iterations at which growth ends. The paper's densification ends at 0.5; the photos that are held
@@ -53,7 +53,7 @@ PACE = 3.0
 
 PER_PIXEL = 1.0
 """Gaussians per pixel of a small photo that growth reaches by its end, unless `PACE` allows more. Larger photos allow
-more in proportion to their edges (measured: docs/size.md)."""
+more in proportion to the root of their edges (measured: docs/benchmarks.md)."""
 
 VALIDATIONS = 3
 """Validations in the second half of a window, which are averaged: quality fluctuates while the learning rates are
@@ -244,8 +244,7 @@ def start(scene: Scene, n: int, config: TrainConfig) -> "Search":
 
 def reach(scene: Scene) -> float:
     """Number of Gaussians that growth may reach by its end, by the photos."""
-    pixels = largest_photo(scene)
-    return PER_PIXEL * min(pixels, sqrt(pixels * SMALL_PHOTO))
+    return PER_PIXEL * min(largest_photo(scene), SMALL_PHOTO) * detail(scene)
 
 
 def validation_times(config: TrainConfig) -> set[int]:
