@@ -105,9 +105,9 @@ bench-quality:
 	cp build/quality/processor-time-psnr.svg docs/results/quality.svg
 
 # Measure the charts of docs/howto/fields.md: make bench-fields DATA=folder of real scenes. The lengths of trainings of
-# fields are chosen for one to three minutes of two cores each. Finished trainings are not repeated.
+# fields are chosen for one to five minutes of one core each. Finished trainings are not repeated.
 FIELD_SCENES = lego:downscale=4:background=white fern:downscale=8 fox_pinhole:downscale=8 bonsai:downscale=8
-FIELD_LENGTHS = plenoxels=1500 ingp-base=1500 nerf-small=800 mip-nerf360-small=500
+FIELD_LENGTHS = plenoxels=1500 ingp-base=1500 nerf-small=2500 mip-nerf360-small=2000
 bench-fields:
 	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-fields DATA=..."; exit 2; }
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(FIELD_SCENES)) --methods auto paper-7k -o build/fields
