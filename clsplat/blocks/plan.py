@@ -33,9 +33,6 @@ COARSE_LENGTH = 1 / 3
 COARSE_SHARE = 1 / COARSE_FACTOR**2
 """Gaussians of the coarse run, as a fraction of those of the whole scene: as many per pixel."""
 
-REFINING_LENGTH = 1 / 2
-"""Iterations of a block's second training, among the trained blocks, as a fraction of those of its first one."""
-
 REFINING_RATE = 1 / 10
 """Factor on the first learning rate of the means in the second training. It becomes that of the middle of a training,
 in which the rate falls by a factor of 100."""
@@ -92,8 +89,7 @@ class Plan(NamedTuple):
             sum(3 * scene.train[i].camera.width * scene.train[i].camera.height for i in block.photos)
             for block in self.blocks
         ]
-        steps = sum(block_config(config, scene, block).iterations for block in self.blocks)
-        steps += round(REFINING_LENGTH * steps)
+        steps = 2 * sum(block_config(config, scene, block).iterations for block in self.blocks)
         largest = max(block.gaussians for block in self.blocks)
         return (
             f"blocks: {len(self.blocks)}, each with {min(photos)} to {max(photos)} of {len(scene.train)} photos "
@@ -156,9 +152,8 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
 
 
 def refining_config(config: TrainConfig, gaussians: int) -> TrainConfig:
-    """The configuration of a block's second training, of the Gaussians that it has."""
-    iterations = max(1, round(REFINING_LENGTH * config.iterations))
-    return replace(of_fixed_size(config, gaussians, REFINING_RATE), iterations=iterations)
+    """The configuration of a block's second training, of the Gaussians that it has. It is as long as the first one."""
+    return of_fixed_size(config, gaussians, REFINING_RATE)
 
 
 def expected_total(config: TrainConfig, coarse: int) -> int:

@@ -54,14 +54,15 @@ class PlyParts:
         self.begin = header.length + (bytes_before(header) if self.binary else 0)
         self.mode, self.offset = read_comments(header.comments)
 
-    def chunks(self, most: int = CHUNK) -> Iterator[tuple[Array, Gaussians]]:
-        """Yield consecutive rows as they are stored, and as Gaussians, at most `most` at a time.
+    def chunks(self, most: int | None = None) -> Iterator[tuple[Array, Gaussians]]:
+        """Yield consecutive rows as they are stored, and as Gaussians, at most `most` at a time (default: `CHUNK`).
 
         Raises
         ------
         InputError
             If the file cannot be read, or a value is not finite.
         """
+        most = CHUNK if most is None else most
         for first in range(0, self.count, most):
             with reading(self._path), open(self._path, "rb") as file:
                 file.seek(self.begin + first * self.dtype.itemsize)
