@@ -152,7 +152,7 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
 
 
 def refining_config(config: TrainConfig, gaussians: int) -> TrainConfig:
-    """The configuration of a block's second training, of the Gaussians that it has. It is as long as the first one."""
+    """The configuration of a block's second training, of the Gaussians that it has: as long as the first one."""
     return of_fixed_size(config, gaussians, REFINING_RATE)
 
 
