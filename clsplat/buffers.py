@@ -124,6 +124,11 @@ class Buffers:
                 self.pool.free_held()  # the smaller blocks
         return nbytes
 
+    def forget(self) -> None:
+        """Free the blocks that are kept for reuse, and forget sizes: other Gaussians need others."""
+        self._largest.clear()
+        self.pool.free_held()
+
     def allocate(self, what: str, nbytes: int) -> cl.MemoryObjectHolder:
         """A block of at least `nbytes`. Errors as for `empty`."""
         capacity, pool = self.capacity(what, nbytes), self.pool

@@ -29,6 +29,7 @@ from clsplat.streaming import Files, photo_budget
 from clsplat.training.checkpoint import CHECKPOINT, load_state
 from clsplat.training.inputs import Inputs
 from clsplat.training.loop import complete
+from clsplat.training.memory import Footprint
 from clsplat.training.preparation import open_device, photo_memory
 from clsplat.training.run_folder import held
 from clsplat.training.session import Training
@@ -141,21 +142,28 @@ def _start(job_file: Path, job: Job) -> Gaussians:
     return Gaussians.concatenate(found)
 
 
+def _scene(views: list[View]) -> Scene:
+    """Photos of a block, as a scene without points."""
+    return Scene(views, [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
 def _seen(
-    renderer: Renderer,
+    device: "Device",
     start: Gaussians,
     trains: NDArray[np.bool_],
     views: list[View],
     config: TrainConfig,
     folder: Path,
 ) -> tuple[list[View], NDArray[np.bool_]]:
-    """The photos as the block should see them; in files of a folder, if the views stream."""
+    """The photos as the block should see them, in files of a folder, if the views stream; and what they show."""
+    renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
+    most = Footprint.of(_scene(views), config, device).most_drawn(device.memory_limit)
     budget = photo_budget(photo_memory(config))
     if budget is None or not any(view.ahead for view in views):
-        return seen_by_block(renderer, start, trains, views)
+        return seen_by_block(renderer, start, trains, views, most=most)
     folder.mkdir(parents=True, exist_ok=True)
     files = Files(folder)
-    _, shown = seen_by_block(renderer, start, trains, views, files.write)
+    _, shown = seen_by_block(renderer, start, trains, views, files.write, most)
     streamed = files.views(views, budget)
     return [made.with_depth(view.depth) for made, view in zip(streamed, views, strict=True)], shown
 
@@ -165,10 +173,11 @@ def _trained(
 ) -> Gaussians:
     """Train the block in a folder that is held, and return what lies in it."""
     config = job.config
-    renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     trains = job.wide.contains(start.means)
-    seen, shown = _seen(renderer, start, trains, views, job.config, work / SEEN)
-    scene = Scene(seen, [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    device.buffers.forget()  # another block's sizes
+    seen, shown = _seen(device, start, trains, views, job.config, work / SEEN)
+    device.buffers.forget()  # those of all that was drawn; less of it trains
+    scene = _scene(seen)
     inputs = Inputs.of(scene, device)
     if (work / CHECKPOINT).exists():
         state = load_state(work / CHECKPOINT, scene.extent, config, inputs)

@@ -41,8 +41,8 @@ class Box(NamedTuple):
 EVERYWHERE = Box((-np.inf,) * 3, (np.inf,) * 3)
 
 
-def cut(points: Array, count: int) -> list[Box]:
-    """Cut space into boxes that hold about as many points each.
+def cut(points: Array, count: int, costs: Array | None = None) -> list[Box]:
+    """Cut space into boxes that cost about the same.
 
     Each box is cut in two across the axis along which its points extend farthest, at the quantile that gives both
     sides their share of the boxes (Bentley 1975, "Multidimensional binary search trees").
@@ -50,33 +50,43 @@ def cut(points: Array, count: int) -> list[Box]:
     Parameters
     ----------
     points : (N, 3)
-        Positions, world units. The cost of a block grows with the number of its Gaussians, which these stand for.
+        Positions, world units.
     count : int
         Number of boxes, at least 1.
+    costs : (N,), optional
+        Cost that each point adds to its box, above 0. Default: the same for all.
 
     Returns
     -------
     list of Box
         `count` boxes; each point of space is in exactly one.
     """
-    return _cut(np.asarray(points, np.float64), EVERYWHERE, count)
+    return _cut(np.asarray(points, np.float64), np.ones(len(points)) if costs is None else costs, EVERYWHERE, count)
 
 
-def _cut(points: Array, box: Box, count: int) -> list[Box]:
+def _cut(points: Array, costs: Array, box: Box, count: int) -> list[Box]:
     if count == 1:
         return [box]
     first = count // 2
     axis, at = 0, 0.0
     if len(points):
         axis = int(_extent(points).argmax())
-        at = float(np.quantile(points[:, axis], first / count))
+        at = _quantile(points[:, axis], costs, first / count)
     low, high = [*box.low], [*box.high]
     low[axis] = high[axis] = at
     left = points[:, axis] < at
     return [
-        *_cut(points[left], Box(box.low, tuple(high)), first),
-        *_cut(points[~left], Box(tuple(low), box.high), count - first),
+        *_cut(points[left], costs[left], Box(box.low, tuple(high)), first),
+        *_cut(points[~left], costs[~left], Box(tuple(low), box.high), count - first),
     ]
+
+
+def _quantile(values: Array, costs: Array, share: float) -> float:
+    """The middle between two values, of which the lower ones have the given share of the costs."""
+    order = np.argsort(values, kind="stable")
+    sums = np.cumsum(costs[order])
+    last = min(int(np.searchsorted(sums, share * sums[-1])), len(order) - 1)
+    return float(values[order[last : last + 2]].mean())
 
 
 def _extent(points: Array) -> Array:

@@ -31,6 +31,11 @@ ROWS = ".rows"
 folder has of a scene."""
 
 
+PART = 1 << 13
+"""Most rows of a part, 2 MB of degree 3. In smaller parts fewer rows are read that no photo shows; in larger ones the
+index is shorter, and a disk reads faster (effect: docs/howto/large.md)."""
+
+
 class Part(NamedTuple):
     """Consecutive rows of a PLY as `clsplat.formats.ply.save_ply` writes it.
 
@@ -82,7 +87,7 @@ def parts_of(file: Path) -> Iterator[Part]:
     """
     rows = PlyParts(file)
     begin = rows.begin
-    for stored, gaussians in rows.chunks():
+    for stored, gaussians in rows.chunks(PART):
         each = Bounds.of(gaussians)
         low, high = np.nextafter(
             [each.low.min(axis=0), each.high.max(axis=0)], [[-np.inf], [np.inf]], dtype=np.float32

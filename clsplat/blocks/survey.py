@@ -2,16 +2,21 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.blocks.sight import Bounds, seen
 from clsplat.constants import ALPHA_MIN, SH_C0
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.renderer import Pass, Renderer, download
 from clsplat.scene import View, in_turn
 from clsplat.stages import Image
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Array = NDArray[np.float64]
 
@@ -51,15 +56,37 @@ def _weights(renderer: Renderer, run: Pass, mask: NDArray[np.bool_] | None = Non
     return np.asarray(download(renderer.backward_to_splats(run, v).colors)[:, 0], np.float64)
 
 
-def block_weights(
-    renderer: Renderer, gaussians: Gaussians, views: list[View], blocks: NDArray[np.intp], count: int
-) -> Array:
-    """Sum the weights of the Gaussians of each block in each photo.
+def survey(renderer: Renderer, gaussians: Gaussians, views: list[View]) -> "csr_array":
+    """The weights of all Gaussians in all photos, without zeros.
 
     Parameters
     ----------
     renderer, gaussians, views
         As given to `weights`.
+
+    Returns
+    -------
+    (V, N) sparse array of float32
+        In pixels. A weight takes eight bytes. A photo shows a small part of a large scene.
+    """
+    from scipy.sparse import csr_array
+
+    ends, columns, values = [0], [np.zeros(0, np.int32)], [np.zeros(0, np.float32)]
+    for each in weights(renderer, gaussians, views):
+        shown = np.flatnonzero(each > 0)
+        columns.append(shown.astype(np.int32))
+        values.append(each[shown].astype(np.float32))
+        ends.append(ends[-1] + len(shown))
+    return csr_array((np.concatenate(values), np.concatenate(columns), ends), (len(views), len(gaussians)))
+
+
+def block_weights(surveyed: "csr_array", blocks: NDArray[np.intp], count: int) -> Array:
+    """Sum the weights of the Gaussians of each block in each photo.
+
+    Parameters
+    ----------
+    surveyed : (V, N) sparse array
+        As `survey` returns it.
     blocks : (N,) int
         The block of each Gaussian, below `count`.
 
@@ -68,8 +95,17 @@ def block_weights(
     (V, count) float64
         In pixels.
     """
-    found = (np.bincount(blocks, each, count) for each in weights(renderer, gaussians, views))
-    return np.array(list(found)).reshape(len(views), count)
+    from scipy.sparse import csr_array
+
+    members = csr_array((np.ones(len(blocks)), blocks, np.arange(len(blocks) + 1)), (len(blocks), count))
+    return np.asarray((surveyed @ members).toarray())
+
+
+def shown_in(surveyed: "csr_array", photos: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Whether any of some photos shows each Gaussian, (N,)."""
+    found = np.zeros(surveyed.shape[1], bool)
+    found[surveyed[photos].indices] = True
+    return found
 
 
 def chosen_photos(shares: Array, fewest: int) -> NDArray[np.intp]:
@@ -97,8 +133,9 @@ def seen_by_block(
     renderer: Renderer,
     gaussians: Gaussians,
     trains: NDArray[np.bool_],
-    views: Iterable[View],
+    views: list[View],
     keep: Callable[[View], None] | None = None,
+    most: int | None = None,
 ) -> tuple[list[View], NDArray[np.bool_]]:
     """Make the photos as a block should see them, and find the Gaussians that they show.
 
@@ -113,9 +150,12 @@ def seen_by_block(
         The scene, on the host.
     trains : (N,) bool
         The Gaussians that the block trains.
-    views : iterable of View
+    views : list of View
     keep : callable, optional
         Called with each view that is made, which is then not in the result: it may not fit the memory.
+    most : int, optional
+        Gaussians that fit the device. If there are more, those are placed that some of the views may show, then those
+        of the next views. The result has the same bits.
 
     Returns
     -------
@@ -124,20 +164,39 @@ def seen_by_block(
     shown : (N,) bool
         The Gaussians that have a weight in any of them.
     """
-    placed, marks = renderer.place(gaussians), renderer.place(marks_of(gaussians, trains))
     black = Renderer(renderer.device or "reference", renderer.config)
     shown = np.zeros(len(gaussians), bool)
     result = []
-    for view in in_turn(views):
-        run = renderer.forward(placed, view.camera)
-        shown |= _weights(renderer, run) > 0
-        image = np.clip(download(run.image.rgb), 0, 1, dtype=np.float64)
-        marked = black.forward(marks, view.camera, gradients=False).image
-        share = download(marked.rgb)[:, :, :1] / np.maximum(download(marked.alpha)[:, :, None], ALPHA_MIN)
-        blended = image + np.clip(share, 0, 1) * (view.image / 255 - image)
-        made = replace(view, image=to_uint8(blended))
-        result.append(made) if keep is None else keep(made)
+    for some, rows in _batches(renderer, gaussians, views, len(gaussians) if most is None else most):
+        drawn = gaussians.take(rows)
+        placed, marks = renderer.place(drawn), renderer.place(marks_of(drawn, trains[rows]))
+        for view in in_turn(some):
+            run = renderer.forward(placed, view.camera)
+            shown[rows[_weights(renderer, run, view.mask) > 0]] = True
+            image = np.clip(download(run.image.rgb), 0, 1, dtype=np.float64)
+            del run  # the next image needs its memory
+            marked = black.forward(marks, view.camera, gradients=False).image
+            share = download(marked.rgb)[:, :, :1] / np.maximum(download(marked.alpha)[:, :, None], ALPHA_MIN)
+            blended = image + np.clip(share, 0, 1) * (view.image / 255 - image)
+            made = replace(view, image=to_uint8(blended))
+            result.append(made) if keep is None else keep(made)
+        del placed, marks
     return result, shown
+
+
+def _batches(
+    renderer: Renderer, gaussians: Gaussians, views: list[View], most: int
+) -> Iterator[tuple[list[View], NDArray[np.intp]]]:
+    """Yield the views, some at a time, and the rows that these may show: at most `most`, or those of one view."""
+    rows = np.arange(len(gaussians))
+    if len(rows) > most:
+        rows = np.flatnonzero(seen((view.camera for view in views), Bounds.of(gaussians), renderer.config))
+    if len(rows) <= most or len(views) == 1:
+        yield views, rows if len(rows) else np.arange(1)  # a scene has a row, also one that nobody sees
+        return
+    half = len(views) // 2
+    yield from _batches(renderer, gaussians, views[:half], most)
+    yield from _batches(renderer, gaussians, views[half:], most)
 
 
 def marks_of(gaussians: Gaussians, trains: NDArray[np.bool_]) -> Gaussians:

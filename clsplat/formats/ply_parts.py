@@ -14,7 +14,7 @@ from clsplat.gaussians import Gaussians
 Array = NDArray[Any]
 
 CHUNK = 1 << 16
-"""Number of rows that are read at a time, 16 MB of degree 3."""
+"""Default number of rows that are read at a time, 16 MB of degree 3."""
 
 
 class PlyParts:
@@ -54,18 +54,19 @@ class PlyParts:
         self.begin = header.length + (bytes_before(header) if self.binary else 0)
         self.mode, self.offset = read_comments(header.comments)
 
-    def chunks(self) -> Iterator[tuple[Array, Gaussians]]:
-        """Yield consecutive rows as they are stored, and as Gaussians.
+    def chunks(self, most: int | None = None) -> Iterator[tuple[Array, Gaussians]]:
+        """Yield consecutive rows as they are stored, and as Gaussians, at most `most` at a time (default: `CHUNK`).
 
         Raises
         ------
         InputError
             If the file cannot be read, or a value is not finite.
         """
-        for first in range(0, self.count, CHUNK):
+        most = CHUNK if most is None else most
+        for first in range(0, self.count, most):
             with reading(self._path), open(self._path, "rb") as file:
                 file.seek(self.begin + first * self.dtype.itemsize)
-                rows = read_rows(self._path, file, self.dtype, min(CHUNK, self.count - first))
+                rows = read_rows(self._path, file, self.dtype, min(most, self.count - first))
             yield rows, self.gaussians(rows, first)
 
     def gaussians(self, rows: Array, first: int = 0) -> Gaussians:

@@ -22,8 +22,11 @@ LEAST = 0.01
 TINY = 1e-300
 """Stands for a distance of 0 in a quotient."""
 
-AT_ONCE = 4096
-"""Gaussians whose distances to all viewpoints are computed at once, which bounds the memory."""
+AT_ONCE = 1024
+"""Gaussians whose distances to the viewpoints are computed at once, which bounds the memory."""
+
+ROUNDING = 1e-6
+"""Fraction by which the distance is enlarged up to which viewpoints are found."""
 
 NEIGHBOURS = 4
 """Nearest cameras of each camera that are viewpoints together with it: those before and after it on a path, and those
@@ -52,7 +55,8 @@ def viewpoints(cameras: list[Camera]) -> NDArray[np.float64]:
     count = min(NEIGHBOURS + 1, len(places))
     distances, others = (found.reshape(len(places), -1) for found in cKDTree(places).query(places, k=count))
     first, nth = np.nonzero((distances > 0) & (distances / 2 < np.minimum(free[:, None], free[others])))
-    return np.concatenate([places, (places[first] + places[others[first, nth]]) / 2])
+    middles = (places[first] + places[others[first, nth]]) / 2
+    return np.unique(np.concatenate([places, middles]), axis=0)  # two neighbours have found the same middle
 
 
 def steepest_slope(cameras: list[Camera]) -> float:
@@ -96,16 +100,22 @@ def room_factors(gaussians: Gaussians, positions: NDArray[np.float64], slope: fl
     means, scales = gaussians.means.astype(np.float64), gaussians.scales.astype(np.float64)
     reach = np.sqrt(2 * np.log(np.maximum(gaussians.opacities / ALPHA_MIN, 1.0)))  # in standard deviations
     largest = scales.max(axis=1)
-    nearest, _ = cKDTree(positions).query(means, workers=-1)
-    rows = np.flatnonzero(reach * np.hypot(1, slope) * largest > nearest)
+    farthest = reach * np.hypot(1, slope) * largest  # beyond, no viewpoint has a quotient below 1
+    tree = cKDTree(positions)
+    nearest, _ = tree.query(means, workers=-1)
+    rows = np.flatnonzero(farthest > nearest)
     for part in np.array_split(rows, -(-len(rows) // AT_ONCE)) if len(rows) else ():
         quats = gaussians.quats[part].astype(np.float64)
         axes = rotations(quats / np.linalg.norm(quats, axis=1, keepdims=True))
-        offsets = np.einsum("nji,ncj->nci", axes, positions[None] - means[part, None])
-        distances = np.linalg.norm(offsets, axis=2)
-        across = np.linalg.norm(offsets * scales[part, None], axis=2) / np.maximum(distances, TINY)
-        needed = reach[part, None] * np.hypot(across, slope * largest[part, None])
-        factors[part] = np.clip((distances / needed).min(axis=1), LEAST, 1.0)
+        found = tree.query_ball_point(means[part], (1 + ROUNDING) * farthest[part], return_sorted=False)
+        counts = np.array([len(each) for each in found])
+        of, row = np.repeat(np.arange(len(part)), counts), np.repeat(part, counts)
+        offsets = np.einsum("pji,pj->pi", axes[of], positions[np.concatenate(found).astype(np.intp)] - means[row])
+        distances = np.linalg.norm(offsets, axis=1)
+        across = np.linalg.norm(offsets * scales[row], axis=1) / np.maximum(distances, TINY)
+        needed = reach[row] * np.hypot(across, slope * largest[row])
+        least = np.minimum.reduceat(distances / needed, np.cumsum(counts) - counts)
+        factors[part] = np.clip(least, LEAST, 1.0)
     return factors
 
 

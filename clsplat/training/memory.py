@@ -145,6 +145,10 @@ class Footprint:
         left = limit - self.fixed - self.still(intersections)
         return max(0, int(left / self.per_gaussian(intersections)))
 
+    def most_drawn(self, limit: int) -> int:
+        """The largest number of Gaussians that are drawn, and do not train, within `limit` bytes; 0 where none is."""
+        return max(0, int((limit - self.fixed) / replace(self, backdrop=1).still()))
+
     def check(self, start: int, limit: int) -> None:
         """Check that `start` Gaussians fit `limit` bytes.
 

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from small_plan import Planned, plan, unseen
 
-from clsplat.blocks.block import _start, result_of, train_block
+from clsplat.blocks.block import _start, _trained, result_of, train_block
 from clsplat.blocks.jobs import read_job
 from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.parts import read_index, read_scene
@@ -20,8 +20,10 @@ from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
+from clsplat.gaussians import Gaussians
 from clsplat.scene import DepthMap
 from clsplat.show.training_curve import read_log
+from clsplat.training.memory import Footprint
 
 
 def copied(planned: Planned, folder: Path) -> list[Path]:
@@ -104,8 +106,8 @@ def test_a_block_begins_with_a_small_error(
             train_block(job, planned.scene.train, device, stop)
         return float(np.mean(losses))
 
-    def changed(renderer: Any, coarse: Any, trains: Any, views: Any) -> Any:
-        seen, shown = seen_by_block(renderer, coarse, trains, views)
+    def changed(renderer: Any, coarse: Any, trains: Any, views: Any, most: int) -> Any:
+        seen, shown = seen_by_block(renderer, coarse, trains, views, most=most)
         return (seen, shown & False) if without == "its surroundings" else (views, shown)
 
     other = copied(planned, tmp_path / "others")[0]
@@ -113,6 +115,27 @@ def test_a_block_begins_with_a_small_error(
     monkeypatch.setattr("clsplat.blocks.block.seen_by_block", changed)
     # Measured: 0.31 with both, 0.35 without surroundings, 0.45 without the block's own view.
     assert first_loss(other) > 1.08 * with_both
+
+
+def test_a_block_takes_the_memory_of_its_training(planned: Planned, tmp_path: Path) -> None:
+    """What its photos might have shown but do not, and the sizes of what was drawn before, take none."""
+    job, rng = read_job(planned.jobs[0]), np.random.default_rng(0)
+    means = rng.uniform(-1, 1, (20_000, 3)).astype(np.float32)
+    trains = job.wide.contains(means)
+    trained, others = np.flatnonzero(trains)[:2000], np.flatnonzero(~trains)[:5000]
+    rows = np.concatenate([trained, others])
+    opacities = np.where(np.arange(7000) < 3500, 1.0, -9.0).astype(np.float32)  # the last ones are invisible
+    sh = np.zeros((7000, (job.config.init.sh_degree + 1) ** 2, 3), np.float32)
+    quats = np.tile(np.float32([1, 0, 0, 0]), (7000, 1))
+    start = Gaussians(means[rows], np.full((7000, 3), -4, np.float32), quats, opacities, sh)
+    config = replace(job.config, max_gaussians=2000)
+    views = job.views(planned.scene.train)
+    limit = Footprint.of(planned.scene, config, Device(), backdrop=1500).total(2000)
+    device = Device(memory_limit=limit)
+    (tmp_path / "work").mkdir()
+    for _ in range(2):
+        _trained(replace(job, config=config), start, views, device, tmp_path / "work", lambda record: None)
+    assert 0.5 * limit < device.memory_peak <= limit
 
 
 def test_other_photos(planned: Planned, device: Device, tmp_path: Path) -> None:

@@ -26,6 +26,14 @@ def test_the_longest_axis_is_cut_and_single_points_do_not_count() -> None:
     assert 1.4 < left.high[1] < 1.6
 
 
+def test_boxes_cost_the_same() -> None:
+    points = np.random.default_rng(0).uniform(size=(1000, 3)) * [4, 1, 1]
+    costs = np.where(points[:, 0] < 1, 9.0, 1.0)
+    sums = [costs[box.contains(points)].sum() for box in cut(points, 4, costs)]
+    # A cut is off by a point at most, of a cost of 9, at each of two levels.
+    assert np.abs(np.array(sums) - costs.sum() / 4).max() <= 18
+
+
 def test_a_margin_surrounds_shared_faces() -> None:
     points = np.random.default_rng(0).uniform(size=(10_000, 3))
     points[:, 0] *= 2

@@ -24,7 +24,7 @@ ROWS = 16
 
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("clsplat.formats.ply_parts.CHUNK", ROWS)
+    monkeypatch.setattr("clsplat.blocks.parts.PART", ROWS)
 
 
 def written(folder: Path) -> tuple[Path, Gaussians]:

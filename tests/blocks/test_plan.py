@@ -8,11 +8,22 @@ from small_plan import CONFIG
 from small_run import known_scene
 
 from clsplat.blocks.partition import EVERYWHERE
-from clsplat.blocks.plan import REFINING_LENGTH, Block, block_config, check_blocks, coarse_config, make_plan, one_fits
+from clsplat.blocks.plan import (
+    RESERVE,
+    Block,
+    block_config,
+    check_blocks,
+    coarse_config,
+    make_plan,
+    one_fits,
+)
+from clsplat.camera import Camera
 from clsplat.config import TrainConfig
 from clsplat.device import Device
 from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
+from clsplat.scene import Scene
 from clsplat.testing import synthetic_scene
 from clsplat.training.memory import Footprint
 from clsplat.training.preparation import check_memory
@@ -34,15 +45,69 @@ def test_auto_takes_the_fewest_blocks_that_fit() -> None:
     assert not one_fits(scene, config, device)
     plan = make_plan(coarse, scene, config, Renderer(device))
     count = len(plan.blocks)
-    assert plan.memory <= device.memory_limit and plan.total == SIZE
+    assert plan.memory <= (1 - RESERVE) * device.memory_limit and plan.total == SIZE
     fewer = make_plan(coarse, scene, replace(config, blocks=count - 1), Renderer(device))
-    assert fewer.memory > device.memory_limit
+    assert fewer.memory > (1 - RESERVE) * device.memory_limit
     assert 3 <= count <= 12
     assert sum(int(block.box.contains(coarse.means).sum()) for block in plan.blocks) == len(coarse)
     text = plan.describe(config, scene, 1.0)
-    steps = count * 40 + round(count * 40 * REFINING_LENGTH)
+    steps = 2 * count * 40
     assert text.startswith(f"blocks: {count}, each with 8 to ") and " of 12 photos" in text
     assert f"about {SIZE} Gaussians in all, {steps} iterations, {round(steps / 60)} minutes" in text
+
+
+def street(count: int) -> tuple[Gaussians, Scene]:
+    """A row of Gaussians along x, five for each of the photos above it, which look down and overlap by half."""
+    rng = np.random.default_rng(0)
+    gaussians = synthetic_scene(5 * count, seed=1)[0]
+    means = rng.uniform(0, [count, 1, 0.2], (5 * count, 3))
+    gaussians = replace(gaussians, means=means, log_scales=np.full((5 * count, 3), -2.5))
+    view = known_scene().train[0]
+    views = [
+        replace(view, name=str(k), camera=Camera.look_at((k + 0.5, 0.5, 1), (k + 0.5, 0.5, 0), (0, 1, 0), 20, 40, 32))
+        for k in range(count)
+    ]
+    return gaussians.astype(np.float32), Scene(views, [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
+def test_a_scene_may_need_many_times_the_memory() -> None:
+    """A block draws what its photos show, however long the street is."""
+    config = replace(CONFIG, blocks="auto")
+    need = Footprint.of(street(10)[1], config, Device())
+    device = Device(memory_limit=round(1.1 * need.total(400)))
+    found = {}
+    for count in (50, 200):
+        coarse, scene = street(count)
+        plan = make_plan(coarse, scene, replace(config, max_gaussians=40 * count), Renderer(device))
+        assert plan.memory <= device.memory_limit
+        shown = [block.gaussians + block.backdrop for block in plan.blocks]
+        found[count] = len(plan.blocks), sum(len(b.photos) for b in plan.blocks) / count, max(shown)
+    assert found[200][0] <= 5 * found[50][0]
+    assert found[200][1] <= 1.25 * found[50][1], "a photo belongs to as many blocks"
+    assert found[200][2] < 5 * 200, "no block draws all of the coarse scene"
+
+
+def test_blocks_that_do_not_fit_are_cut_by_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks at the ends have fewer surroundings. They become longer, so that fewer blocks are enough."""
+    coarse, scene = street(60)
+    config = replace(CONFIG, blocks="auto", max_gaussians=40 * 60)
+    limit = round(Footprint.of(scene, config, Device()).total(600) / (1 - RESERVE))
+    alike = make_plan(coarse, scene, config, Renderer(Device(memory_limit=limit)))
+    monkeypatch.setattr("clsplat.blocks.plan.ROUNDS", 0)
+    equal = make_plan(coarse, scene, config, Renderer(Device(memory_limit=limit)))
+    assert 2 < len(alike.blocks) < len(equal.blocks)
+    sizes = [int(block.box.contains(coarse.means).sum()) for block in alike.blocks]
+    at_end = [bool(np.isinf([block.box.low[0], block.box.high[0]]).any()) for block in alike.blocks]
+    assert sum(at_end) == 2
+    assert min(np.array(sizes)[at_end]) > max(np.array(sizes)[~np.array(at_end)])
+
+
+def test_photos_count_by_the_part_that_a_block_fills() -> None:
+    coarse, scene = street(40)
+    plan = make_plan(coarse, scene, replace(CONFIG, blocks=10, max_gaussians=1600), Renderer())
+    photos, visits = np.array([(len(block.photos), block.visits) for block in plan.blocks]).T
+    # A block is four photos long, and two more show half of its margin; but it has eight photos.
+    assert (photos >= 8).all() and (visits > 3).all() and (visits <= photos).all() and visits.mean() < 6
 
 
 def test_points_need_not_fit_if_blocks_do() -> None:
@@ -91,10 +156,11 @@ def test_configurations(device: Device) -> None:
     config = replace(CONFIG, iterations=9000, max_gaussians=1000)
     coarse = coarse_config(config, scene, device)
     assert (coarse.iterations, coarse.max_gaussians, coarse.coarse.factor) == (3000, 250, 2)
-    block = Block(EVERYWHERE, EVERYWHERE, EVERYWHERE, np.arange(3), 300, 0)
+    block = Block(EVERYWHERE, EVERYWHERE, EVERYWHERE, np.arange(3), 300, 0, 3.0)
     settings = block_config(config, scene, block)
     # Three photos alone would train for 3000 iterations; a quarter of all photos' visits are 2250.
     assert (settings.iterations, settings.max_gaussians, settings.optim.sh_degree_every) == (3000, 300, 1)
     assert block_config(replace(config, iterations=24_000), scene, block).iterations == 6000
+    assert block_config(replace(config, iterations=24_000), scene, block._replace(visits=2.0)).iterations == 4000
     assert block_config(replace(config, iterations=70), scene, block).iterations == 70
     assert block_config(replace(config, max_gaussians=None), scene, block).max_gaussians is None

@@ -29,7 +29,7 @@ APART = 1000.0
 
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("clsplat.formats.ply_parts.CHUNK", ROWS)
+    monkeypatch.setattr("clsplat.blocks.parts.PART", ROWS)
 
 
 def places(count: int) -> tuple[Gaussians, list[View]]:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from small_run import known_scene
 
-from clsplat.blocks.survey import COVERED, block_weights, chosen_photos, seen_by_block, weights
+from clsplat.blocks.survey import COVERED, block_weights, chosen_photos, seen_by_block, shown_in, survey, weights
 from clsplat.config import InitConfig
 from clsplat.device import Device
+from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.renderer import Renderer
 from clsplat.testing import synthetic_scene
@@ -25,9 +26,15 @@ def test_weights_are_those_of_compositing(device: Device) -> None:
     (found,) = weights(Renderer(device), gaussians.astype(np.float32), [replace(view, mask=mask)])
     # Sums of weights up to 1 over some hundred pixels in single precision; splats at a threshold may differ.
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=0.02)
+    hidden = replace(view, mask=np.zeros_like(mask))
+    surveyed = survey(Renderer(device), gaussians.astype(np.float32), [hidden, replace(view, mask=mask)])
+    np.testing.assert_allclose(surveyed.toarray(), [np.zeros(50), found], rtol=1e-6)
+    assert surveyed.nnz == (found > 0).sum(), "zeros take no memory"
     blocks = np.arange(50) % 3
-    sums = block_weights(Renderer(device), gaussians.astype(np.float32), [replace(view, mask=mask)], blocks, 3)
-    np.testing.assert_allclose(sums[0], np.bincount(blocks, expected), rtol=1e-3)
+    sums = block_weights(surveyed, blocks, 3)
+    np.testing.assert_allclose(sums, [np.zeros(3), np.bincount(blocks, expected, 3)], rtol=1e-3)
+    assert not shown_in(surveyed, np.array([0])).any()
+    np.testing.assert_array_equal(shown_in(surveyed, np.array([0, 1])), found > 0)
 
 
 @pytest.mark.parametrize(
@@ -71,6 +78,31 @@ def test_a_block_sees_its_part_of_a_photo(device: Device, where: str) -> None:
     total = sum(half - image for half in halves)
     assert np.abs(total - (view.image.astype(int) - image))[covered].max() <= 2
     assert all(np.abs(half - image).max() > 20 for half in halves)
+
+
+@pytest.mark.parametrize("most", [1, 30])
+def test_a_block_sees_the_same_where_the_device_holds_few_gaussians(device: Device, most: int) -> None:
+    scene = known_scene()
+    coarse = initialize(scene, InitConfig(opacity=0.7), seed=0)
+    coarse.log_scales -= 2
+    trains, renderer, placed = coarse.means[:, 0] < 0, Renderer(device), []
+    # The photos are narrow, so that each shows a part of the scene.
+    views = [replace(v, camera=replace(v.camera, fx=4 * v.camera.fx, fy=4 * v.camera.fy)) for v in scene.train[:4]]
+    expected, shown = seen_by_block(renderer, coarse, trains, views)
+    place = renderer.place
+
+    def counted(gaussians: Gaussians) -> Gaussians:
+        placed.append(len(gaussians))
+        return place(gaussians)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(renderer, "place", counted)
+        found, again = seen_by_block(renderer, coarse, trains, views, most=most)
+    np.testing.assert_array_equal(again, shown)
+    assert [view.name for view in found] == [view.name for view in views]
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.image, other.image)
+    assert 0 < max(placed) < len(coarse)
 
 
 def _image(renderer: Renderer, gaussians, view):

@@ -60,6 +60,17 @@ def test_a_gaussian_at_a_viewpoint_keeps_a_size() -> None:
     ).all()
 
 
+def test_each_gaussian_makes_room_for_the_viewpoint_that_is_nearest_to_it_in_its_extents() -> None:
+    """Viewpoints that are too far away to matter are not looked at; none that matters is left out."""
+    rng = np.random.default_rng(2)
+    found = gaussians_of(rng.uniform(0, 40, (300, 3)).tolist(), np.exp(rng.normal(-0.5, 1, (300, 3))).tolist())
+    positions = rng.uniform(0, 40, (150, 3))
+    each = [room_factors(found, position[None], 0.7) for position in positions]
+    factors = room_factors(found, positions, 0.7)
+    np.testing.assert_array_equal(factors, np.min(each, axis=0))
+    assert 50 < (factors < 1).sum() < 250
+
+
 def camera_at(x: float, near: float | None) -> Camera:
     return replace(Camera.look_at((x, 0, 0), (x, 0, 9), (0, 1, 0), 50, 64, 48), near=near)
 
