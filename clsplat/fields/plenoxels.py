@@ -47,9 +47,10 @@ TV_DENSITY, TV_HARMONICS = 1e-5, 1e-3
 refinement. If photos have few pixels for each cell, trainings then overfit. Here the penalty therefore stays until
 the end, as in that code's settings for users' own captures."""
 
-SPACE_TV_DENSITY, SPACE_TV_HARMONICS = 1e-3, 1e-2
-"""The same where there is a background: twice those of the paper for photos that face forward, since the few
-steps here visit a corner 15 to 30 times, and the paper's 1280 times. Effect: docs/howto/fields.md."""
+SPACE_TV_DENSITY, SPACE_TV_HARMONICS = 1.5, 15.0
+"""The same where there is a background, for all steps together: each step has its part. Trainings of any length then
+smooth as much (effect: docs/howto/fields.md). The paper has 5e-4 and 5e-3 in each of 128 000 steps, for photos that
+face forward; steps here have more rays and larger cells."""
 
 TV_SHARE = 100
 """Number of steps after which each corner has had the total variation in its gradient once (section 3.4)."""
@@ -152,6 +153,9 @@ class Plenoxels(Field):
         count = -(-rows // TV_SHARE)
         scale = len(self.occupied) / TV_CELLS / count
         density, harmonics = self._variation
+        if self.space.contracted:
+            part = progress / max(1, self.iteration - 1)  # of the training in a step; 0 in the first one
+            density, harmonics = part * density, part * harmonics
         weights = density * scale * self._density_scale / 2, harmonics * scale
         variation = self._index, self._corners, self.table, gradient
         self.stages.voxels_tv(*variation, weights, self.iteration * count % rows, count)

@@ -16,6 +16,7 @@ from clsplat.fields.field_files import MODEL, load_checkpoint, load_field
 from clsplat.fields.field_training import CHECKPOINT, train_field
 from clsplat.fields.occupancy import FULL_UPDATES, SHARE, THRESHOLD, Occupancy
 from clsplat.fields.pixels import Pixels
+from clsplat.fields.plenoxels import SPACE_DENSITY_SCALE, SPACE_TV_DENSITY, SPACE_TV_HARMONICS, TV_CELLS
 from clsplat.fields.space import FAR, Space
 from clsplat.metrics import psnr, to_uint8
 from clsplat.randomness import stream
@@ -121,6 +122,29 @@ def test_cells_are_refined_while_pixels_are_smaller(device, scene):
     assert field._resolved()
     field._place(np.ones((16, 16, 16), np.uint8), np.zeros((17**3, 28)))
     assert not field._resolved()
+
+
+def test_trainings_of_any_length_smooth_as_much(device, monkeypatch):
+    """Plenoxels in contracted space: the weights of the total variation, summed over the steps but the first."""
+    room = ball(room=True)
+    space = Space.of(room.train)
+    assert space.contracted
+    pixels = Pixels(room.train, space, WHITE)
+    for steps in (4, 8):
+        field, weights = SmallPlenoxels(space, device, 0), []
+
+        def recorded(*arguments, smooth=field.stages.voxels_tv, field=field, weights=weights):
+            # Weights are divided by the number of corners in a visit, and multiplied by that of cells on an edge.
+            weights.append(np.multiply(arguments[4], arguments[6] * TV_CELLS / len(field.occupied)))
+            return smooth(*arguments)
+
+        monkeypatch.setattr(field.stages, "voxels_tv", recorded)
+        for i in range(steps):
+            field.step(pixels.draw(stream(0, "pixels of a batch", i), field.rays), i / steps)
+        monkeypatch.undo()
+        density, harmonics = np.sum(weights, axis=0) * steps / (steps - 1)
+        assert harmonics == pytest.approx(SPACE_TV_HARMONICS)
+        assert density == pytest.approx(SPACE_TV_DENSITY * SPACE_DENSITY_SCALE / 2)
 
 
 def test_the_finest_level_has_the_resolution_of_the_photos(device, scene):
