@@ -1,7 +1,7 @@
 PYTHON = python
 
 .PHONY: test test-slow stability fuzz fuzz-cases faults faults-below mutants soak lint docs check-races check-variants \
-  check-runtimes check-builds bench bench-knobs bench-quality bench-fields bench-captures bench-stability formats \
+  check-runtimes check-builds bench bench-knobs bench-quality bench-full-size bench-fields bench-captures bench-stability formats \
   foreign works-with foreign-packages
 
 # Run the default tests: a few minutes on two cores.
@@ -101,8 +101,20 @@ bench-quality:
 	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-quality DATA=..."; exit 2; }
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods $(METHODS) \
 	  $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/quality
+	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods auto --iterations 750 1500 \
+	  -o build/quality
 	cp build/quality/results.jsonl docs/results/quality.jsonl
 	cp build/quality/processor-time-psnr.svg docs/results/quality.svg
+
+# Measure the charts of docs/benchmarks.md at full size: make bench-full-size DATA=folder of real scenes. This takes
+# hours. Finished trainings are not repeated.
+FULL_SCENES = castle_p30 fern fox_pinhole bonsai
+bench-full-size:
+	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-full-size DATA=..."; exit 2; }
+	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(FULL_SCENES)) --methods $(METHODS) -o build/full-size
+	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(FULL_SCENES)) --methods auto --iterations 1000 2000 \
+	  -o build/full-size
+	cp build/full-size/results.jsonl docs/results/full-size.jsonl
 
 # Measure the charts of docs/howto/fields.md: make bench-fields DATA=folder of real scenes. The lengths of trainings of
 # fields are chosen for one to five minutes of one core each. Finished trainings are not repeated.

@@ -33,12 +33,19 @@ COARSE_LENGTH = 1 / 3
 COARSE_SHARE = 1 / COARSE_FACTOR**2
 """Gaussians of the coarse run, as a fraction of those of the whole scene: as many per pixel."""
 
+REFINEMENTS = 2
+"""Trainings of each block among the trained ones. With one of twice the length, pixels that several blocks share are
+0.3 dB worse (measured: docs/howto/large.md)."""
+
+REFINING_LENGTH = 1 / 2
+"""Iterations of each of these trainings, as a fraction of those of a block's first one."""
+
 REFINING_RATE = 1 / 10
-"""Factor on the first learning rate of the means in the second training. It becomes that of the middle of a training,
+"""Factor on the first learning rate of the means in these trainings. It becomes that of the middle of a training,
 in which the rate falls by a factor of 100."""
 
 NEAR = 0.25
-"""Width of the surroundings that the second training draws as they were trained, where memory is too small for all of
+"""Width of the surroundings that later trainings draw as they were trained, where memory is too small for all of
 them, as a fraction of the block's extent. Beyond, the coarse scene is drawn."""
 
 ROUNDS = 4
@@ -51,7 +58,7 @@ photo that shows less of the block counts in proportion: most of its visits woul
 
 RESERVE = 1 / 10
 """Fraction of the memory's limit that a plan leaves free. Trained Gaussians are not spread as the coarse ones: a
-second training took up to 10 % more than planned (a town of 100 photos, 6 blocks)."""
+later training took up to 10 % more than planned (a town of 100 photos, 6 blocks)."""
 
 COARSE_MEMORY = 1 / 2
 """Fraction of the memory's limit that the Gaussians of the coarse run may take. With a quarter, photos belong to more
@@ -61,7 +68,7 @@ blocks (a town of 1000 photos: to 3.7 instead of 3.3), as large Gaussians are in
 class Block(NamedTuple):
     """A part of the scene.
 
-    box: what it keeps; wide: what it trains, with the margin; near: what its second training draws as it was trained;
+    box: what it keeps; wide: what it trains, with the margin; near: what later trainings draw as it was trained;
     photos: indices of training photos; gaussians: expected number, margin included; backdrop: expected Gaussians
     that its photos show around it in either training; visits: photos, each counted by the part that the block fills.
     """
@@ -89,7 +96,8 @@ class Plan(NamedTuple):
             sum(3 * scene.train[i].camera.width * scene.train[i].camera.height for i in block.photos)
             for block in self.blocks
         ]
-        steps = 2 * sum(block_config(config, scene, block).iterations for block in self.blocks)
+        steps = sum(block_config(config, scene, block).iterations for block in self.blocks)
+        steps += round(REFINEMENTS * REFINING_LENGTH * steps)
         largest = max(block.gaussians for block in self.blocks)
         return (
             f"blocks: {len(self.blocks)}, each with {min(photos)} to {max(photos)} of {len(scene.train)} photos "
@@ -152,8 +160,12 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
 
 
 def refining_config(config: TrainConfig, gaussians: int) -> TrainConfig:
-    """The configuration of a block's second training, of the Gaussians that it has: as long as the first one."""
-    return of_fixed_size(config, gaussians, REFINING_RATE)
+    """The configuration of a training among the trained blocks, from that of the block's first one.
+
+    gaussians: number that the block has.
+    """
+    iterations = max(1, round(REFINING_LENGTH * config.iterations))
+    return replace(of_fixed_size(config, gaussians, REFINING_RATE), iterations=iterations)
 
 
 def expected_total(config: TrainConfig, coarse: int) -> int:

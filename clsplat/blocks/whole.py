@@ -109,16 +109,18 @@ def plan_blocks(
     return jobs, plan.blocks
 
 
-def plan_refinement(jobs: list[Path], blocks: list[Block]) -> list[Path]:
-    """Write the jobs of the second trainings, in which each block has the trained ones around it.
+def plan_refinement(first: list[Path], latest: list[Path], blocks: list[Block]) -> list[Path]:
+    """Write the jobs of trainings in which each block has the trained ones around it.
 
     In the first trainings each block is surrounded by the coarse scene. Together, the blocks are therefore worse than
     a scene that has been trained as a whole.
 
     Parameters
     ----------
-    jobs : list of Path
-        Those of the first trainings, all of which have results.
+    first : list of Path
+        The jobs of the first trainings.
+    latest : list of Path
+        Those of the latest trainings, all of which have results.
     blocks : list of Block
         As `plan_blocks` returned them.
 
@@ -127,14 +129,13 @@ def plan_refinement(jobs: list[Path], blocks: list[Block]) -> list[Path]:
     list of Path
         The files of the jobs, in the order of the blocks.
     """
-    folder, first = jobs[0].parent, [read_job(job) for job in jobs]
-    index = write_index([result_of(job) for job in jobs])
+    folder, index = first[0].parent, write_index([result_of(job) for job in latest])
     counts = np.zeros(len(blocks), int)
     for part in read_index(index):
         means = read_part(folder, part).means
         counts += [block.wide.contains(means).sum() for block in blocks]
     refined = []
-    for job, block, count in zip(first, blocks, counts.tolist(), strict=True):
+    for job, block, count in zip(map(read_job, first), blocks, counts.tolist(), strict=True):
         settings = refining_config(job.config, count)
         refined.append(replace(job, scene=index.name, near=block.near, config=settings).write(folder))
     return refined

@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -34,6 +35,7 @@ def train_in_blocks(
     JobsPrinted
         If `where.print_jobs` is set, and blocks have to be trained.
     """
+    from clsplat.blocks.plan import REFINEMENTS
     from clsplat.blocks.stored import StoredScene
     from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
     from clsplat.evaluate import mean_metrics
@@ -50,12 +52,14 @@ def train_in_blocks(
     if not first:
         return None
     _run(first, scene, renderer.device, watch, where)
-    second = plan_refinement(first, blocks)
-    _run(second, scene, renderer.device, watch, where)
-    merge(second, out / SCENE, scene.offset)
+    trained = [first]
+    for _ in range(REFINEMENTS):
+        trained.append(plan_refinement(first, trained[-1], blocks))
+        _run(trained[-1], scene, renderer.device, watch, where)
+    merge(trained[-1], out / SCENE, scene.offset)
     gaussians = StoredScene(out / SCENE)
     scores = mean_metrics(gaussians, scene.test, renderer) if scene.test else {}
-    write_log(out, [*first, *second], {"num_gaussians": len(gaussians)} | scores)
+    write_log(out, list(chain(*trained)), {"num_gaussians": len(gaussians)} | scores)
     return gaussians
 
 

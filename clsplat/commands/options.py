@@ -67,5 +67,5 @@ class ClusterOptions:
     """Scheduler of dask whose workers train the blocks, such as tcp://host:8786; needs the extra `cluster`."""
     print_jobs: bool = False
     """Print the commands that train the blocks, for a batch system, and stop. When they have run, repeat the command
-    with --resume: the first time it prints the commands of the second trainings, the next time it joins the
+    with --resume: the first two times it prints the commands of later trainings, the next time it joins the
     blocks."""

@@ -191,8 +191,9 @@ def test_a_second_training_is_surrounded_by_the_first_ones(
 ) -> None:
     for job in planned.jobs:
         train_block(job, planned.scene.train, device)
-    second = plan_refinement(planned.jobs, planned.blocks)
-    assert second == plan_refinement(planned.jobs, planned.blocks) and not set(second) & set(planned.jobs)
+    second = plan_refinement(planned.jobs, planned.jobs, planned.blocks)
+    assert second == plan_refinement(planned.jobs, planned.jobs, planned.blocks)
+    assert not set(second) & set(planned.jobs)
     merge(planned.jobs, tmp_path / "first.ply")
     first = load_gaussians(tmp_path / "first.ply")[0]
     job = read_job(second[0])
@@ -203,7 +204,7 @@ def test_a_second_training_is_surrounded_by_the_first_ones(
 
     # Where memory is small, what is farther away is coarse.
     near = planned.blocks[0].wide
-    path = plan_refinement(planned.jobs, [block._replace(near=near) for block in planned.blocks])[0]
+    path = plan_refinement(planned.jobs, planned.jobs, [block._replace(near=near) for block in planned.blocks])[0]
     far = read_scene(path.with_name(job.far), 1)
     for module in ("block", "parts"):
         monkeypatch.setattr(f"clsplat.blocks.{module}.seen", lambda cameras, bounds, config: bounds.radius > 0)

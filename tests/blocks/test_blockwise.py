@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from cli_runs import fails, run
 
+from clsplat.blocks.plan import REFINEMENTS
 from clsplat.formats import load_gaussians
 
 TRAIN = (
@@ -31,7 +32,7 @@ def test_a_run_is_like_any_other_and_printed_jobs_make_the_same(
 
     printed = tmp_path / "printed"
     arguments = ["train", dataset, "-o", printed, *TRAIN, "--blocks", 2, "--print-jobs"]
-    for resume in ([], ["--resume"]):
+    for resume in ([], *[["--resume"]] * REFINEMENTS):
         run(*arguments, *resume)
         jobs = capsys.readouterr().out.splitlines()
         assert len(jobs) == 2 and not (printed / "scene.ply").exists()

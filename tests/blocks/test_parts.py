@@ -67,7 +67,7 @@ def test_a_second_training_reads_what_its_photos_show(
     """Half of the scene is where no photo looks: its file need not even exist."""
     for job in planned.jobs:
         train_block(job, planned.scene.train, device)
-    path = plan_refinement(planned.jobs, planned.blocks)[0]
+    path = plan_refinement(planned.jobs, planned.jobs, planned.blocks)[0]
     job, folder = read_job(path), path.parent
     visible = read_scene(folder / job.scene, 1)
     hidden = Gaussians(**{name: array.copy() for name, array in visible.arrays().items()})

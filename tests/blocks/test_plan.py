@@ -9,6 +9,8 @@ from small_run import known_scene
 
 from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.plan import (
+    REFINEMENTS,
+    REFINING_LENGTH,
     RESERVE,
     Block,
     block_config,
@@ -51,7 +53,7 @@ def test_auto_takes_the_fewest_blocks_that_fit() -> None:
     assert 3 <= count <= 12
     assert sum(int(block.box.contains(coarse.means).sum()) for block in plan.blocks) == len(coarse)
     text = plan.describe(config, scene, 1.0)
-    steps = 2 * count * 40
+    steps = count * 40 + round(count * 40 * REFINEMENTS * REFINING_LENGTH)
     assert text.startswith(f"blocks: {count}, each with 8 to ") and " of 12 photos" in text
     assert f"about {SIZE} Gaussians in all, {steps} iterations, {round(steps / 60)} minutes" in text
 
