@@ -29,7 +29,7 @@ LENGTH = 1 / 4
 """Iterations of a level, as a fraction of those of the scene. A choice; others were not measured."""
 
 RATE = 1 / 10
-"""Factor on the first learning rate of the means, as in the second training of a block: the Gaussians have their
+"""Factor on the first learning rate of the means, as in later trainings of a block: the Gaussians have their
 places."""
 
 
