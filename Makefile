@@ -1,7 +1,8 @@
 PYTHON = python
 
 .PHONY: test test-slow stability fuzz fuzz-cases faults faults-below mutants soak lint docs check-races check-variants \
-  check-runtimes check-builds bench bench-knobs bench-quality bench-full-size bench-fields bench-captures bench-stability formats \
+  check-runtimes check-builds bench bench-knobs bench-quality bench-full-size bench-fields bench-captures \
+  bench-stability formats \
   foreign works-with foreign-packages
 
 # Run the default tests: a few minutes on two cores.
