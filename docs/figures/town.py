@@ -6,7 +6,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-results = json.loads((Path(__file__).resolve().parents[1] / "results" / "town.json").read_text())
+results = json.loads(Path("../results/town.json").read_text())  # the working directory is this file's
 photos = np.array([int(count) for count in results])
 
 
