@@ -14,7 +14,8 @@
 // Buffers, H x W pixels, S sources, D planes; rows have `stride` numbers, of which the first PAD and the last are 0:
 //   in   photo[H,W], grey in [0, 1]; source[rows,columns] grey; maps[S,12], A (row-major) and b for positions in pixels,
 //        with centres at +0.5; planes[D] inverse depths, ascending
-//   out  padded[H,stride], the photo; windows[2,H,stride], its mean and variance in the window around each pixel; warped[D,H,stride], grey, or OUTSIDE where the source does not show the position;
+//   out  padded[H,stride], the photo; windows[2,H,stride], its mean and variance in the window around each pixel;
+//        warped[D,H,stride], grey, or OUTSIDE where the source does not show the position;
 //        pairs[2,D,H,W], the two largest similarities so far, -1 where the window leaves the photo or the source, or
 //        the photo is flat; inverse[H,W]; scores[H,W], -1 where the best plane is the first or the last one
 // -DRADIUS        half of the window, px, less than PAD

@@ -34,8 +34,7 @@ COARSE_SHARE = 1 / COARSE_FACTOR**2
 """Gaussians of the coarse run, as a fraction of those of the whole scene: as many per pixel."""
 
 REFINEMENTS = 2
-"""Trainings of each block among the trained ones. With one of twice the length, pixels that several blocks share are
-0.3 dB worse (measured: docs/howto/large.md)."""
+"""Trainings of each block among the trained ones (measured: docs/howto/large.md)."""
 
 REFINING_LENGTH = 1 / 2
 """Iterations of each of these trainings, as a fraction of those of a block's first one."""
@@ -49,20 +48,19 @@ NEAR = 0.25
 them, as a fraction of the block's extent. Beyond, the coarse scene is drawn."""
 
 ROUNDS = 4
-"""Cuts after the first one, by which blocks that do not fit the memory become alike. After four, the largest takes a
-few per cent more than the mean; at first, 30 % (a town of 300 photos, 24 blocks)."""
+"""Cuts after the first one, by which blocks that do not fit the memory become alike (effect: docs/howto/large.md)."""
 
 WHOLE = 2 / 3
 """Part of a photo that a block and its margin fill, from which on it counts as a whole photo in the block's length. A
 photo that shows less of the block counts in proportion: most of its visits would train nothing."""
 
 RESERVE = 1 / 10
-"""Fraction of the memory's limit that a plan leaves free. Trained Gaussians are not spread as the coarse ones: a
-later training took up to 10 % more than planned (a town of 100 photos, 6 blocks)."""
+"""Fraction of the memory's limit that a plan leaves free: trained Gaussians are not spread as the coarse ones (effect:
+docs/howto/large.md)."""
 
 COARSE_MEMORY = 1 / 2
-"""Fraction of the memory's limit that the Gaussians of the coarse run may take. With a quarter, photos belong to more
-blocks (a town of 1000 photos: to 3.7 instead of 3.3), as large Gaussians are in more of them."""
+"""Fraction of the memory's limit that the Gaussians of the coarse run may take. With less, they are larger, and photos
+belong to more blocks (effect: docs/howto/large.md)."""
 
 
 class Block(NamedTuple):
