@@ -55,12 +55,12 @@ WHOLE = 2 / 3
 photo that shows less of the block counts in proportion: most of its visits would train nothing."""
 
 RESERVE = 1 / 10
-"""Fraction of the memory's limit that a plan leaves free: trained Gaussians are not spread as the coarse ones (effect:
-docs/howto/large.md)."""
+"""Fraction of the memory's limit that a plan leaves free: trained Gaussians are not spread as the coarse ones
+(effect: docs/howto/large.md)."""
 
 COARSE_MEMORY = 1 / 2
-"""Fraction of the memory's limit that the Gaussians of the coarse run may take. With less, they are larger, and photos
-belong to more blocks (effect: docs/howto/large.md)."""
+"""Fraction of the memory's limit that the Gaussians of the coarse run may take. With less, they are larger, and
+photos belong to more blocks (effect: docs/howto/large.md)."""
 
 
 class Block(NamedTuple):
