@@ -20,6 +20,7 @@ PURPOSES = (
     "offsets of samples",
     "points of the grid",
     "dense points",
+    "points of blocks",
 )
 """Uses of random numbers. The index is part of the stream: new purposes are added at the end."""
 

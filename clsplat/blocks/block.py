@@ -94,11 +94,13 @@ def train_block(
         return result
     job = read_job(job_file)
     start = _start(job_file, job)
+    coefficients = (job.config.init.sh_degree + 1) ** 2
+    points = [with_coefficients(read_part(job_file.parent, part), coefficients) for part in points_of(job_file, job)]
     views = job.views(_loaded(job) if loaded is None else loaded)
     device = device or open_device(job.config)
     with held(work):
         if not result.exists():
-            gaussians = _trained(job, start, views, device, work, progress)
+            gaussians = _trained(job, start, points, views, device, work, progress)
             with replacing(log_of(job_file)) as file:
                 file.write((work / LOG).read_bytes())
             save_gaussians(result, gaussians, job.config.render.mode)
@@ -130,6 +132,17 @@ def needed_parts(job_file: Path, job: Job) -> Iterator[tuple[bool, Part]]:
         if near:
             wanted &= job.near.meets(bounds.low, bounds.high)
         yield from ((near, part) for part, needed in zip(parts, wanted, strict=True) if needed)
+
+
+def points_of(job_file: Path, job: Job) -> list[Part]:
+    """The parts of the Gaussians at sparse points that a block trains, too.
+
+    Raises
+    ------
+    InputError
+        If their index cannot be read or has been changed.
+    """
+    return read_index(job_file.with_name(job.points)) if job.points else []
 
 
 def _start(job_file: Path, job: Job) -> Gaussians:
@@ -169,7 +182,13 @@ def _seen(
 
 
 def _trained(
-    job: Job, start: Gaussians, views: list[View], device: "Device", work: Path, progress: Progress
+    job: Job,
+    start: Gaussians,
+    points: list[Gaussians],
+    views: list[View],
+    device: "Device",
+    work: Path,
+    progress: Progress,
 ) -> Gaussians:
     """Train the block in a folder that is held, and return what lies in it."""
     config = job.config
@@ -182,7 +201,8 @@ def _trained(
     if (work / CHECKPOINT).exists():
         state = load_state(work / CHECKPOINT, scene.extent, config, inputs)
     else:
-        state = replace(initial_state(scene, config, start.take(trains)), inputs=inputs)
+        first = Gaussians.concatenate([start.take(trains), *points])
+        state = replace(initial_state(scene, config, first), inputs=inputs)
     state.inputs.demand(scene)
     training = Training(scene, config, device, state, start.take(shown & ~trains))
     gaussians = complete(training, work, progress=progress)

@@ -25,7 +25,7 @@ BOXES = ("near", "box", "wide")
 FIT = ("inverse", "scale", "shift")
 """Fields of a depth map that its fit to the scene's points determines."""
 
-FORMAT = 2
+FORMAT = 3
 """Version of the files of jobs."""
 
 
@@ -35,15 +35,17 @@ class Job:
 
     data: folder of the dataset; scene: name of the index (`clsplat.blocks.parts`), beside the job's file, of the
     Gaussians from which the block starts and that surround it; near: where these are used; far: the index of those
-    elsewhere; box, wide: what the block keeps and trains; photos: digests of pixels and mask, by name; cameras: as
-    the scene has them, by name; depths: for photos with a depth map, by name, the digest of its values and its fit to
-    the points; config: settings of the block.
+    elsewhere; points: the index of Gaussians at sparse points, which the block trains, too, or empty; box, wide: what
+    the block keeps and trains; photos: digests of pixels and mask, by name; cameras: as the scene has them, by name;
+    depths: for photos with a depth map, by name, the digest of its values and its fit to the points; config: settings
+    of the block.
     """
 
     data: str
     scene: str
     near: Box
     far: str
+    points: str
     box: Box
     wide: Box
     photos: dict[str, Photo]
@@ -67,6 +69,7 @@ class Job:
             "data": self.data,
             "scene": self.scene,
             "far": self.far,
+            "points": self.points,
             **{name: [_face(side) for side in getattr(self, name)] for name in BOXES},
             "photos": {
                 name: {"pixels": photo.pixels, "mask": photo.mask, "camera": self.cameras[name]}
@@ -128,7 +131,10 @@ class Job:
 def make_job(
     data: Path, scene: str, block: Block, views: list[View], photos: dict[str, Photo], config: TrainConfig
 ) -> Job:
-    """Make the job of a block in a scene's file from its photos, the digests of all photos, and its settings."""
+    """Make the job of a block in a scene's file, without sparse points.
+
+    views: the photos of the block; photos: digests of all photos; config: settings of the block.
+    """
     names = [view.name for view in views]
     cameras = {view.name: asdict(view.camera) | {"viewmat": view.camera.viewmat.tolist()} for view in views}
     own = {name: photos[name] for name in names}
@@ -137,7 +143,7 @@ def make_job(
         for view in views
         if (depth := view.depth)
     }
-    return Job(str(data), scene, EVERYWHERE, scene, block.box, block.wide, own, cameras, depths, config)
+    return Job(str(data), scene, EVERYWHERE, scene, "", block.box, block.wide, own, cameras, depths, config)
 
 
 def read_job(path: Path) -> Job:
@@ -153,7 +159,7 @@ def read_job(path: Path) -> Job:
         if content["format"] != FORMAT:
             raise InputError(f"{path}: expected a job of format {FORMAT}, found {content['format']!r}")
         boxes: dict[str, Any] = {n: Box(_corner(content[n][0], -1), _corner(content[n][1], 1)) for n in BOXES}
-        scenes: dict[str, Any] = {name: str(content[name]) for name in ("data", "scene", "far")}
+        scenes: dict[str, Any] = {name: str(content[name]) for name in ("data", "scene", "far", "points")}
         photos = {name: Photo(str(p["pixels"]), str(p["mask"]), []) for name, p in content["photos"].items()}
         cameras = {name: dict(p["camera"]) for name, p in content["photos"].items()}
         depths = {str(name): dict(depth) for name, depth in content.get("depths", {}).items()}

@@ -41,7 +41,7 @@ class Box(NamedTuple):
 EVERYWHERE = Box((-np.inf,) * 3, (np.inf,) * 3)
 
 
-def cut(points: Array, count: int, costs: Array | None = None) -> list[Box]:
+def cut(points: Array, count: int, costs: Array | None = None, between: bool = False) -> list[Box]:
     """Cut space into boxes that cost about the same.
 
     Each box is cut in two across the axis along which its points extend farthest, at the quantile that gives both
@@ -55,29 +55,34 @@ def cut(points: Array, count: int, costs: Array | None = None) -> list[Box]:
         Number of boxes, at least 1.
     costs : (N,), optional
         Cost that each point adds to its box, above 0. Default: the same for all.
+    between : bool
+        Make another cut, whose borders are in the boxes of the usual one: there is a box more, the first and the last
+        cost half as much as the others, and boxes are divided at a third instead of half of their parts.
 
     Returns
     -------
     list of Box
-        `count` boxes; each point of space is in exactly one.
+        `count` boxes, or one more; each point of space is in exactly one.
     """
-    return _cut(np.asarray(points, np.float64), np.ones(len(points)) if costs is None else costs, EVERYWHERE, count)
+    costs = np.ones(len(points)) if costs is None else costs
+    parts = [0.5, *[1.0] * (count - 1), 0.5] if between else [1.0] * count
+    return _cut(np.asarray(points, np.float64), costs, EVERYWHERE, parts, 3 if between else 2)
 
 
-def _cut(points: Array, costs: Array, box: Box, count: int) -> list[Box]:
-    if count == 1:
+def _cut(points: Array, costs: Array, box: Box, parts: list[float], divisor: int) -> list[Box]:
+    if len(parts) == 1:
         return [box]
-    first = count // 2
+    first = max(1, len(parts) // divisor)
     axis, at = 0, 0.0
     if len(points):
         axis = int(_extent(points).argmax())
-        at = _quantile(points[:, axis], costs, first / count)
+        at = _quantile(points[:, axis], costs, sum(parts[:first]) / sum(parts))
     low, high = [*box.low], [*box.high]
     low[axis] = high[axis] = at
     left = points[:, axis] < at
     return [
-        *_cut(points[left], costs[left], Box(box.low, tuple(high)), first),
-        *_cut(points[~left], costs[~left], Box(tuple(low), box.high), count - first),
+        *_cut(points[left], costs[left], Box(box.low, tuple(high)), parts[:first], divisor),
+        *_cut(points[~left], costs[~left], Box(tuple(low), box.high), parts[first:], divisor),
     ]
 
 

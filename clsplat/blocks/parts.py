@@ -68,8 +68,10 @@ def write_index(files: list[Path]) -> Path:
     """
     parts = [part for file in files for part in parts_of(file)]
     path = files[0].with_name(_name(parts) + INDEX)
-    with replacing(path) as out:
-        out.write(json.dumps(parts).encode())
+    content = json.dumps(parts).encode()
+    if not path.exists() or path.read_bytes() != content:
+        with replacing(path) as out:
+            out.write(content)
     return path
 
 

@@ -81,11 +81,21 @@ class Block(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """The blocks of a scene; total: expected number of its Gaussians; memory: expected bytes of the largest block."""
+    """Two cuts of a scene into blocks, whose borders differ.
+
+    blocks: those of the first and the last training; between: those of the one in between; total: expected number of
+    the scene's Gaussians; memory: expected bytes of the largest block.
+    """
 
     blocks: list[Block]
+    between: list[Block]
     total: int
     memory: int
+
+    def cut(self, training: int) -> list[Block]:
+        """The blocks of a training, counted from 0: pixels that several blocks share in one are a block's own in the
+        next."""
+        return self.between if training % 2 else self.blocks
 
     def describe(self, config: TrainConfig, scene: Scene, seconds: float) -> str:
         """A sentence on blocks, photos, memory, time and size; seconds: of an iteration with photos of full size."""
@@ -94,8 +104,14 @@ class Plan(NamedTuple):
             sum(3 * scene.train[i].camera.width * scene.train[i].camera.height for i in block.photos)
             for block in self.blocks
         ]
-        steps = sum(block_config(config, scene, block).iterations for block in self.blocks)
-        steps += round(REFINEMENTS * REFINING_LENGTH * steps)
+        lengths = [1.0, *[REFINING_LENGTH] * REFINEMENTS]
+        steps = round(
+            sum(
+                length * block_config(config, scene, block).iterations
+                for training, length in enumerate(lengths)
+                for block in self.cut(training)
+            )
+        )
         largest = max(block.gaussians for block in self.blocks)
         return (
             f"blocks: {len(self.blocks)}, each with {min(photos)} to {max(photos)} of {len(scene.train)} photos "
@@ -157,13 +173,11 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
     )
 
 
-def refining_config(config: TrainConfig, gaussians: int) -> TrainConfig:
-    """The configuration of a training among the trained blocks, from that of the block's first one.
-
-    gaussians: number that the block has.
-    """
-    iterations = max(1, round(REFINING_LENGTH * config.iterations))
-    return replace(of_fixed_size(config, gaussians, REFINING_RATE), iterations=iterations)
+def refining_config(config: TrainConfig, scene: Scene, block: Block, gaussians: int) -> TrainConfig:
+    """The configuration of a block's training among the trained blocks; gaussians: number that the block has."""
+    first = block_config(config, scene, block)
+    iterations = max(1, round(REFINING_LENGTH * first.iterations))
+    return replace(of_fixed_size(first, gaussians, REFINING_RATE), iterations=iterations)
 
 
 def expected_total(config: TrainConfig, coarse: int) -> int:
@@ -201,7 +215,7 @@ def make_plan(coarse: Gaussians, scene: Scene, config: TrainConfig, renderer: Re
     total, most = expected_total(config, len(coarse)), max(1, len(coarse) // FEWEST_GAUSSIANS)
     if config.blocks == "auto" and need.total(total) <= limit:
         whole = Block(EVERYWHERE, EVERYWHERE, EVERYWHERE, np.arange(len(scene.train)), total, 0, len(scene.train))
-        return Plan([whole], total, need.total(total))
+        return Plan([whole], [whole], total, need.total(total))
     if config.blocks != "auto" and config.blocks > most:
         raise InputError(
             f"--blocks: expected at most {most}, as the coarse scene has {len(coarse)} Gaussians, found "
@@ -210,11 +224,11 @@ def make_plan(coarse: Gaussians, scene: Scene, config: TrainConfig, renderer: Re
     fewest = max(config.few.below, FEWEST_PHOTOS)  # so that a block may search its size
     ground = _Ground(coarse.means, survey(renderer, coarse, scene.train), total, fewest, need, usable)
     if config.blocks == "auto":
-        blocks = _fitting(ground, -(-total // max(1, need.most_gaussians(usable))), most)
+        cuts = _fitting(ground, -(-total // max(1, need.most_gaussians(usable))), most)
     else:
-        blocks, _ = _cut(ground, config.blocks)
-    blocks = [_among_all(ground, block) for block in blocks]
-    return Plan(blocks, total, max(_memory(block, need) for block in blocks))
+        cuts, _ = _cuts(ground, config.blocks)
+    blocks, between = ([_among_all(ground, block) for block in each] for each in cuts)
+    return Plan(blocks, between, total, max(_memory(block, need) for block in (*blocks, *between)))
 
 
 class _Ground(NamedTuple):
@@ -233,14 +247,14 @@ class _Ground(NamedTuple):
     limit: int
 
 
-def _fitting(ground: _Ground, least: int, most: int) -> list[Block]:
+def _fitting(ground: _Ground, least: int, most: int) -> list[list[Block]]:
     """Cut a scene into blocks that fit the memory: `least` of them, then twice as many until they fit, then as few as
     halving the last interval finds. More blocks need less memory each, with few exceptions."""
     low, high = 0, min(max(2, least), most)
-    blocks, smallest = _cut(ground, high)
+    cuts, smallest = _cuts(ground, high)
     while smallest > ground.limit and high < most:
         low, high = high, min(2 * high, most)
-        blocks, memory = _cut(ground, high)
+        cuts, memory = _cuts(ground, high)
         smallest = min(smallest, memory)
     if smallest > ground.limit:
         raise InputError(
@@ -250,15 +264,21 @@ def _fitting(ground: _Ground, least: int, most: int) -> list[Block]:
         )
     while high - max(low, 1) > 1:
         middle = (low + high) // 2
-        fewer, memory = _cut(ground, middle)
+        fewer, memory = _cuts(ground, middle)
         if memory <= ground.limit:
-            blocks, high = fewer, middle
+            cuts, high = fewer, middle
         else:
             low = middle
-    return blocks
+    return cuts
 
 
-def _cut(ground: _Ground, count: int) -> tuple[list[Block], int]:
+def _cuts(ground: _Ground, count: int) -> tuple[list[list[Block]], int]:
+    """Cut a scene into blocks, and again with other borders; find the bytes of the block that takes most."""
+    found = [_cut(ground, count, between) for between in (False, True)]
+    return [blocks for blocks, _ in found], max(memory for _, memory in found)
+
+
+def _cut(ground: _Ground, count: int, between: bool) -> tuple[list[Block], int]:
     """Cut a scene into a number of blocks with their photos, and find the bytes of the one that takes most.
 
     The blocks have as many Gaussians each. If one of them does not fit, the cut is made again, `ROUNDS` times, with
@@ -267,11 +287,11 @@ def _cut(ground: _Ground, count: int) -> tuple[list[Block], int]:
     best: tuple[list[Block], int] | None = None
     costs = np.ones(len(ground.means))
     for _ in range(1 + ROUNDS):
-        boxes = cut(ground.means, count, costs)
+        boxes = cut(ground.means, count, costs, between)
         member = np.zeros(len(costs), np.intp)
         for k, box in enumerate(boxes):
             member[box.contains(ground.means)] = k
-        shares = block_weights(ground.surveyed, member, count)
+        shares = block_weights(ground.surveyed, member, len(boxes))
         blocks = [_block(ground, box, chosen_photos(shares[:, k], ground.fewest)) for k, box in enumerate(boxes)]
         needed = np.array([_memory(block, ground.need) for block in blocks])
         if best is None or needed.max() < best[1]:

@@ -9,6 +9,7 @@ import asyncio
 import io
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from itertools import chain
 from pathlib import Path
 from threading import Thread
 from typing import Any, BinaryIO
@@ -18,7 +19,7 @@ from zlib import crc32
 import numpy as np
 
 from clsplat.atomic import replacing
-from clsplat.blocks.block import log_of, needed_parts, train_block
+from clsplat.blocks.block import log_of, needed_parts, points_of, train_block
 from clsplat.blocks.jobs import Job, read_job
 from clsplat.blocks.parts import ROWS, Part
 from clsplat.camera import Camera
@@ -290,9 +291,9 @@ def train_from(desk: str, name: str, folder: Path) -> None:
         stack.callback(cache.close)
         job_file = cache.file(name)
         job = read_job(job_file)
-        for scene in {job.scene, job.far}:
+        for scene in {job.scene, job.far, job.points} - {""}:
             cache.file(scene)
-        for _, part in needed_parts(job_file, job):
+        for part in chain((part for _, part in needed_parts(job_file, job)), points_of(job_file, job)):
             cache.rows(part)
         result = train_block(job_file, cache.photos(job))
         cache.send(log_of(job_file))

@@ -18,6 +18,7 @@ from clsplat.blocks.parts import read_index, read_part, read_scene, write_index
 from clsplat.blocks.plan import (
     COARSE_FACTOR,
     Block,
+    Plan,
     block_config,
     check_blocks,
     coarse_config,
@@ -25,11 +26,13 @@ from clsplat.blocks.plan import (
     one_fits,
     refining_config,
 )
+from clsplat.blocks.points import sparse_start
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
 from clsplat.formats import save_gaussians
 from clsplat.formats.ply import save_ply_parts
 from clsplat.formats.ply_parts import PlyParts
+from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
 from clsplat.run_log import LOG
 from clsplat.scene import Scene, in_turn
@@ -56,7 +59,7 @@ def plan_blocks(
     out: Path,
     watch: Watch,
     tell: Callable[[str], None],
-) -> tuple[list[Path], list[Block]]:
+) -> tuple[list[Path], Plan | None]:
     """Train the coarse scene, cut it into blocks, and write a job for each.
 
     What an interrupted run has finished is not done again.
@@ -78,8 +81,9 @@ def plan_blocks(
     Returns
     -------
     jobs : list of Path
-        Their files, in the order of the blocks; empty if one block is enough.
-    blocks : list of Block
+        Those of the first trainings, in the order of the blocks; empty if one block is enough.
+    plan : Plan or None
+        None if one block is enough.
 
     Raises
     ------
@@ -89,7 +93,7 @@ def plan_blocks(
     check_blocks(config)
     if one_fits(scene, config, device):
         tell(f"blocks: one is enough for {config.max_gaussians} Gaussians")
-        return [], []
+        return [], None
     folder = out / BLOCKS
     folder.mkdir(parents=True, exist_ok=True)
     file, seconds = _coarse(scene, config, device, folder, watch)
@@ -99,17 +103,30 @@ def plan_blocks(
     plan = make_plan(coarse, scene, config, renderer)
     if len(plan.blocks) == 1:
         tell(f"blocks: one is enough for about {plan.total} Gaussians")
-        return [], []
+        return [], None
     tell(plan.describe(config, scene, seconds * COARSE_FACTOR**2))
     jobs = []
     for block in plan.blocks:
         views = [scene.train[i] for i in block.photos]
-        settings = block_config(config, scene, block)
-        jobs.append(make_job(data.resolve(), file.name, block, views, photos, settings).write(folder))
-    return jobs, plan.blocks
+        job = make_job(data.resolve(), file.name, block, views, photos, block_config(config, scene, block))
+        if start := sparse_start(scene, coarse.means, block, config):
+            job = replace(job, points=_written(start, folder, config).name)
+        jobs.append(job.write(folder))
+    return jobs, plan
 
 
-def plan_refinement(first: list[Path], latest: list[Path], blocks: list[Block]) -> list[Path]:
+def _written(gaussians: Gaussians, folder: Path, config: TrainConfig) -> Path:
+    """Write Gaussians into a folder, and return their index."""
+    digest = digest_of(*(array.tobytes() for array in gaussians.arrays().values()))
+    file = folder / f"points-{digest}.ply"
+    if not file.exists():
+        save_gaussians(file, gaussians, config.render.mode)
+    return write_index([file])
+
+
+def plan_refinement(
+    latest: list[Path], blocks: list[Block], scene: Scene, config: TrainConfig, data: Path
+) -> list[Path]:
     """Write the jobs of trainings in which each block has the trained ones around it.
 
     In the first trainings each block is surrounded by the coarse scene. Together, the blocks are therefore worse than
@@ -117,27 +134,31 @@ def plan_refinement(first: list[Path], latest: list[Path], blocks: list[Block]) 
 
     Parameters
     ----------
-    first : list of Path
-        The jobs of the first trainings.
     latest : list of Path
-        Those of the latest trainings, all of which have results.
+        The jobs of the latest trainings, all of which have results.
     blocks : list of Block
-        As `plan_blocks` returned them.
+        Those of a cut of the plan: not that of the latest trainings, whose borders need mending most.
+    scene : Scene
+    config : TrainConfig
+    data : Path
+        All as given to `plan_blocks`.
 
     Returns
     -------
     list of Path
         The files of the jobs, in the order of the blocks.
     """
-    folder, index = first[0].parent, write_index([result_of(job) for job in latest])
+    folder, index = latest[0].parent, write_index([result_of(job) for job in latest])
     counts = np.zeros(len(blocks), int)
     for part in read_index(index):
         means = read_part(folder, part).means
         counts += [block.wide.contains(means).sum() for block in blocks]
-    refined = []
-    for job, block, count in zip(map(read_job, first), blocks, counts.tolist(), strict=True):
-        settings = refining_config(job.config, count)
-        refined.append(replace(job, scene=index.name, near=block.near, config=settings).write(folder))
+    photos, coarse, refined = _read_photos(scene), read_job(latest[0]).far, []
+    for block, count in zip(blocks, counts.tolist(), strict=True):
+        views = [scene.train[i] for i in block.photos]
+        settings = refining_config(config, scene, block, count)
+        job = make_job(data.resolve(), coarse, block, views, photos, settings)
+        refined.append(replace(job, scene=index.name, near=block.near).write(folder))
     return refined
 
 

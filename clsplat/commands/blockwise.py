@@ -48,13 +48,13 @@ def train_in_blocks(
             yield progress.after
 
     assert renderer.device
-    first, blocks = plan_blocks(scene, config, renderer.device, data, out, watch, say)
-    if not first:
+    first, plan = plan_blocks(scene, config, renderer.device, data, out, watch, say)
+    if plan is None:
         return None
     _run(first, scene, renderer.device, watch, where)
     trained = [first]
-    for _ in range(REFINEMENTS):
-        trained.append(plan_refinement(first, trained[-1], blocks))
+    for training in range(1, 1 + REFINEMENTS):
+        trained.append(plan_refinement(trained[-1], plan.cut(training), scene, config, data))
         _run(trained[-1], scene, renderer.device, watch, where)
     merge(trained[-1], out / SCENE, scene.offset)
     gaussians = StoredScene(out / SCENE)

@@ -1,7 +1,7 @@
 """Preparation of a training: the scene and the configuration as ``clsplat train`` uses them."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -129,7 +129,12 @@ def of_fixed_size(config: TrainConfig, gaussians: int, rate: float) -> TrainConf
     rate : float
         Factor on the first learning rate of the means.
     """
-    still: dict[str, Any] = {name: replace(getattr(config, name), stop_fraction=0.0) for name in STRATEGIES}
+    still: dict[str, Any] = {}
+    for name in STRATEGIES:
+        settings = getattr(config, name)
+        # Penalties would make Gaussians fade that no round replaces.
+        penalties = {each.name: 0.0 for each in fields(settings) if each.name.endswith("_penalty")}
+        still[name] = replace(settings, stop_fraction=0.0, **penalties)
     return replace(
         config,
         **still,

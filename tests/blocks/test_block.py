@@ -16,7 +16,7 @@ from clsplat.blocks.jobs import read_job
 from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.parts import read_index, read_scene
 from clsplat.blocks.survey import seen_by_block
-from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
+from clsplat.blocks.whole import merge, plan_blocks, write_log
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
@@ -134,7 +134,7 @@ def test_a_block_takes_the_memory_of_its_training(planned: Planned, tmp_path: Pa
     device = Device(memory_limit=limit)
     (tmp_path / "work").mkdir()
     for _ in range(2):
-        _trained(replace(job, config=config), start, views, device, tmp_path / "work", lambda record: None)
+        _trained(replace(job, config=config), start, [], views, device, tmp_path / "work", lambda record: None)
     assert 0.5 * limit < device.memory_peak <= limit
 
 
@@ -153,7 +153,7 @@ def test_other_photos(planned: Planned, device: Device, tmp_path: Path) -> None:
 
 DAMAGE = {
     "changed": (lambda c: c | {"wide": c["box"]}, "expected a job as it was written, found a changed one"),
-    "format": (lambda c: c | {"format": 9}, "expected a job of format 2, found 9"),
+    "format": (lambda c: c | {"format": 9}, "expected a job of format 3, found 9"),
     "no photos": (lambda c: {k: v for k, v in c.items() if k != "photos"}, "found KeyError"),
     "setting": (lambda c: c | {"config": {"nonsense": 1}}, "found no such setting"),
     "list": (lambda c: [c], "found TypeError"),
@@ -182,7 +182,8 @@ def test_another_coarse_scene(planned: Planned, device: Device) -> None:
 def test_one_block_that_fits_needs_no_coarse_run(planned: Planned, device: Device, tmp_path: Path) -> None:
     told: list[str] = []
     config = replace(planned.config, blocks="auto")
-    assert plan_blocks(planned.scene, config, device, planned.data, tmp_path / "new", unseen, told.append) == ([], [])
+    found = plan_blocks(planned.scene, config, device, planned.data, tmp_path / "new", unseen, told.append)
+    assert found == ([], None)
     assert told == ["blocks: one is enough for 240 Gaussians"] and not (tmp_path / "new").exists()
 
 
@@ -191,8 +192,8 @@ def test_a_second_training_is_surrounded_by_the_first_ones(
 ) -> None:
     for job in planned.jobs:
         train_block(job, planned.scene.train, device)
-    second = plan_refinement(planned.jobs, planned.jobs, planned.blocks)
-    assert second == plan_refinement(planned.jobs, planned.jobs, planned.blocks)
+    second = planned.again()
+    assert second == planned.again()
     assert not set(second) & set(planned.jobs)
     merge(planned.jobs, tmp_path / "first.ply")
     first = load_gaussians(tmp_path / "first.ply")[0]
@@ -203,8 +204,8 @@ def test_a_second_training_is_surrounded_by_the_first_ones(
     assert abs(sum(counts) - len(first)) <= 0.05 * len(first), "none are added; some move across the border"
 
     # Where memory is small, what is farther away is coarse.
-    near = planned.blocks[0].wide
-    path = plan_refinement(planned.jobs, planned.jobs, [block._replace(near=near) for block in planned.blocks])[0]
+    near = planned.plan.between[0].wide
+    path = planned.again([block._replace(near=near) for block in planned.plan.between])[0]
     far = read_scene(path.with_name(job.far), 1)
     for module in ("block", "parts"):
         monkeypatch.setattr(f"clsplat.blocks.{module}.seen", lambda cameras, bounds, config: bounds.radius > 0)

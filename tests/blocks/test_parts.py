@@ -11,7 +11,7 @@ from clsplat.blocks.block import result_of, train_block
 from clsplat.blocks.jobs import read_job
 from clsplat.blocks.parts import bounds_of, read_index, read_part, read_scene, write_index
 from clsplat.blocks.sight import Bounds, seen
-from clsplat.blocks.whole import merge, plan_refinement
+from clsplat.blocks.whole import merge
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians, save_gaussians
@@ -67,7 +67,7 @@ def test_a_second_training_reads_what_its_photos_show(
     """Half of the scene is where no photo looks: its file need not even exist."""
     for job in planned.jobs:
         train_block(job, planned.scene.train, device)
-    path = plan_refinement(planned.jobs, planned.jobs, planned.blocks)[0]
+    path = planned.again()[0]
     job, folder = read_job(path), path.parent
     visible = read_scene(folder / job.scene, 1)
     hidden = Gaussians(**{name: array.copy() for name, array in visible.arrays().items()})

@@ -51,9 +51,11 @@ def test_auto_takes_the_fewest_blocks_that_fit() -> None:
     fewer = make_plan(coarse, scene, replace(config, blocks=count - 1), Renderer(device))
     assert fewer.memory > (1 - RESERVE) * device.memory_limit
     assert 3 <= count <= 12
-    assert sum(int(block.box.contains(coarse.means).sum()) for block in plan.blocks) == len(coarse)
+    for training in range(3):
+        assert sum(int(block.box.contains(coarse.means).sum()) for block in plan.cut(training)) == len(coarse)
     text = plan.describe(config, scene, 1.0)
-    steps = count * 40 + round(count * 40 * REFINEMENTS * REFINING_LENGTH)
+    assert len(plan.between) == count + 1 and REFINEMENTS == 2
+    steps = round(40 * (count + REFINING_LENGTH * (count + 1 + count)))
     assert text.startswith(f"blocks: {count}, each with 8 to ") and " of 12 photos" in text
     assert f"about {SIZE} Gaussians in all, {steps} iterations, {round(steps / 60)} minutes" in text
 

@@ -152,7 +152,7 @@ def test_photos_arrive_with_all_their_layers(
         for k, view in enumerate(planned.scene.train)
     ]
     config = replace(CONFIG, memory_limit=memory)
-    block = planned.blocks[0]._replace(photos=np.arange(len(views)))
+    block = planned.plan.blocks[0]._replace(photos=np.arange(len(views)))
     job = make_job(tmp_path, "scene", block, views, photos_of(views, np.zeros(3)), config)
     with Desk(None, tmp_path, views) as desk:
         found = Cache(tmp_path / "cache", desk.name).photos(job)
