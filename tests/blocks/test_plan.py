@@ -18,6 +18,7 @@ from clsplat.blocks.plan import (
     coarse_config,
     make_plan,
     one_fits,
+    refining_config,
 )
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
@@ -168,3 +169,7 @@ def test_configurations(device: Device) -> None:
     assert block_config(replace(config, iterations=24_000), scene, block._replace(visits=2.0)).iterations == 4000
     assert block_config(replace(config, iterations=70), scene, block).iterations == 70
     assert block_config(replace(config, max_gaussians=None), scene, block).max_gaussians is None
+    later = refining_config(config, scene, block, 280)
+    assert (later.iterations, later.max_gaussians, later.error.stop_fraction) == (1500, 280, 0)
+    assert later.error.opacity_penalty == later.mcmc.opacity_penalty == later.mcmc.scale_penalty == 0
+    assert settings.error.opacity_penalty > 0
