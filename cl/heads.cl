@@ -3,8 +3,9 @@
 //   inputs of the network of colours: 16 spherical harmonics of the ray's direction, then the 16 features of a sample
 //   sigma = exp(feature 0), whose exponent is limited to +-EXPONENT_MAX;  c = 1 / (1 + exp(-outputs 0 to 2))
 //                                                                                  (Müller et al. 2022, section 5.4)
-// Plenoxels (Fridovich-Keil et al. 2022, section 3.1) has 28 features f of a sample, with the basis Y of degree 2:
-//   sigma = density_scale max(f_0, 0);  c_k = max(1/2 + sum_b Y_b(direction) f_{1+9k+b}, 0)
+// Plenoxels (Fridovich-Keil et al. 2022, section 3.1) has 1 + 3B features f of a sample, with the first B functions of
+// the basis Y, 1 or 9 for degree 0 or 2:
+//   sigma = density_scale max(f_0, 0);  c_k = max(1/2 + sum_b Y_b(direction) f_{1+Bk+b}, 0)
 // NeRF and Mip-NeRF 360 have, with softplus(x) = log(1 + exp(x)) (Barron et al. 2021, appendix):
 //   sigma = density_scale softplus(feature 0 - DENSITY_SHIFT);  c as above
 // See docs/stages/heads.md; clsplat/reference/heads.py is the twin.
@@ -13,7 +14,7 @@
 //
 // Buffers, R rays, S samples: in features[S,16], directions[R,3] of length 1, rays_of[S] u32, outputs[S,16]; out
 //   inputs[S,32], sigmas[S], colors[S,3]. Backward: in v_sigmas[S], v_colors[S,3], v_inputs[S,32]; out v_outputs[S,16],
-//   v_features[S,16]. Of Plenoxels: in features[S,28]; out v_features[S,28].
+//   v_features[S,16]. Of Plenoxels: in features[S,1+3B]; out v_features[S,1+3B].
 //   With a softplus: in features[S,W], outputs[S,V]; in and out v_features[S,W], to which the gradient is added.
 // -DEXPONENT_MAX    largest exponent of a density
 // -DDENSITY_SHIFT   as above
@@ -75,52 +76,51 @@ __kernel void heads_join_bwd(const uint samples, const __global real *v_inputs, 
         v_features[16 * s] += v_sigmas[s] * sigmas[s];
 }
 
-#define SH_FEATURES 28 // a density, and nine coefficients for each colour
-
-static inline void sh_at(const __global real *directions, uint ray, reals *basis) {
+static inline void sh_at(const __global real *directions, uint ray, uint bands, reals *basis) {
     const real3 d = load3(directions, ray);
     const reals3 direction = {d.x, d.y, d.z};
-    sh_basis(direction, 2, basis);
+    sh_basis(direction, bands == 1 ? 0 : 2, basis);
 }
 
-static inline real sh_color(const reals *basis, const __global real *coefficients) {
+static inline real sh_color(const reals *basis, uint bands, const __global real *coefficients) {
     real color = (real)0.5;
-    for (int b = 0; b < 9; ++b)
+    for (uint b = 0; b < bands; ++b)
         color += basis[b] * coefficients[b];
     return color;
 }
 
-__kernel void heads_sh_fwd(const uint samples, const real density_scale, const __global real *features,
-                           const __global real *directions, const __global uint *rays_of, __global real *sigmas,
-                           __global real *colors) {
+__kernel void heads_sh_fwd(const uint samples, const uint bands, const real density_scale,
+                           const __global real *features, const __global real *directions,
+                           const __global uint *rays_of, __global real *sigmas, __global real *colors) {
     const size_t s = get_global_id(0);
     if (s >= samples)
         return;
     reals basis[9];
-    sh_at(directions, rays_of[s], basis);
-    const __global real *own = features + s * SH_FEATURES;
+    sh_at(directions, rays_of[s], bands, basis);
+    const __global real *own = features + s * (1 + 3 * bands);
     sigmas[s] = density_scale * GREATER(own[0], (real)0);
     for (int k = 0; k < 3; ++k) {
-        const real color = sh_color(basis, own + 1 + 9 * k);
+        const real color = sh_color(basis, bands, own + 1 + bands * k);
         colors[3 * s + k] = GREATER(color, (real)0);
     }
 }
 
-__kernel void heads_sh_bwd(const uint samples, const real density_scale, const __global real *features,
-                           const __global real *directions, const __global uint *rays_of,
-                           const __global real *v_sigmas, const __global real *v_colors, __global real *v_features) {
+__kernel void heads_sh_bwd(const uint samples, const uint bands, const real density_scale,
+                           const __global real *features, const __global real *directions,
+                           const __global uint *rays_of, const __global real *v_sigmas, const __global real *v_colors,
+                           __global real *v_features) {
     const size_t s = get_global_id(0);
     if (s >= samples)
         return;
     reals basis[9];
-    sh_at(directions, rays_of[s], basis);
-    const __global real *own = features + s * SH_FEATURES;
-    __global real *v_own = v_features + s * SH_FEATURES;
+    sh_at(directions, rays_of[s], bands, basis);
+    const __global real *own = features + s * (1 + 3 * bands);
+    __global real *v_own = v_features + s * (1 + 3 * bands);
     v_own[0] = own[0] > 0 ? density_scale * v_sigmas[s] : 0;
     for (int k = 0; k < 3; ++k) {
-        const real v = sh_color(basis, own + 1 + 9 * k) > 0 ? v_colors[3 * s + k] : 0;
-        for (int b = 0; b < 9; ++b)
-            v_own[1 + 9 * k + b] = v * basis[b];
+        const real v = sh_color(basis, bands, own + 1 + bands * k) > 0 ? v_colors[3 * s + k] : 0;
+        for (uint b = 0; b < bands; ++b)
+            v_own[1 + bands * k + b] = v * basis[b];
     }
 }
 

@@ -13,13 +13,14 @@
 // Mapping: one work-item per ray. The backward kernel goes from the last sample to the first, and subtracts nothing
 // from sums over the ray.
 //
-// Buffers, R rays, S samples: in sigmas[S] 1/length, colors[S,3], deltas[S] length, first[R+1] u32: ray r has the
-//   samples first[r] to first[r + 1], front to back; out rgb[R,3], transmittances[S] (T_i, 0 behind the end), behind[R]
-//   (T_end). Backward: in v_rgb[R,3]; out v_sigmas[S], v_colors[S,3]. Distortion: out losses[R], between pulls[S], in
-//   and out v_sigmas[S], to which the gradient times `scale` is added.
+// Buffers, R rays, S samples: in background[R,3], or [1,3] of all rays without `separate`; sigmas[S] 1/length,
+//   colors[S,3], deltas[S] length, first[R+1] u32: ray r has the samples first[r] to first[r + 1], front to back; out
+//   rgb[R,3], transmittances[S] (T_i, 0 behind the end), behind[R] (T_end). Backward: in v_rgb[R,3]; out v_sigmas[S],
+//   v_colors[S,3]. Distortion: out losses[R], between pulls[S], in and out v_sigmas[S], to which the gradient times
+//   `scale` is added.
 #include "common.h"
 
-__kernel void rays_fwd(const uint rays, const real red, const real green, const real blue,
+__kernel void rays_fwd(const uint rays, const uint separate, const __global real *background,
                        const __global real *sigmas, const __global real *colors, const __global real *deltas,
                        const __global uint *first, __global real *rgb, __global real *transmittances,
                        __global real *behind) {
@@ -38,11 +39,11 @@ __kernel void rays_fwd(const uint rays, const real red, const real green, const 
     }
     for (; i < end; ++i)
         transmittances[i] = 0;
-    store3(rgb, r, color + transmittance * (real3)(red, green, blue));
+    store3(rgb, r, color + transmittance * load3(background, separate ? r : 0));
     behind[r] = transmittance;
 }
 
-__kernel void rays_bwd(const uint rays, const real red, const real green, const real blue,
+__kernel void rays_bwd(const uint rays, const uint separate, const __global real *background,
                        const __global real *sigmas, const __global real *colors, const __global real *deltas,
                        const __global uint *first, const __global real *transmittances, const __global real *v_rgb,
                        __global real *v_sigmas, __global real *v_colors) {
@@ -50,7 +51,7 @@ __kernel void rays_bwd(const uint rays, const real red, const real green, const 
     if (r >= rays)
         return;
     const real3 v = load3(v_rgb, r);
-    real3 seen = (real3)(red, green, blue); // behind sample i
+    real3 seen = load3(background, separate ? r : 0); // behind sample i
     for (uint i = first[r + 1]; i-- > first[r];) {
         const real depth = sigmas[i] * deltas[i], transmittance = transmittances[i];
         const real3 color = load3(colors, i);

@@ -12,8 +12,10 @@
 //                equal rows adds up the run. voxels_zero clears the gradients first.
 // voxels_tv has one work-item per row of a range, and adds the gradient of the total variation to that of the row.
 //
-// Buffers, S points, a grid of N^3 cells, M rows: in positions[S,3] in [0, 1], index[N+1,N+1,N+1] u32, x fastest: row of
-//   a corner, NO_ROW without one; table[M,FEATURES]; out features[S,FEATURES]. Backward: in v_features[S,FEATURES]; out
+// A grid may be closed in x: then the last corners have the rows of the first ones.
+//
+// Buffers, S points, a grid of nx * ny * nz cells, M rows: in positions[S,3] in [0, 1], index[nz+1,ny+1,nx+1] u32: row
+//   of a corner, NO_ROW without one; table[M,FEATURES]; out features[S,FEATURES]. Backward: in v_features[S,FEATURES]; out
 //   v_table[M,FEATURES]; between keys[S,8] u32, sorted keys[8S] u32, order[8S] u32. Total variation: in corners[M] u32,
 //   place of each row's corner in `index`; in and out v_table.
 // -DFEATURES   features of a corner, at least 1
@@ -30,27 +32,29 @@
 #define NO_ROW 0xFFFFFFFFu
 
 typedef struct {
-    uint corner; // in `index`, the one nearest the origin
-    uint edge;
+    uint corner;        // in `index`, the one nearest the origin
+    uint stride, plane; // in `index`, to the next corners in y and in z
     real along[3];
 } Cell;
 
-static inline Cell cell_at(const __global real *positions, size_t s, uint cells) {
+static inline Cell cell_at(const __global real *positions, size_t s, const uint3 grid) {
     Cell cell;
+    const uint cells[3] = {grid.x, grid.y, grid.z};
     uint place[3];
     for (int axis = 0; axis < 3; ++axis) {
-        const real x = CLAMP(positions[3 * s + axis], (real)0, (real)1) * cells;
-        place[axis] = LESSER((uint)x, cells - 1);
+        const real x = CLAMP(positions[3 * s + axis], (real)0, (real)1) * cells[axis];
+        place[axis] = LESSER((uint)x, cells[axis] - 1);
         cell.along[axis] = x - place[axis];
     }
-    cell.edge = cells + 1;
-    cell.corner = place[0] + cell.edge * (place[1] + cell.edge * place[2]);
+    cell.stride = grid.x + 1;
+    cell.plane = cell.stride * (grid.y + 1);
+    cell.corner = place[0] + cell.stride * place[1] + cell.plane * place[2];
     return cell;
 }
 
 // Place in `index` of a corner; bits 0, 1 and 2 of k are its sides in x, y and z.
 static inline uint corner_of(const Cell *cell, uint k) {
-    return cell->corner + (k & 1) + cell->edge * ((k >> 1 & 1) + cell->edge * (k >> 2));
+    return cell->corner + (k & 1) + cell->stride * (k >> 1 & 1) + cell->plane * (k >> 2);
 }
 
 static inline real weight_of(const Cell *cell, uint k) {
@@ -63,12 +67,13 @@ static inline void add_scaled(real *sum, real weight, const __global real *value
         sum[i] += weight * values[i];
 }
 
-__kernel void voxels_fwd(const uint points, const uint cells, const __global real *positions,
-                         const __global uint *index, const __global real *table, __global real *features) {
+__kernel void voxels_fwd(const uint points, const uint nx, const uint ny, const uint nz,
+                         const __global real *positions, const __global uint *index, const __global real *table,
+                         __global real *features) {
     const size_t s = get_global_id(0);
     if (s >= points)
         return;
-    const Cell cell = cell_at(positions, s, cells);
+    const Cell cell = cell_at(positions, s, (uint3)(nx, ny, nz));
     real sum[FEATURES];
     for (int i = 0; i < FEATURES; ++i)
         sum[i] = 0;
@@ -81,15 +86,15 @@ __kernel void voxels_fwd(const uint points, const uint cells, const __global rea
         features[s * FEATURES + i] = sum[i];
 }
 
-__kernel void voxels_bwd(const uint points, const uint cells, const uint rows, const uint parts,
-                         const __global real *positions, const __global uint *index, const __global real *v_features,
-                         __global real *v_table) {
+__kernel void voxels_bwd(const uint points, const uint nx, const uint ny, const uint nz, const uint rows,
+                         const uint parts, const __global real *positions, const __global uint *index,
+                         const __global real *v_features, __global real *v_table) {
     const uint part = get_global_id(0), length = (rows + parts - 1) / parts;
     const uint begin = LESSER(part * length, rows), end = LESSER(begin + length, rows);
     for (size_t i = (size_t)begin * FEATURES; i < (size_t)end * FEATURES; ++i)
         v_table[i] = 0;
     for (uint s = 0; s < points; ++s) {
-        const Cell cell = cell_at(positions, s, cells);
+        const Cell cell = cell_at(positions, s, (uint3)(nx, ny, nz));
         for (uint k = 0; k < 8; ++k) {
             const uint row = index[corner_of(&cell, k)];
             if (row < begin || row >= end) // also without a row
@@ -107,21 +112,21 @@ __kernel void voxels_zero(const uint values, __global real *v_table) {
         v_table[i] = 0;
 }
 
-__kernel void voxels_keys(const uint points, const uint cells, const uint rows, const __global real *positions,
-                          const __global uint *index, __global uint *keys) {
+__kernel void voxels_keys(const uint points, const uint nx, const uint ny, const uint nz, const uint rows,
+                          const __global real *positions, const __global uint *index, __global uint *keys) {
     const size_t s = get_global_id(0);
     if (s >= points)
         return;
-    const Cell cell = cell_at(positions, s, cells);
+    const Cell cell = cell_at(positions, s, (uint3)(nx, ny, nz));
     for (uint k = 0; k < 8; ++k) {
         const uint row = index[corner_of(&cell, k)];
         keys[8 * s + k] = row == NO_ROW ? rows : row;
     }
 }
 
-__kernel void voxels_sums(const uint corners, const uint cells, const uint rows, const __global real *positions,
-                          const __global real *v_features, const __global uint *sorted_keys,
-                          const __global uint *order, __global real *v_table) {
+__kernel void voxels_sums(const uint corners, const uint nx, const uint ny, const uint nz, const uint rows,
+                          const __global real *positions, const __global real *v_features,
+                          const __global uint *sorted_keys, const __global uint *order, __global real *v_table) {
     const size_t begin = get_global_id(0);
     if (begin >= corners || sorted_keys[begin] == rows || (begin > 0 && sorted_keys[begin] == sorted_keys[begin - 1]))
         return;
@@ -130,20 +135,28 @@ __kernel void voxels_sums(const uint corners, const uint cells, const uint rows,
         sum[i] = 0;
     for (size_t j = begin; j < corners && sorted_keys[j] == sorted_keys[begin]; ++j) {
         const uint s = order[j] / 8;
-        const Cell cell = cell_at(positions, s, cells);
+        const Cell cell = cell_at(positions, s, (uint3)(nx, ny, nz));
         add_scaled(sum, weight_of(&cell, order[j] % 8), v_features + (size_t)s * FEATURES);
     }
     for (int i = 0; i < FEATURES; ++i)
         v_table[(size_t)sorted_keys[begin] * FEATURES + i] = sum[i];
 }
 
-// Row of the neighbour of a corner along an axis, a step of 1 or -1 away; NO_ROW outside of the grid.
-static inline uint neighbour(const __global uint *index, uint corner, uint edge, int axis, int step) {
-    const uint stride = axis == 0 ? 1 : axis == 1 ? edge : edge * edge;
-    const uint place = corner / stride % edge;
-    if (corner == NO_ROW || (step < 0 && place == 0) || (step > 0 && place == edge - 1))
-        return NO_ROW;
-    return index[step < 0 ? corner - stride : corner + stride];
+// Place in `index` of the neighbour of a corner along an axis, a step of 1 or -1 away; NO_ROW outside of the grid.
+static inline uint neighbour(const __global uint *index, uint corner, const uint3 cells, int axis, int step) {
+    const uint edges[3] = {cells.x + 1, cells.y + 1, cells.z + 1};
+    const uint stride = axis == 0 ? 1 : axis == 1 ? edges[0] : edges[0] * edges[1];
+    const uint place = corner / stride % edges[axis];
+    if (step > 0)
+        return place == edges[axis] - 1 ? NO_ROW : corner + stride;
+    if (place > 0)
+        return corner - stride;
+    const bool closed = axis == 0 && index[corner] != NO_ROW && index[corner + cells.x] == index[corner];
+    return closed ? corner + cells.x - 1 : NO_ROW;
+}
+
+static inline uint row_at(const __global uint *index, uint corner) {
+    return corner == NO_ROW ? NO_ROW : index[corner];
 }
 
 // Differences of a feature from a row to the next ones, and their length with TV_EPS.
@@ -158,19 +171,21 @@ static inline real differences(const __global real *table, const uint *next, uin
     return sqrt(square);
 }
 
-__kernel void voxels_tv(const uint rows, const uint cells, const uint first, const uint count,
-                        const real first_weight, const real weight, const __global uint *index,
+__kernel void voxels_tv(const uint rows, const uint nx, const uint ny, const uint nz, const uint first,
+                        const uint count, const real first_weight, const real weight, const __global uint *index,
                         const __global uint *corners, const __global real *table, __global real *v_table) {
     if (get_global_id(0) >= count)
         return;
-    const uint row = (first + get_global_id(0)) % rows, edge = cells + 1;
+    const uint row = (first + get_global_id(0)) % rows;
+    const uint3 cells = (uint3)(nx, ny, nz);
     uint next[4][3], before[3]; // rows after this one, and after each of those before it
     for (int axis = 0; axis < 3; ++axis) {
-        next[3][axis] = neighbour(index, corners[row], edge, axis, 1);
-        before[axis] = neighbour(index, corners[row], edge, axis, -1);
+        next[3][axis] = row_at(index, neighbour(index, corners[row], cells, axis, 1));
+        const uint corner = neighbour(index, corners[row], cells, axis, -1);
+        before[axis] = row_at(index, corner);
         for (int other = 0; other < 3; ++other)
             next[axis][other] =
-                before[axis] == NO_ROW ? NO_ROW : neighbour(index, corners[before[axis]], edge, other, 1);
+                before[axis] == NO_ROW ? NO_ROW : row_at(index, neighbour(index, corner, cells, other, 1));
     }
     for (int feature = 0; feature < FEATURES; ++feature) {
         real d[3];

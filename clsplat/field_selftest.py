@@ -57,6 +57,16 @@ def test_march(b: Any) -> Found:
     yield found.deltas, expected.deltas
 
 
+def test_spheres(b: Any) -> Found:
+    """In a grid without empty cells, so that no rounding moves samples to them."""
+    origins, along, offsets = b.rounded(0.3 * directions(b)), directions(b), b.rounded(np.linspace(0.1, 0.9, RAYS))
+    given = origins, along, offsets, np.ones((5, 2, 4), np.uint8)
+    found, expected = b.stages.spheres(*up(b, *given), 0.1), reference.spheres(*given, 0.1)
+    yield found.first, expected.first
+    yield found.positions, expected.positions
+    yield found.deltas, expected.deltas
+
+
 def test_hashgrid(b: Any) -> Found:
     levels = HashLevels.geometric(3, 4, 16, 512)
     positions = b.rounded(b.rng.uniform(0.01, 0.99, (SAMPLES, 3)))

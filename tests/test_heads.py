@@ -69,10 +69,10 @@ def test_gradients_by_central_differences(device64):
 SCALE = 7.0
 
 
-def harmonics(samples=301):
+def harmonics(samples=301, width=28):
     """Features of Plenoxels, with densities and colours on both sides of 0, and what `inputs` has besides."""
     _, directions, _, v_sigmas, v_colors, _, rays_of = inputs(samples)
-    features = np.random.default_rng(1).normal(size=(samples, 28)).astype(np.float32).astype(np.float64)
+    features = np.random.default_rng(1).normal(size=(samples, width)).astype(np.float32).astype(np.float64)
     return features, directions, rays_of, v_sigmas, v_colors
 
 
@@ -83,8 +83,9 @@ def sh_by_kernel(device, features, directions, rays_of, v_sigmas, v_colors):
     return [a.get() for a in results]
 
 
-def test_harmonics_match_twin(any_device):
-    features, directions, rays_of, v_sigmas, v_colors = given = harmonics()
+@pytest.mark.parametrize("width", [4, 28])
+def test_harmonics_match_twin(any_device, width):
+    features, directions, rays_of, v_sigmas, v_colors = given = harmonics(width=width)
     sigmas, colors = reference.heads_sh_fwd(features, directions, rays_of, SCALE)
     assert (sigmas == 0).any() and (colors == 0).any() and (colors > 0).any()
     v_features = reference.heads_sh_bwd(features, directions, rays_of, SCALE, v_sigmas, v_colors)
@@ -96,8 +97,9 @@ def test_harmonics_match_twin(any_device):
         assert_matches(name, array, expected, tolerances)
 
 
-def test_gradients_of_harmonics_by_central_differences(device64):
-    features, *rest = harmonics(40)
+@pytest.mark.parametrize("width", [4, 28])
+def test_gradients_of_harmonics_by_central_differences(device64, width):
+    features, *rest = harmonics(40, width)
     *_, v_sigmas, v_colors = rest
 
     def total(features):
@@ -105,6 +107,13 @@ def test_gradients_of_harmonics_by_central_differences(device64):
         return float(sigmas @ v_sigmas + (colors * v_colors).sum())
 
     gradcheck(total, {"features": features}, {"features": sh_by_kernel(device64, features, *rest)[2]})
+
+
+def test_harmonics_of_degree_0_do_not_depend_on_the_direction(device64):
+    """c = 1/2 + f / (2 sqrt(pi)), at least 0."""
+    features, *rest = harmonics(width=4)
+    expected = np.maximum(0.5 + features[:, 1:] / (2 * np.sqrt(np.pi)), 0)
+    np.testing.assert_allclose(sh_by_kernel(device64, features, *rest)[1], expected, rtol=1e-12)
 
 
 def soft_by_kernel(device, features, outputs, v_sigmas, v_features):

@@ -57,6 +57,31 @@ def test_matches_twin(any_device, density):
         assert_matches(name, found, wanted, tolerances)
 
 
+def test_each_ray_may_have_its_own_background(any_device):
+    """Colours and gradients are those of the twin; with equal backgrounds, those of one background to the bit."""
+    given, rng = samples(), np.random.default_rng(5)
+    v_rgb, own = (rng.uniform(size=(37, 3)).astype(np.float32).astype(np.float64) for _ in range(2))
+    on_device = [any_device.upload("samples", a) for a in given[:3]]
+    on_device.append(any_device.upload("first", given[3], np.uint32))
+    v = any_device.upload("v_rgb", v_rgb)
+
+    def run(background):
+        there = any_device.upload("background", background)
+        image = ops.rays_fwd(any_device, *on_device, there)
+        return image.rgb.get(), *(
+            a.get() for a in ops.rays_bwd(any_device, *on_device, there, image.transmittances, v)
+        )
+
+    image = reference.rays_fwd(*given, own)
+    expected = image.rgb, *reference.rays_bwd(*given, own, image.transmittances, v_rgb)
+    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    for name, found, wanted in zip(("ray colours", "v_sigmas", "v_ray colours"), run(own), expected, strict=True):
+        assert_matches(name, found, wanted, tolerances)
+    rgb, _, _, v_sigmas, v_colors = by_kernel(any_device, *given, v_rgb)
+    for found, wanted in zip(run(np.tile(BACKGROUND, (37, 1))), (rgb, v_sigmas, v_colors), strict=True):
+        np.testing.assert_array_equal(found, wanted)
+
+
 @pytest.mark.parametrize("count", [1, 7, 64])
 def test_a_homogeneous_medium_has_its_closed_form(any_device, count):
     """Colour c (1 - exp(-sigma L)) + exp(-sigma L) background, however the length L is divided."""

@@ -71,7 +71,7 @@ def test_a_stage_that_computes_wrong_is_named(device, monkeypatch):
     monkeypatch.setattr(ops.scan, "queue_scan", failing)
     found = selftest.faults(device)
     out = "out of resources"
-    assert found == {"observe": "expected errors below 0.0001, found 0.5", "scan": out, "march": out}
+    assert found == {"observe": "expected errors below 0.0001, found 0.5", "scan": out, "march": out, "spheres": out}
 
 
 def test_values_that_are_not_finite_or_missing_are_wrong():

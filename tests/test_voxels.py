@@ -8,21 +8,26 @@ from clsplat import ops, reference
 from clsplat.field_stages import NO_ROW, TV_EPS
 from clsplat.testing import assert_matches, gradcheck
 
-CELLS, FEATURES = 5, 3
+CORNERS, FEATURES = (4, 7, 6), 3  # along z, y, x
 
 
-def inputs(points=500, share=0.7, seed=0):
+def inputs(points=500, share=0.7, seed=0, closed=False):
     """A grid of which a share of the corners have rows, in a random order; exact in single precision."""
     rng = np.random.default_rng(seed)
-    corners = np.flatnonzero(rng.uniform(size=(CELLS + 1) ** 3) < share).astype(np.uint32)
+    given = rng.uniform(size=CORNERS) < share
+    given[..., -1] &= not closed
+    corners = np.flatnonzero(given).astype(np.uint32)
     rng.shuffle(corners)
-    index = np.full((CELLS + 1) ** 3, NO_ROW, np.uint32)
+    index = np.full(np.prod(CORNERS), NO_ROW, np.uint32)
     index[corners] = np.arange(len(corners))
+    index = index.reshape(CORNERS)
+    if closed:
+        index[..., -1] = index[..., 0]
     positions = rng.uniform(size=(points, 3))
     positions[:2] = [[0, 0, 0], [1, 1, 1]]
     arrays = positions, rng.normal(size=(len(corners), FEATURES)), rng.normal(size=(points, FEATURES))
     exact = [a.astype(np.float32).astype(np.float64) for a in arrays]
-    return *exact, index.reshape((CELLS + 1,) * 3), corners
+    return *exact, index, corners
 
 
 def by_kernel(device, positions, table, v_features, index, corners, first=0, count=None):
@@ -43,13 +48,32 @@ def by_twin(positions, table, v_features, index, corners, first=0, count=None):
     return features, reference.voxels_bwd(positions, index, rows, v_features), variation
 
 
+CLOSED = pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+
+
+@CLOSED
 @pytest.mark.parametrize("share", [0.02, 0.7, 1.0])
-def test_matches_twin(any_device, share):
-    check(any_device, inputs(share=share))
+def test_matches_twin(any_device, share, closed):
+    check(any_device, inputs(share=share, closed=closed))
 
 
-def test_matches_twin_as_cpu_and_gpu(configured_device):
-    check(configured_device, inputs())
+@CLOSED
+def test_matches_twin_as_cpu_and_gpu(configured_device, closed):
+    check(configured_device, inputs(closed=closed))
+
+
+def test_a_closed_grid_goes_on_behind_its_end(device64):
+    """Rotated by two cells, the features and all gradients are the same."""
+    positions, table, v, index, corners = given = inputs(closed=True)
+    turned = np.roll(index[..., :-1], 2, axis=2)
+    turned = np.concatenate([turned, turned[..., :1]], axis=2)
+    places = {row: place for place, row in reversed(list(enumerate(turned.ravel())))}
+    moved = positions.copy()
+    moved[2:, 0] = (positions[2:, 0] + 2 / (CORNERS[2] - 1)) % 1
+    moved[:2, 0] = 2 / (CORNERS[2] - 1)  # where the grid is closed
+    found = by_kernel(device64, moved, table, v, turned, np.array([places[row] for row in range(len(corners))]))
+    for array, expected in zip(found, by_kernel(device64, *given), strict=True):
+        np.testing.assert_allclose(array, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_part_of_the_rows_beyond_the_last_one(device64):
@@ -68,9 +92,10 @@ def check(device, given, *part):
         assert_matches(name, found, expected, tolerances)
 
 
-def test_gradients_by_central_differences(device64):
+@CLOSED
+def test_gradients_by_central_differences(device64, closed):
     """Of the interpolation, and of the sum over corners of the length of the differences."""
-    given = positions, table, v, index, corners = inputs()
+    given = positions, table, v, index, corners = inputs(closed=closed)
     _, v_table, variation = by_kernel(device64, *given)
 
     def interpolated(table):
@@ -80,8 +105,10 @@ def test_gradients_by_central_differences(device64):
         total = 0.0
         for z, y, x in np.argwhere(index != NO_ROW):
             here, d = table[index[z, y, x]], np.zeros((3, FEATURES))
+            if closed and x == CORNERS[2] - 1:
+                continue  # the first corner again
             for axis, after in enumerate([(z, y, x + 1), (z, y + 1, x), (z + 1, y, x)]):
-                if max(after) <= CELLS and index[after] != NO_ROW:
+                if (np.array(after) < CORNERS).all() and index[after] != NO_ROW:
                     d[axis] = table[index[after]] - here
             total += float(np.sqrt((d**2).sum(axis=0) + TV_EPS) @ [2.0, 0.5, 0.5])
         return total

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.field_stages import NO_ROW, Marching, Samples
+from clsplat.field_stages import Marching
 from clsplat.fields.field import Array, Field, Rays
 from clsplat.fields.pixels import Batch
-from clsplat.fields.space import CONE, FAR, Space
+from clsplat.fields.space import CUBE_FAR, Space
+from clsplat.fields.sparse_grid import Seen, SparseGrid
 from clsplat.randomness import stream
 from clsplat.scene import Color
-from clsplat.stages import AdamStep
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -34,12 +34,13 @@ raises the rate of the densities from a hundredth during its first 15 000 steps,
 FIRST_DENSITY = 0.2
 """Density at the start, in inverse edges of the unit cube: 0.1 of the paper, whose cube has edges of 2."""
 
-SPACE_DENSITY_SCALE, SPACE_FIRST_DENSITY = 150.0, 0.05
+SPACE_DENSITY_SCALE, SPACE_FIRST_DENSITY = 300.0, 0.1
 """The same two where there is a background. The first steps do not depend on the size of the gradients: at higher
 rates they make cells close to the cameras opaque. Effect: docs/howto/fields.md."""
 
-BETA2, EPS = 0.95, 1e-8
-"""Constants of RMSProp (code of Fridovich-Keil et al. 2022). It is Adam without a mean of the gradients."""
+SPACE_STEP_SHARE = 1 / 32
+"""Length of a step per distance where there is a background, if that is more than `STEP_CELLS`. Steps of half a cell
+leave half as many rays in a step of the training. Effect: docs/howto/fields.md."""
 
 TV_DENSITY, TV_HARMONICS = 1e-5, 1e-3
 """Weights of the total variation of densities, in inverse halves of an edge, and of harmonics, for synthetic scenes
@@ -47,13 +48,10 @@ TV_DENSITY, TV_HARMONICS = 1e-5, 1e-3
 refinement. If photos have few pixels for each cell, trainings then overfit. Here the penalty therefore stays until
 the end, as in that code's settings for users' own captures."""
 
-SPACE_TV_DENSITY, SPACE_TV_HARMONICS = 1.5, 15.0
+SPACE_TV_DENSITY, SPACE_TV_HARMONICS = 1.5, 30.0
 """The same where there is a background, for all steps together: each step has its part. Trainings of any length then
-smooth as much (effect: docs/howto/fields.md). The paper has 5e-4 and 5e-3 in each of 128 000 steps, for photos that
-face forward; steps here have more rays and larger cells."""
-
-TV_SHARE = 100
-"""Number of steps after which each corner has had the total variation in its gradient once (section 3.4)."""
+smooth as much (effect: docs/howto/fields.md). The paper has 5e-5 and 5e-3 in each of 102 400 steps, which have fewer
+rays and smaller cells."""
 
 TV_CELLS = 256
 """Cells along an edge for which differences are not scaled (equation 3)."""
@@ -66,8 +64,8 @@ CELL_PIXELS = 1.5
 them: 512 cells for photos of 800 x 800 pixels."""
 
 OCCUPIED_DEPTH = 0.02
-"""Optical depth of a step at one of its corners from which a cell is kept when others are pruned. For 128 cells it is
-a density of 2.6 of the paper, whose code keeps those above 5."""
+"""Optical depth of a step at one of its corners from which a cell is kept when others are pruned. For 128 cells of a
+cube it is a density of 2.6 of the paper, whose code keeps those above 5."""
 
 FIRST_SAMPLES = 90
 """Approximate number of samples of a ray before the first pruning, for 64 cells."""
@@ -75,9 +73,30 @@ FIRST_SAMPLES = 90
 RAYS_MAX = 32768
 """Largest number of rays in a step."""
 
+SPHERES = 64
+"""Cells between the unit ball and infinity after two refinements, equally spaced in inverse radius. The paper has 64
+spheres from the start."""
+
+SPHERE_PIXELS = 3.0
+"""Width of a cell of the spheres at the equator after two refinements, in pixels. Effect: docs/howto/fields.md."""
+
+LONGITUDES_MAX = 1024
+"""Largest number of longitudes of the spheres, which bounds their memory. The paper has 2048."""
+
+SPHERE_DENSITY_SCALE, SPHERE_FIRST_DENSITY = 150.0, 0.05
+"""Density of a stored value of 1 on the spheres, and density at the start, in inverse contracted lengths."""
+
+SPHERE_RATE = 0.05
+"""Learning rate of the spheres at the start. It falls as the one of the harmonics. The paper's code has 0.1 for the
+colours; there are no harmonics here that share a colour."""
+
+SPHERE_TV_DENSITY, SPHERE_TV_COLOR = 1.0, 5.0
+"""Weights of the total variation of the spheres, for all steps together: differences of contracted densities and of
+colours, not scaled by the size of cells. Effect: docs/howto/fields.md."""
+
 
 class Plenoxels(Field):
-    """A sparse grid that is refined twice."""
+    """A sparse grid that is refined twice, and spheres around it."""
 
     name = "plenoxels"
     cells = 64
@@ -85,29 +104,27 @@ class Plenoxels(Field):
     samples = 2**16
     """Approximate number of samples of a step. The paper has 5000 rays, which have about as many."""
     iterations = 3000
-    halved = ("table",)
+    halved = ("table", "spheres_table")
 
     def __init__(self, space: Space, device: "Device", seed: int):
         super().__init__(space, device, seed)
         self._rays, self._events = self.samples // FIRST_SAMPLES, 0
-        first, self._density_scale, self._variation = FIRST_DENSITY, DENSITY_SCALE, (TV_DENSITY, TV_HARMONICS)
+        self._spheres: SparseGrid | None = None
+        cells, row = self.cells, np.zeros(FEATURES)
+        first, scale, self._variation = FIRST_DENSITY, DENSITY_SCALE, (TV_DENSITY, TV_HARMONICS)
         if space.contracted:
-            first, self._density_scale = SPACE_FIRST_DENSITY, SPACE_DENSITY_SCALE
+            cells //= 2  # the spheres have the others
+            first, scale = SPACE_FIRST_DENSITY, SPACE_DENSITY_SCALE
             self._variation = SPACE_TV_DENSITY, SPACE_TV_HARMONICS
-        table = np.zeros(((self.cells + 1) ** 3, FEATURES))
-        table[:, 0] = first / self._density_scale
-        self._place(np.ones((self.cells,) * 3, np.uint8), table)
-
-    def _place(self, occupied: NDArray[np.uint8], table: Array) -> None:
-        """Set the occupied cells and the rows of their corners, in the order of the corners."""
-        corners = np.flatnonzero(corners_of(occupied)).astype(np.uint32)
-        index = np.full((len(occupied) + 1,) * 3, NO_ROW, np.uint32)
-        index.reshape(-1)[corners] = np.arange(len(corners), dtype=np.uint32)
-        self.occupied, self.corners = occupied, corners
-        upload = self.device.upload
-        self._occupied, self._index = upload("occupied", occupied, np.uint8), upload("index", index, np.uint32)
-        self._corners = upload("corners", corners, np.uint32)
-        self.table, self._squares = upload("table", table), upload("squares", np.zeros(table.shape))
+            finest = min(LONGITUDES_MAX, 2 * np.pi / (SPHERE_PIXELS * space.pixel))
+            longitudes = 2 * max(1, round(finest / 8))  # an even number, of which the finest is four times as many
+            around = np.ones((SPHERES // 4, longitudes // 2, longitudes), np.uint8)
+            outer = np.array([SPHERE_FIRST_DENSITY / SPHERE_DENSITY_SCALE, 0, 0, 0])
+            args = self.stages, device, around, outer, SPHERE_DENSITY_SCALE
+            self._spheres = SparseGrid.uniform(*args, closed=True)
+        row[0] = first / scale
+        occupied = in_ball(cells) if space.contracted else np.ones((cells,) * 3, np.uint8)
+        self._grid = SparseGrid.uniform(self.stages, device, occupied, row, scale)
 
     @property
     def rays(self) -> int:
@@ -116,127 +133,103 @@ class Plenoxels(Field):
 
     @property
     def _marching(self) -> Marching:
-        step = STEP_CELLS / len(self.occupied)
-        if not self.space.contracted:
-            return Marching(step, 0.0, 0.0, 1e6, False)
-        return Marching(self.space.edge * step, CONE, self.space.near, FAR, True)
+        share = SPACE_STEP_SHARE if self.space.contracted else 0.0
+        step = STEP_CELLS / len(self._grid.occupied)
+        return Marching(step, share, self.space.near / self._edge, CUBE_FAR, False)
+
+    @property
+    def _edge(self) -> float:
+        """Edge of the cube of the grid, in field coordinates: the unit ball is two wide."""
+        return 2.0 if self.space.contracted else 1.0
+
+    def _see(self, origins: Array, directions: Any, offsets: Any, background: Color) -> tuple[Seen, Seen | None]:
+        """What rays see of the grid, and of the spheres behind it; origins (R, 3) are on the host."""
+        upload, behind, shown, inside = self.device.upload, None, background, origins
+        if self._spheres is not None:
+            inside = origins / self._edge + 0.5
+            there = upload("origins", origins), directions, offsets, self._spheres.cells
+            behind = self._spheres.see(self.stages.spheres(*there, self.space.near), directions, background)
+            shown = behind.image.rgb
+        there = upload("origins", inside), directions, offsets, self._grid.cells
+        return self._grid.see(self.stages.march(*there, self._marching), directions, shown), behind
 
     def step(self, batch: Batch, progress: float) -> float:
         """See `Field`."""
         while self._events < len(EVENTS) and progress >= EVENTS[self._events][0]:
-            self._prune()
-            if EVENTS[self._events][1] == "refine" and self._resolved():
-                self._refine()
+            self._change(EVENTS[self._events][1] == "refine")
             self._events += 1
         self.iteration += 1
-        upload, stages = self.device.upload, self.stages
-        offsets = stream(self.seed, "offsets of samples", self.iteration).uniform(size=len(batch.origins))
-        rays = upload("origins", batch.origins), upload("directions", batch.directions)
-        samples = stages.march(*rays, upload("offsets", offsets), self._occupied, self._marching)
-        if not samples.total:  # nothing is left in the way of these rays
-            return float(np.mean((np.array(batch.background) - batch.colors) ** 2))
-        self._rays = int(np.clip(len(offsets) * self.samples / samples.total, 64, RAYS_MAX))
-        features = stages.voxels_fwd(samples.positions, self._index, self.table)
-        head = features, rays[1], samples.rays_of, self._density_scale
-        sigmas, colors = stages.heads_sh_fwd(*head)
-        composited = sigmas, colors, samples.deltas, samples.first, batch.background
-        image = stages.rays_fwd(*composited)
-        errors = image.rgb.get() - batch.colors
-        v_rgb = upload("v_rgb", errors * (2 / errors.size))
-        v_features = stages.heads_sh_bwd(*head, *stages.rays_bwd(*composited, image.transmittances, v_rgb))
-        self._descend(samples, v_features, progress)
+        upload, count = self.device.upload, len(batch.origins)
+        offsets = stream(self.seed, "offsets of samples", self.iteration).uniform(size=count)
+        rays = batch.origins, upload("directions", batch.directions), upload("offsets", offsets)
+        seen, behind = self._see(*rays, batch.background)
+        total = seen.samples.total + (behind.samples.total if behind else 0)
+        if total:
+            self._rays = int(np.clip(count * self.samples / total, 64, RAYS_MAX))
+        errors = seen.image.rgb.get() - batch.colors
+        v_rgb, rate = errors * (2 / errors.size), (RATE_FINAL / RATE) ** progress
+        # Smoothing has a part of the training where there is a background; 0 in the first step.
+        part = progress / max(1, self.iteration - 1) if self.space.contracted else 1.0
+        if seen.samples.total:
+            gradient, scale = self._grid.gradient(seen, upload("v_rgb", v_rgb)), len(self._grid.occupied) / TV_CELLS
+            weights = part * scale * self._variation[0] / 2, part * scale * self._variation[1]
+            self._grid.descend(gradient, weights, RATE * rate, self.iteration)
+        if self._spheres is not None and behind is not None and behind.samples.total:
+            v_behind = v_rgb * seen.image.behind.get()[:, None]
+            gradient = self._spheres.gradient(behind, upload("v_rgb", v_behind))
+            weights = part * SPHERE_TV_DENSITY, part * SPHERE_TV_COLOR
+            self._spheres.descend(gradient, weights, SPHERE_RATE * rate, self.iteration)
         return float(np.mean(errors**2))
 
-    def _descend(self, samples: Samples, v_features: Any, progress: float) -> None:
-        rows = self.table.shape[0]
-        gradient = self.stages.voxels_bwd(samples.positions, self._index, rows, v_features)
-        count = -(-rows // TV_SHARE)
-        scale = len(self.occupied) / TV_CELLS / count
-        density, harmonics = self._variation
-        if self.space.contracted:
-            part = progress / max(1, self.iteration - 1)  # of the training in a step; 0 in the first one
-            density, harmonics = part * density, part * harmonics
-        weights = density * scale * self._density_scale / 2, harmonics * scale
-        variation = self._index, self._corners, self.table, gradient
-        self.stages.voxels_tv(*variation, weights, self.iteration * count % rows, count)
-        rate = RATE * (RATE_FINAL / RATE) ** progress
-        step = AdamStep(self.iteration, {}, 0.0, BETA2, EPS, 0)
-        # With beta1 = 0 the mean of the gradients is the gradient, which is where it is already.
-        self.stages.adam_array(self.table, gradient, gradient, self._squares, rate, step, sparse=True)
+    def _change(self, refine: bool) -> None:
+        """Prune the grid and the spheres, and refine them."""
+        self._grid.prune(OCCUPIED_DEPTH * len(self._grid.occupied) / STEP_CELLS)
+        if refine and self._resolved():
+            self._grid.refine()
+        if self._spheres is not None:
+            self._spheres.prune(OCCUPIED_DEPTH * len(self._spheres.occupied))
+            if refine:
+                self._spheres.refine()
 
     def _resolved(self) -> bool:
         """Whether the photos' pixels are small enough for cells of half the edge."""
-        return self.space.edge / (2 * len(self.occupied)) >= CELL_PIXELS * self.space.pixel
-
-    def _prune(self) -> None:
-        """Keep the cells with a dense corner, and those around them."""
-        from scipy.ndimage import maximum_filter
-
-        cells, table = len(self.occupied), self.table.get()
-        densities = np.zeros((cells + 1) ** 3, np.float32)
-        densities[self.corners] = self._density_scale * table[:, 0]
-        dense = densities.reshape((cells + 1,) * 3) * (STEP_CELLS / cells) > OCCUPIED_DEPTH
-        kept = maximum_filter(cells_of(dense), 3, mode="constant") & (self.occupied != 0)
-        if not kept.any():  # a field that is empty may still become dense
-            return
-        rows = corners_of(kept).reshape(-1)[self.corners]
-        self._place(kept.astype(np.uint8), table[rows])
-
-    def _refine(self) -> None:
-        """Divide each cell by two along each axis; new corners are interpolated."""
-        occupied = self.occupied
-        for axis in range(3):
-            occupied = np.repeat(occupied, 2, axis=axis)
-        places = np.argwhere(corners_of(occupied))[:, ::-1] / len(occupied)
-        positions = self.device.upload("positions", places)
-        self._place(occupied, self.stages.voxels_fwd(positions, self._index, self.table).get())
+        return self._edge / (2 * len(self._grid.occupied)) >= CELL_PIXELS * self.space.pixel
 
     def colors(self, rays: Rays, background: Color) -> Any:
         """See `Field`."""
         offsets = self.device.upload("offsets", np.full(len(rays.radii), 0.5))
-        samples = self.stages.march(*rays[:2], offsets, self._occupied, self._marching)
-        features = self.stages.voxels_fwd(samples.positions, self._index, self.table)
-        sigmas, colors = self.stages.heads_sh_fwd(features, rays.directions, samples.rays_of, self._density_scale)
-        return self.stages.rays_fwd(sigmas, colors, samples.deltas, samples.first, background).rgb
+        return self._see(rays.origins.get(), rays.directions, offsets, background)[0].image.rgb
+
+    def _parts(self) -> dict[str, SparseGrid]:
+        """The grid and the spheres, with the beginnings of the names of their arrays."""
+        return {"": self._grid} | ({} if self._spheres is None else {"spheres_": self._spheres})
 
     def model(self) -> dict[str, Array]:
         """See `Field`."""
-        shape = np.array(len(self.occupied))
-        return {"table": self.table.get(), "cells": shape, "occupied": np.packbits(self.occupied)}
+        return {start + name: array for start, part in self._parts().items() for name, array in part.model().items()}
 
     def optimiser(self) -> dict[str, Array]:
         """See `Field`."""
-        return {"squares": self._squares.get(), "counters": np.array([self._rays, self._events])}
+        squares = {f"{start}squares": part.squares.get() for start, part in self._parts().items()}
+        return squares | {"counters": np.array([self._rays, self._events])}
 
     def restore(self, arrays: dict[str, Array]) -> None:
         """See `Field`."""
-        cells = int(arrays["cells"])
-        occupied = np.unpackbits(arrays["occupied"])[: cells**3].reshape((cells,) * 3)
-        self._place(occupied, arrays["table"])
-        if "squares" in arrays:
-            self._squares = self.device.upload("squares", arrays["squares"])
+        for start, part in self._parts().items():
+            part.restore(*(arrays[start + name] for name in ("table", "cells", "occupied")))
+            if f"{start}squares" in arrays:
+                part.squares = self.device.upload("squares", arrays[f"{start}squares"])
+        if "counters" in arrays:
             self._rays, self._events = map(int, arrays["counters"])
 
     def finish(self) -> None:
-        """Round the table to half precision. The paper's code stores harmonics in it, too."""
-        self.table.set(self.table.get().astype(np.float16).astype(self.device.real))
+        """Round the tables to half precision. The paper's code stores harmonics in it, too."""
+        for part in self._parts().values():
+            part.round()
 
 
-def corners_of(occupied: Array) -> NDArray[np.bool_]:
-    """Corners (N + 1, N + 1, N + 1) of the occupied cells (N, N, N)."""
-    corners = np.zeros(tuple(n + 1 for n in occupied.shape), bool)
-    n = len(occupied)
-    for k in range(8):
-        z, y, x = k >> 2, k >> 1 & 1, k & 1
-        corners[z : z + n, y : y + n, x : x + n] |= occupied != 0
-    return corners
-
-
-def cells_of(corners: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells (N, N, N) with at least one of the corners (N + 1, N + 1, N + 1)."""
-    n = len(corners) - 1
-    cells = np.zeros((n,) * 3, bool)
-    for k in range(8):
-        z, y, x = k >> 2, k >> 1 & 1, k & 1
-        cells |= corners[z : z + n, y : y + n, x : x + n]
-    return cells
+def in_ball(cells: int) -> NDArray[np.uint8]:
+    """Cells (N, N, N) of a cube whose middle lies in the ball that the cube encloses."""
+    middles = (np.arange(cells) + 0.5) / cells * 2 - 1
+    z, y, x = np.meshgrid(middles, middles, middles, indexing="ij")
+    return (x**2 + y**2 + z**2 < 1).astype(np.uint8)

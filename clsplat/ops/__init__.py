@@ -43,6 +43,7 @@ from clsplat.ops.rays import rays_bwd, rays_distortion, rays_fwd
 from clsplat.ops.removal import removal, removal_residuals, removal_sums
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
+from clsplat.ops.spheres import spheres
 from clsplat.ops.sweep import sweep_best, sweep_similarities
 from clsplat.ops.take import take_rows
 from clsplat.ops.voxels import voxels_bwd, voxels_fwd, voxels_tv
@@ -102,6 +103,7 @@ class Launches:
         self.mlp_fwd = partial(mlp_fwd, device)
         self.mlp_bwd = partial(mlp_bwd, device)
         self.march = partial(march, device)
+        self.spheres = partial(spheres, device)
         self.heads_join = partial(heads_join, device)
         self.heads_fwd = partial(heads_fwd, device)
         self.heads_bwd = partial(heads_bwd, device)

@@ -89,8 +89,9 @@ def heads_sh_fwd(
 
     Parameters
     ----------
-    features : (S, 28) real
-        A density, of which the positive part counts, and nine coefficients of spherical harmonics of each colour.
+    features : (S, 28) or (S, 4) real
+        A density, of which the positive part counts, and the coefficients of spherical harmonics of each colour: nine
+        of degree 2, or one of degree 0.
     directions : (R, 3) real
         Of the rays; of length 1.
     rays_of : (S,) uint32
@@ -104,9 +105,9 @@ def heads_sh_fwd(
     colors : (S, 3) real
         At least 0.
     """
-    samples = features.shape[0]
+    samples, width = features.shape
     sigmas, colors = device.empty("sigmas", samples), device.empty("colours of samples", (samples, 3))
-    arguments = [samples, float(density_scale), features, directions, rays_of, sigmas, colors]
+    arguments = [samples, width // 3, float(density_scale), features, directions, rays_of, sigmas, colors]
     device.launch("heads", "heads_sh_fwd", (samples,), arguments, defines=DEFINES)
     return sigmas, colors
 
@@ -120,10 +121,20 @@ def heads_sh_bwd(
     v_sigmas: Array,
     v_colors: Array,
 ) -> Array:
-    """Gradient of `heads_sh_fwd` with respect to the features, (S, 28), from v_sigmas (S,) and v_colors (S, 3)."""
-    samples = features.shape[0]
+    """Gradient of `heads_sh_fwd` with respect to the features, from v_sigmas (S,) and v_colors (S, 3)."""
+    samples, width = features.shape
     v_features = device.empty("v_features", features.shape)
-    arguments = [samples, float(density_scale), features, directions, rays_of, v_sigmas, v_colors, v_features]
+    arguments = [
+        samples,
+        width // 3,
+        float(density_scale),
+        features,
+        directions,
+        rays_of,
+        v_sigmas,
+        v_colors,
+        v_features,
+    ]
     device.launch("heads", "heads_sh_bwd", (samples,), arguments, defines=DEFINES)
     return v_features
 

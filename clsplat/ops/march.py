@@ -40,10 +40,15 @@ def march(
     counts = device.empty("samples of rays", rays, np.uint32)
     device.launch("march", "march_count", (rays,), [*shared, counts], defines=defines)
     first, total = exclusive_scan(device, counts, "samples of rays")
-    if not total:  # drivers refuse empty buffers: one sample of no length, which no ray has
-        positions, deltas = device.upload("positions", np.zeros((1, 3))), device.upload("deltas", np.zeros(1))
-        return Samples(positions, deltas, device.upload("rays of samples", [0], np.uint32), first, 0)
+    if not total:
+        return no_samples(device, first)
     positions, deltas = device.empty("positions", (total, 3)), device.empty("deltas", total)
     rays_of = device.empty("rays of samples", total, np.uint32)
     device.launch("march", "march_samples", (rays,), [*shared, first, positions, deltas, rays_of], defines=defines)
     return Samples(positions, deltas, rays_of, first, total)
+
+
+def no_samples(device: Device, first: Array) -> Samples:
+    """One sample of no length, which no ray has: drivers refuse empty buffers."""
+    positions, deltas = device.upload("positions", np.zeros((1, 3))), device.upload("deltas", np.zeros(1))
+    return Samples(positions, deltas, device.upload("rays of samples", [0], np.uint32), first, 0)

@@ -2,10 +2,18 @@
 
 from typing import Any
 
+import numpy as np
 from pyopencl.array import Array
 
 from clsplat.device import Device
 from clsplat.field_stages import RayColors
+
+
+def _behind(device: Device, background: Any) -> list[Any]:
+    """Whether each ray has a background of its own, and the backgrounds."""
+    if isinstance(background, Array):
+        return [1, background]
+    return [0, device.upload("background", np.reshape(background, (1, 3)))]
 
 
 def rays_fwd(device: Device, sigmas: Array, colors: Array, deltas: Array, first: Array, background: Any) -> RayColors:
@@ -20,8 +28,8 @@ def rays_fwd(device: Device, sigmas: Array, colors: Array, deltas: Array, first:
         Lengths of the segments that the samples stand for.
     first : (R + 1,) uint32
         Ray r has the samples first[r] to first[r + 1].
-    background : (3,) floats on the host
-        Colour behind all samples.
+    background : (3,) floats on the host, or (R, 3) real on the device
+        Colour behind all samples, of all rays or of each.
 
     Returns
     -------
@@ -30,7 +38,7 @@ def rays_fwd(device: Device, sigmas: Array, colors: Array, deltas: Array, first:
     rays = first.shape[0] - 1
     rgb, behind = device.empty("colours of rays", (rays, 3)), device.empty("behind rays", rays)
     transmittances = device.empty("transmittances", sigmas.shape[0])
-    arguments = [rays, *map(float, background), sigmas, colors, deltas, first, rgb, transmittances, behind]
+    arguments = [rays, *_behind(device, background), sigmas, colors, deltas, first, rgb, transmittances, behind]
     device.launch("rays", "rays_fwd", (rays,), arguments)
     return RayColors(rgb, transmittances, behind)
 
@@ -65,7 +73,7 @@ def rays_bwd(
     v_sigmas, v_colors = device.empty("v_sigmas", sigmas.shape), device.empty("v_colors", colors.shape)
     arguments = [
         rays,
-        *map(float, background),
+        *_behind(device, background),
         sigmas,
         colors,
         deltas,

@@ -14,6 +14,11 @@ def _defines(table: Array) -> dict[str, Any]:
     return {"FEATURES": table.shape[1], "TV_EPS": TV_EPS}
 
 
+def _cells(index: Array) -> list[int]:
+    """Cells along x, y and z."""
+    return [corners - 1 for corners in index.shape[::-1]]
+
+
 def voxels_fwd(device: Device, positions: Array, index: Array, table: Array) -> Array:
     """Interpolate the corners of a sparse grid at points (Fridovich-Keil et al. 2022, section 3.1).
 
@@ -21,9 +26,9 @@ def voxels_fwd(device: Device, positions: Array, index: Array, table: Array) -> 
     ----------
     positions : (S, 3) real
         In [0, 1]; points outside are moved to the border.
-    index : (N + 1, N + 1, N + 1) uint32
-        Row in `table` of each corner [z, y, x] of the N^3 cells. Those without one, whose features are 0, have
-        `clsplat.field_stages.NO_ROW`.
+    index : (nz + 1, ny + 1, nx + 1) uint32
+        Row in `table` of each corner [z, y, x] of the cells. Those without one, whose features are 0, have
+        `clsplat.field_stages.NO_ROW`. A grid is closed if its last corners along x have the rows of the first ones.
     table : (M, F) real
 
     Returns
@@ -32,7 +37,7 @@ def voxels_fwd(device: Device, positions: Array, index: Array, table: Array) -> 
     """
     points = positions.shape[0]
     features = device.empty("features", (points, table.shape[1]))
-    arguments = [points, index.shape[0] - 1, positions, index, table, features]
+    arguments = [points, *_cells(index), positions, index, table, features]
     device.launch("voxels", "voxels_fwd", (points,), arguments, defines=_defines(table))
     return features
 
@@ -52,19 +57,19 @@ def voxels_bwd(device: Device, positions: Array, index: Array, rows: int, v_feat
     -------
     v_table : (rows, F) real
     """
-    points, cells, defines = positions.shape[0], index.shape[0] - 1, _defines(v_features)
+    points, cells, defines = positions.shape[0], _cells(index), _defines(v_features)
     v_table = device.empty("v_table", (rows, v_features.shape[1]))
     if device.is_cpu:
         parts = device.cl_device.max_compute_units
-        arguments = [points, cells, rows, parts, positions, index, v_features, v_table]
+        arguments = [points, *cells, rows, parts, positions, index, v_features, v_table]
         device.launch("voxels", "voxels_bwd", (parts,), arguments, defines=defines, group=(1,))
         return v_table
     device.launch("voxels", "voxels_zero", (v_table.size,), [v_table.size, v_table], defines=defines)
     keys = device.empty("rows of corners", 8 * points, np.uint32)
-    arguments = [points, cells, rows, positions, index, keys]
+    arguments = [points, *cells, rows, positions, index, keys]
     device.launch("voxels", "voxels_keys", (points,), arguments, defines=defines)
     sorted_keys, order = argsort(device, keys, rows.bit_length())
-    arguments = [8 * points, cells, rows, positions, v_features, sorted_keys, order, v_table]
+    arguments = [8 * points, *cells, rows, positions, v_features, sorted_keys, order, v_table]
     device.launch("voxels", "voxels_sums", (8 * points,), arguments, defines=defines)
     return v_table
 
@@ -86,7 +91,7 @@ def voxels_tv(
     index, table
         As given to `voxels_fwd`.
     corners : (M,) uint32
-        Place of the corner of each row in the flat `index`.
+        Place of the corner of each row in the flat `index`; the first one, where a grid is closed.
     v_table : (M, F) real
         Gradient, to which is added.
     weights : two floats
@@ -94,7 +99,7 @@ def voxels_tv(
     first, count : int
         The rows first to first + count, at most M of them; after the last row follows the first one.
     """
-    rows, cells = table.shape[0], index.shape[0] - 1
-    scalars = [rows, cells, first, count, float(weights[0]), float(weights[1])]
+    rows = table.shape[0]
+    scalars = [rows, *_cells(index), first, count, float(weights[0]), float(weights[1])]
     arguments = [*scalars, index, corners, table, v_table]
     device.launch("voxels", "voxels_tv", (count,), arguments, defines=_defines(table))

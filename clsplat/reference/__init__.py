@@ -40,6 +40,7 @@ from clsplat.reference.rays import rays_bwd, rays_distortion, rays_fwd
 from clsplat.reference.removal import removal, removal_residuals, removal_sums
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
+from clsplat.reference.spheres import spheres
 from clsplat.reference.sweep import sweep_best, sweep_similarities
 from clsplat.reference.take import take_rows
 from clsplat.reference.voxels import voxels_bwd, voxels_fwd, voxels_tv

@@ -37,9 +37,9 @@ def heads_join_bwd(v_inputs: Array, features: Array, sigmas: Array, v_sigmas: Ar
 
 
 def _sh_colors(features: Array, directions: Array, rays_of: Array) -> tuple[Array, Array]:
-    """Basis (S, 9), and colours (S, 3) before the limit at 0."""
-    basis = sh_basis(directions, 2)[rays_of]
-    return basis, 0.5 + np.einsum("sb,skb->sk", basis, features[:, 1:].reshape(-1, 3, 9))
+    """Basis (S, 9) or (S, 1), and colours (S, 3) before the limit at 0."""
+    basis = sh_basis(directions, 2 if features.shape[1] == 28 else 0)[rays_of]
+    return basis, 0.5 + np.einsum("sb,skb->sk", basis, features[:, 1:].reshape(len(features), 3, -1))
 
 
 def heads_sh_fwd(features: Array, directions: Array, rays_of: Array, density_scale: float) -> tuple[Array, Array]:
@@ -60,7 +60,7 @@ def heads_sh_bwd(
     basis, colors = _sh_colors(features, directions, rays_of)
     v_density = np.where(features[:, 0] > 0, density_scale * v_sigmas, 0)
     v_harmonics = np.where(colors > 0, v_colors, 0)[:, :, None] * basis[:, None]
-    return np.concatenate([v_density[:, None], v_harmonics.reshape(-1, 27)], axis=1)
+    return np.concatenate([v_density[:, None], v_harmonics.reshape(len(features), -1)], axis=1)
 
 
 def heads_soft_fwd(features: Array, outputs: Array, density_scale: float) -> tuple[Array, Array]:

@@ -14,6 +14,7 @@ Array = NDArray[Any]
 def rays_fwd(sigmas: Array, colors: Array, deltas: Array, first: Array, background: Any) -> RayColors:
     """Composite the samples of rays. Arguments and result as for `clsplat.ops.rays_fwd`."""
     rays = len(first) - 1
+    backgrounds = np.broadcast_to(background, (rays, 3))
     rgb, transmittances, behind = np.zeros((rays, 3)), np.zeros(len(sigmas)), np.ones(rays)
     for r in range(rays):
         own = slice(int(first[r]), int(first[r + 1]))
@@ -23,7 +24,7 @@ def rays_fwd(sigmas: Array, colors: Array, deltas: Array, first: Array, backgrou
         transmittances[own] = np.where(drawn, reaching[:-1], 0)
         behind[r] = reaching[drawn.sum()]
         weights = transmittances[own] * -np.expm1(-depths)
-        rgb[r] = weights @ colors[own] + behind[r] * np.asarray(background, np.float64)
+        rgb[r] = weights @ colors[own] + behind[r] * backgrounds[r]
     return RayColors(rgb, transmittances, behind)
 
 
@@ -38,8 +39,8 @@ def rays_bwd(
 ) -> tuple[Array, Array]:
     """Gradients of `rays_fwd`. Arguments and results as for `clsplat.ops.rays_bwd`."""
     v_sigmas, v_colors = np.zeros(len(sigmas)), np.zeros((len(sigmas), 3))
-    for r in range(len(first) - 1):
-        seen = np.asarray(background, np.float64)
+    backgrounds = np.broadcast_to(background, (len(first) - 1, 3))
+    for r, seen in enumerate(backgrounds):
         for i in reversed(range(int(first[r]), int(first[r + 1]))):
             if transmittances[i] == 0:
                 continue

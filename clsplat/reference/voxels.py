@@ -12,7 +12,7 @@ Array = NDArray[Any]
 
 def _corners(positions: Array, index: Array) -> tuple[Array, Array]:
     """Rows (S, 8) of the corners of each point's cell, and their weights (S, 8)."""
-    cells = len(index) - 1
+    cells = np.array(index.shape[::-1]) - 1
     x = np.clip(positions, 0, 1) * cells
     places = np.minimum(x.astype(np.int64), cells - 1)
     sides = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)])
@@ -48,19 +48,17 @@ def voxels_tv(
     count: int,
 ) -> None:
     """Add the gradient of the total variation. Arguments as for `clsplat.ops.voxels_tv`."""
-    known = index != NO_ROW
-    values = np.where(known[..., None], table[np.where(known, index, 0)], 0)
-    differences = np.zeros((3, *values.shape))
-    for axis in range(3):
-        # The corner after the last one of an axis does not exist.
-        after = np.roll(known, -1, axis=2 - axis)
-        np.moveaxis(after, 2 - axis, 0)[-1] = False
-        step = np.roll(values, -1, axis=2 - axis) - values
-        differences[axis] = np.where((known & after)[..., None], step, 0)
+    places, gradient = np.stack(np.unravel_index(corners, index.shape)), np.zeros(table.shape)
+    after, differences = np.full((3, len(table)), NO_ROW, np.int64), np.zeros((3, *table.shape))
+    for axis, step in enumerate(np.eye(3, dtype=int)[::-1, :, None]):  # x is the last axis of `index`
+        inside = (places + step < np.array(index.shape)[:, None]).all(axis=0)
+        after[axis, inside] = index[tuple((places + step)[:, inside])]
+        known = after[axis] != NO_ROW
+        differences[axis, known] = table[after[axis, known]] - table[known]
     slopes = differences / np.sqrt((differences**2).sum(axis=0) + TV_EPS)
-    gradient = -slopes.sum(axis=0)
     for axis in range(3):
-        gradient += np.roll(slopes[axis], 1, axis=2 - axis)
+        known = after[axis] != NO_ROW
+        gradient[known] -= slopes[axis, known]
+        np.add.at(gradient, after[axis, known], slopes[axis, known])
     own = (first + np.arange(count)) % len(table)
-    scale = np.where(np.arange(table.shape[1]) == 0, weights[0], weights[1])
-    v_table[own] += scale * gradient.reshape(-1, table.shape[1])[corners[own]]
+    v_table[own] += np.where(np.arange(table.shape[1]) == 0, weights[0], weights[1]) * gradient[own]

@@ -11,12 +11,11 @@ from small_fields import SmallIngp, SmallMipNerf360, SmallNerf, SmallPlenoxels
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.dataset.near_planes import NEAR_SHARE
 from clsplat.errors import InputError
-from clsplat.fields import METHODS
+from clsplat.fields import METHODS, plenoxels
 from clsplat.fields.field_files import MODEL, load_checkpoint, load_field
 from clsplat.fields.field_training import CHECKPOINT, train_field
 from clsplat.fields.occupancy import FULL_UPDATES, SHARE, THRESHOLD, Occupancy
 from clsplat.fields.pixels import Pixels
-from clsplat.fields.plenoxels import SPACE_DENSITY_SCALE, SPACE_TV_DENSITY, SPACE_TV_HARMONICS, TV_CELLS
 from clsplat.fields.space import FAR, Space
 from clsplat.metrics import psnr, to_uint8
 from clsplat.randomness import stream
@@ -27,6 +26,10 @@ CONFIG = TrainConfig(iterations=250, data=DataConfig(background="white"))
 
 SMALL = [SmallIngp, SmallPlenoxels, SmallNerf, SmallMipNerf360]
 EACH = pytest.mark.parametrize("method", SMALL, ids=lambda m: m.name)
+
+CASES = [*((method, False) for method in SMALL), (SmallPlenoxels, True)]
+ALL = pytest.mark.parametrize(("method", "room"), CASES, ids=lambda v: v.name if isinstance(v, type) else f"room={v}")
+"""All methods without a background, and the one with it whose model then has other arrays."""
 
 
 @pytest.fixture(autouse=True)
@@ -53,6 +56,14 @@ def test_a_ball_is_learned(device, scene, method, tmp_path):
     assert losses[-1] < 0.1 * losses[0]
 
 
+def test_the_spheres_learn_a_room(device, tmp_path, monkeypatch):
+    """Plenoxels: the ball in the middle, and a wall outside of the grid. A contracted grid had 14 dB."""
+    monkeypatch.setattr(SmallPlenoxels, "cells", 16)
+    room = ball(room=True)
+    field = train_field(room, SmallPlenoxels, CONFIG, tmp_path, device)
+    assert quality(field, room.test) > 15
+
+
 @pytest.mark.parametrize("method", [SmallNerf, SmallMipNerf360], ids=lambda m: m.name)
 def test_a_room_is_learned(device, method, tmp_path):
     """Contracted space: the ball in the middle and a wall three times as far as the cameras, in held-out photos.
@@ -65,9 +76,9 @@ def test_a_room_is_learned(device, method, tmp_path):
     assert quality(field, room.test) > 17
 
 
-@EACH
-def test_runs_repeat_and_resume_to_the_bit(device, scene, method, tmp_path):
-    config = replace(CONFIG, iterations=40)
+@ALL
+def test_runs_repeat_and_resume_to_the_bit(device, method, room, tmp_path):
+    config, scene = replace(CONFIG, iterations=40), ball(room=room)
     folders = [tmp_path / name for name in ("whole", "again", "interrupted")]
     for folder in folders:
         folder.mkdir()
@@ -89,8 +100,9 @@ def test_runs_repeat_and_resume_to_the_bit(device, scene, method, tmp_path):
     ]  # fmt: skip
 
 
-@EACH
-def test_the_file_renders_what_was_trained(device, scene, method, tmp_path):
+@ALL
+def test_the_file_renders_what_was_trained(device, method, room, tmp_path):
+    scene = ball(room=room)
     field = train_field(scene, method, replace(CONFIG, iterations=20), tmp_path, device)
     loaded = load_field(tmp_path / MODEL, {method.name: method}, device)
     camera = scene.test[0].camera
@@ -111,7 +123,7 @@ def test_rays_without_samples_see_the_background(device, scene, monkeypatch):
     field = SmallPlenoxels(Space.of(scene.train), device, 0)
     occupied = np.zeros((8, 8, 8), np.uint8)
     occupied[0, 0, 0] = 1
-    field._place(occupied, np.zeros((8, 28)))
+    field._grid.place(occupied, np.zeros((8, 28)))
     image = field.image(scene.test[0].camera, WHITE)
     np.testing.assert_array_equal(image, np.ones_like(image))
 
@@ -120,31 +132,37 @@ def test_cells_are_refined_while_pixels_are_smaller(device, scene):
     """A pixel of these photos is 1/40 of the cube wide in its middle: 16 cells are allowed, 32 are not."""
     field = SmallPlenoxels(Space.of(scene.train), device, 0)
     assert field._resolved()
-    field._place(np.ones((16, 16, 16), np.uint8), np.zeros((17**3, 28)))
+    field._grid.place(np.ones((16, 16, 16), np.uint8), np.zeros((17**3, 28)))
     assert not field._resolved()
 
 
 def test_trainings_of_any_length_smooth_as_much(device, monkeypatch):
-    """Plenoxels in contracted space: the weights of the total variation, summed over the steps but the first."""
+    """Plenoxels with a background: the weights of the total variation, summed over the steps but the first."""
     room = ball(room=True)
     space = Space.of(room.train)
     assert space.contracted
     pixels = Pixels(room.train, space, WHITE)
     for steps in (4, 8):
-        field, weights = SmallPlenoxels(space, device, 0), []
+        field, weights = SmallPlenoxels(space, device, 0), {28: [], 4: []}
 
-        def recorded(*arguments, smooth=field.stages.voxels_tv, field=field, weights=weights):
-            # Weights are divided by the number of corners in a visit, and multiplied by that of cells on an edge.
-            weights.append(np.multiply(arguments[4], arguments[6] * TV_CELLS / len(field.occupied)))
+        def recorded(*arguments, smooth=field.stages.voxels_tv, weights=weights):
+            # Weights are divided by the number of corners in a visit.
+            weights[arguments[2].shape[1]].append(np.multiply(arguments[4], arguments[6]))
             return smooth(*arguments)
 
         monkeypatch.setattr(field.stages, "voxels_tv", recorded)
+        monkeypatch.setattr(plenoxels, "EVENTS", ())  # all steps have cells of one size
         for i in range(steps):
             field.step(pixels.draw(stream(0, "pixels of a batch", i), field.rays), i / steps)
         monkeypatch.undo()
-        density, harmonics = np.sum(weights, axis=0) * steps / (steps - 1)
-        assert harmonics == pytest.approx(SPACE_TV_HARMONICS)
-        assert density == pytest.approx(SPACE_TV_DENSITY * SPACE_DENSITY_SCALE / 2)
+        size = len(field._grid.occupied) / plenoxels.TV_CELLS
+        expected = {
+            28: (size * plenoxels.SPACE_TV_DENSITY * plenoxels.SPACE_DENSITY_SCALE / 2,
+                 size * plenoxels.SPACE_TV_HARMONICS),
+            4: (plenoxels.SPHERE_TV_DENSITY * plenoxels.SPHERE_DENSITY_SCALE, plenoxels.SPHERE_TV_COLOR),
+        }  # fmt: skip
+        for features, found in weights.items():
+            np.testing.assert_allclose(np.sum(found, axis=0) * steps / (steps - 1), expected[features])
 
 
 def test_the_finest_level_has_the_resolution_of_the_photos(device, scene):

@@ -49,7 +49,7 @@ FIELDS = ("tests/fields/test_layers.py", "tests/fields/test_fields.py")
 
 FIELD_STAGES = (
     *("encode", "frustums", "hashgrid", "heads", "histograms", "intervals", "march", "mlp", "mlp_cpu", "mlp_gpu"),
-    *("mlp_sums", "rays", "spans", "voxels", "weights"),
+    *("mlp_sums", "rays", "spans", "spheres", "voxels", "weights"),
 )
 """Stems of files that only radiance fields use."""
 
