@@ -14,7 +14,7 @@
         *m = adam->keep1 * *m + adam->take1 * g;                                                                     \
         *v = adam->keep2 * *v + adam->take2 * (g * g);                                                               \
         const real##N mean = *v * adam->inv_correction2;                                                             \
-        return p - rates * (*m / (ROOT##N(mean) + adam->eps));                                                   \
+        return p - rates * (*m / (ROOT##N(mean) + adam->eps));                                                       \
     }
 
 // Gradient by ln(scales) of max(-ln(erank - 1 + slack), 0), with erank = exp(entropy of s^2 / sum of s^2) (Hyung et

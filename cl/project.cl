@@ -672,8 +672,8 @@ __kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const 
                 const size_t begin = 3 * ((i + lane) * sh_stride + first);
                 for (int k = 0; k < CHUNKS; ++k) {
                     const reals number = LANE_NUMBERS + (3 * first + LANES * k);
-                    update_whole_chunk(&adam, number < 3 ? sh0 : sh_rest, values[LANES * k + lane],
-                                       begin + LANES * k, of_sh);
+                    update_whole_chunk(&adam, number < 3 ? sh0 : sh_rest, values[LANES * k + lane], begin + LANES * k,
+                                       of_sh);
                 }
             }
             continue;
