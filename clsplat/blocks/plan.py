@@ -222,7 +222,8 @@ def make_plan(coarse: Gaussians, scene: Scene, config: TrainConfig, renderer: Re
             f"{config.blocks}; use fewer blocks"
         )
     fewest = max(config.few.below, FEWEST_PHOTOS)  # so that a block may search its size
-    ground = _Ground(coarse.means, survey(renderer, coarse, scene.train), total, fewest, need, usable)
+    fitting = config.blocks == "auto"
+    ground = _Ground(coarse.means, survey(renderer, coarse, scene.train), total, fewest, need, usable, fitting)
     if config.blocks == "auto":
         cuts = _fitting(ground, -(-total // max(1, need.most_gaussians(usable))), most)
     else:
@@ -236,7 +237,7 @@ class _Ground(NamedTuple):
 
     means (N, 3): of the coarse Gaussians; surveyed (V, N): their weights in the photos; total: expected Gaussians of
     the scene; fewest: photos that a block has at least; need: memory of training without surroundings; limit: bytes
-    that a block may take.
+    that a block may take; fitting: whether blocks must fit, as their number is found by that.
     """
 
     means: NDArray[np.float64]
@@ -245,6 +246,7 @@ class _Ground(NamedTuple):
     fewest: int
     need: Footprint
     limit: int
+    fitting: bool
 
 
 def _fitting(ground: _Ground, least: int, most: int) -> list[list[Block]]:
@@ -274,8 +276,11 @@ def _fitting(ground: _Ground, least: int, most: int) -> list[list[Block]]:
 
 def _cuts(ground: _Ground, count: int) -> tuple[list[list[Block]], int]:
     """Cut a scene into blocks, and again with other borders; find the bytes of the block that takes most."""
-    found = [_cut(ground, count, between) for between in (False, True)]
-    return [blocks for blocks, _ in found], max(memory for _, memory in found)
+    blocks, memory = _cut(ground, count, between=False)
+    if memory > ground.limit and ground.fitting:
+        return [blocks], memory  # nobody needs the other cut
+    between, other = _cut(ground, count, between=True)
+    return [blocks, between], max(memory, other)
 
 
 def _cut(ground: _Ground, count: int, between: bool) -> tuple[list[Block], int]:

@@ -45,9 +45,9 @@ Array = NDArray[np.float64]
 
 
 def boxes(run: Path) -> list[Any]:
-    """The boxes of a run's blocks, each once."""
-    jobs = [path for path in sorted((run / BLOCKS).glob("*.json")) if not path.name.startswith("coarse")]
-    return sorted({read_job(path).box for path in jobs})
+    """The boxes of a run's blocks in the first and the last trainings."""
+    paths = [path for path in sorted((run / BLOCKS).glob("*.json")) if not path.name.startswith("coarse")]
+    return sorted(job.box for job in map(read_job, paths) if job.scene == job.far)
 
 
 def shares(gaussians: Gaussians, cut: list[Any], renderer: Renderer, view: View) -> Array:
