@@ -4,9 +4,6 @@
 //                                                         (Max 1995, "Optical models"; Mildenhall et al. 2020, eq. 3)
 //   B_i, the colour behind sample i:  B_last = background,  B_{i-1} = alpha_i c_i + (1 - alpha_i) B_i
 //   v_c_i = T_i alpha_i v_C,  v_sigma_i = delta_i T_{i+1} v_C . (c_i - B_i)
-// The distortion of a ray with the weights w_i = T_i alpha_i and the middles m_i of its segments, laid end to end
-// (Barron et al. 2022, equation 15), is sum_ij w_i w_j |m_i - m_j| + (1/3) sum_i w_i^2 delta_i:
-//   v_w_i = 2 sum_j w_j |m_i - m_j| + (2/3) w_i delta_i,  v_sigma_i = delta_i (T_{i+1} v_w_i - sum_{j > i} w_j v_w_j)
 // A ray ends before the first sample with T_i <= TRANSMITTANCE_MIN. Samples behind its end have no gradient.
 // See docs/stages/rays.md; clsplat/reference/rays.py is the twin.
 //
@@ -16,8 +13,7 @@
 // Buffers, R rays, S samples: in background[R,3], or [1,3] of all rays without `separate`; sigmas[S] 1/length,
 //   colors[S,3], deltas[S] length, first[R+1] u32: ray r has the samples first[r] to first[r + 1], front to back; out
 //   rgb[R,3], transmittances[S] (T_i, 0 behind the end), behind[R] (T_end). Backward: in v_rgb[R,3]; out v_sigmas[S],
-//   v_colors[S,3]. Distortion: out losses[R], between pulls[S], in and out v_sigmas[S], to which the gradient times
-//   `scale` is added.
+//   v_colors[S,3].
 #include "common.h"
 
 __kernel void rays_fwd(const uint rays, const uint separate, const __global real *background,
@@ -61,37 +57,4 @@ __kernel void rays_bwd(const uint rays, const uint separate, const __global real
         if (transmittance > 0)
             seen = alpha * color + onward * seen;
     }
-}
-
-// Distances of middles: sum_{j < i} w_j (m_i - m_j) grows from sample to sample, and the same from behind.
-__kernel void rays_distortion(const uint rays, const real scale, const __global real *sigmas,
-                              const __global real *deltas, const __global uint *first,
-                              const __global real *transmittances, __global real *losses, __global real *pulls,
-                              __global real *v_sigmas) {
-    const size_t r = get_global_id(0);
-    if (r >= rays)
-        return;
-    const uint begin = first[r], end = first[r + 1];
-    real sum = 0, pull = 0;
-    for (uint i = begin; i < end; ++i) {
-        pulls[i] = pull;
-        sum += transmittances[i] * -expm1(-sigmas[i] * deltas[i]);
-        if (i + 1 < end)
-            pull += sum * (deltas[i] + deltas[i + 1]) / 2;
-    }
-    real loss = 0, behind = 0; // behind: the sum of w_j v_w_j
-    sum = pull = 0;
-    for (uint i = end; i-- > begin;) {
-        const real depth = sigmas[i] * deltas[i], transmittance = transmittances[i];
-        const real weight = transmittance * -expm1(-depth), own = weight * deltas[i] / 3;
-        const real apart = pulls[i] + pull, v_weight = 2 * (apart + own);
-        loss += weight * (apart + own);
-        if (transmittance > 0)
-            v_sigmas[i] += scale * deltas[i] * (transmittance * exp(-depth) * v_weight - behind);
-        behind += weight * v_weight;
-        sum += weight;
-        if (i > begin)
-            pull += sum * (deltas[i] + deltas[i - 1]) / 2;
-    }
-    losses[r] = loss;
 }

@@ -216,6 +216,3 @@ class FieldStages(Protocol):
         transmittances: Array,
         v_rgb: Array,
     ) -> tuple[Array, Array]: ...
-    def rays_distortion(
-        self, sigmas: Array, deltas: Array, first: Array, transmittances: Array, scale: float, v_sigmas: Array
-    ) -> Array: ...

@@ -33,10 +33,6 @@ RATE, SPACE_RATE, RATE_FALL = 1e-2, 2e-2, 30.0
 """Learning rates at the start, in the unit cube (Müller et al. 2022, section 4) and where there is a background, and
 by what they are divided at the end; exponential in between, over a training of any length."""
 
-DISTORTION = 0.01
-"""Weight of the distortion loss where there is a background: that of Barron et al. 2022, section 4. Müller et al.
-2022 have none. Effect: docs/howto/fields.md."""
-
 BETA1, BETA2, EPS = 0.9, 0.99, 1e-15
 """Constants of Adam (Müller et al. 2022, section 4)."""
 
@@ -116,9 +112,6 @@ class IngpBase(Field):
         errors = image.rgb.get() - batch.colors
         v_rgb = upload("v_rgb", errors * (2 / errors.size))
         v_sigmas, v_colors = self.stages.rays_bwd(*composited, image.transmittances, v_rgb)
-        if self.space.contracted:
-            weights = run.sigmas, samples.deltas, samples.first, image.transmittances
-            self.stages.rays_distortion(*weights, DISTORTION / len(errors), v_sigmas)
         self._descend(samples, run, v_sigmas, v_colors, progress)
         return float(np.mean(errors**2))
 

@@ -39,7 +39,7 @@ from clsplat.ops.mlp import mlp_bwd, mlp_fwd
 from clsplat.ops.noise import add_noise
 from clsplat.ops.observe import add_column, observe
 from clsplat.ops.project import join_rows, project_bwd, project_bwd_adam, project_disparities, project_fwd
-from clsplat.ops.rays import rays_bwd, rays_distortion, rays_fwd
+from clsplat.ops.rays import rays_bwd, rays_fwd
 from clsplat.ops.removal import removal, removal_residuals, removal_sums
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
@@ -97,7 +97,6 @@ class Launches:
     def _add_fields(self, device: Device) -> None:
         self.rays_fwd = partial(rays_fwd, device)
         self.rays_bwd = partial(rays_bwd, device)
-        self.rays_distortion = partial(rays_distortion, device)
         self.hashgrid_fwd = partial(hashgrid_fwd, device)
         self.hashgrid_bwd = partial(hashgrid_bwd, device)
         self.mlp_fwd = partial(mlp_fwd, device)

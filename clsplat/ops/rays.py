@@ -85,32 +85,3 @@ def rays_bwd(
     ]
     device.launch("rays", "rays_bwd", (rays,), arguments)
     return v_sigmas, v_colors
-
-
-def rays_distortion(
-    device: Device, sigmas: Array, deltas: Array, first: Array, transmittances: Array, scale: float, v_sigmas: Array
-) -> Array:
-    """Loss of weights that are spread along rays (Barron et al. 2022, equation 15), for any number of samples.
-
-    Samples are laid end to end: lengths between them, in which a grid has no occupied cells, do not count.
-
-    Parameters
-    ----------
-    sigmas, deltas, first
-        As given to `rays_fwd`.
-    transmittances : (S,) real
-        As returned by `rays_fwd`.
-    scale : float
-        Factor on the gradient.
-    v_sigmas : (S,) real
-        The gradient of the sum of the losses with respect to the densities, times `scale`, is added to it.
-
-    Returns
-    -------
-    losses : (R,) real
-    """
-    rays = first.shape[0] - 1
-    losses, pulls = device.empty("losses of rays", rays), device.empty("pulls", sigmas.shape)
-    arguments = [rays, float(scale), sigmas, deltas, first, transmittances, losses, pulls, v_sigmas]
-    device.launch("rays", "rays_distortion", (rays,), arguments)
-    return losses

@@ -36,7 +36,7 @@ from clsplat.reference.mlp import mlp_bwd, mlp_fwd
 from clsplat.reference.noise import add_noise
 from clsplat.reference.observe import add_column, observe
 from clsplat.reference.project import join_rows, project_bwd, project_bwd_adam, project_disparities, project_fwd
-from clsplat.reference.rays import rays_bwd, rays_distortion, rays_fwd
+from clsplat.reference.rays import rays_bwd, rays_fwd
 from clsplat.reference.removal import removal, removal_residuals, removal_sums
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments

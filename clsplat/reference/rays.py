@@ -49,20 +49,3 @@ def rays_bwd(
             v_sigmas[i] = deltas[i] * transmittances[i] * (1 - alpha) * (v_rgb[r] @ (colors[i] - seen))
             seen = alpha * colors[i] + (1 - alpha) * seen
     return v_sigmas, v_colors
-
-
-def rays_distortion(
-    sigmas: Array, deltas: Array, first: Array, transmittances: Array, scale: float, v_sigmas: Array
-) -> Array:
-    """Loss of the spread of weights. Arguments and result as for `clsplat.ops.rays_distortion`."""
-    losses = np.zeros(len(first) - 1)
-    for r in range(len(losses)):
-        own = slice(int(first[r]), int(first[r + 1]))
-        d, depths, reaching = deltas[own], sigmas[own] * deltas[own], transmittances[own]
-        w, middles = reaching * -np.expm1(-depths), np.cumsum(d) - d / 2
-        apart = np.abs(middles[:, None] - middles) @ w
-        losses[r] = w @ (apart + w * d / 3)
-        v_w = 2 * (apart + w * d / 3)
-        behind = np.triu(np.ones((len(w), len(w))), 1) @ (w * v_w)
-        v_sigmas[own] += np.where(reaching > 0, scale * d * (reaching * np.exp(-depths) * v_w - behind), 0)
-    return losses
