@@ -27,7 +27,7 @@ def test_the_longest_axis_is_cut_and_single_points_do_not_count() -> None:
 
 
 @pytest.mark.parametrize("sides", [(9, 1, 1), (3, 3, 1)])
-@pytest.mark.parametrize("count", [2, 4, 9])
+@pytest.mark.parametrize("count", [2, 4, 9, 32])
 def test_the_other_cut_has_its_borders_in_the_boxes_of_the_usual_one(sides: tuple[int, ...], count: int) -> None:
     """What is near a border of one cut is mostly in the middle of a box of the other one."""
     points = np.random.default_rng(0).uniform(size=(20_000, 3)) * sides
@@ -37,11 +37,12 @@ def test_the_other_cut_has_its_borders_in_the_boxes_of_the_usual_one(sides: tupl
         inside = np.array([box.contains(points) for box in boxes])
         assert (inside.sum(axis=0) == 1).all() and len(boxes) == count + between
         shares = [0.5, *[1] * (count - 1), 0.5] if between else [1] * count
-        np.testing.assert_allclose(inside.sum(axis=1), 20_000 / count * np.array(shares), rtol=0.01)
+        np.testing.assert_allclose(inside.sum(axis=1), 20_000 / count * np.array(shares), rtol=0.02)
         wide = np.array([box.widened(points, MARGIN).contains(points) for box in boxes])
         near.append(wide.sum(axis=0) > 1)
-    # If the borders were independent of each other, this would be the product of the shares.
-    assert np.mean(near[0] & near[1]) < 0.6 * near[0].mean()
+    # Up to a third, as if the borders were independent of each other. If the other cut, too, divided boxes at half of
+    # their parts, it would be three quarters for 32 boxes.
+    assert np.mean(near[0] & near[1]) < 0.4 * near[0].mean()
 
 
 def test_boxes_cost_the_same() -> None:
