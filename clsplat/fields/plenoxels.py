@@ -121,10 +121,10 @@ class Plenoxels(Field):
             around = np.ones((SPHERES // 4, longitudes // 2, longitudes), np.uint8)
             outer = np.array([SPHERE_FIRST_DENSITY / SPHERE_DENSITY_SCALE, 0, 0, 0])
             args = self.stages, device, around, outer, SPHERE_DENSITY_SCALE
-            self._spheres = SparseGrid.uniform(*args, closed=True)
+            self._spheres = SparseGrid(*args, closed=True)
         row[0] = first / scale
         occupied = in_ball(cells) if space.contracted else np.ones((cells,) * 3, np.uint8)
-        self._grid = SparseGrid.uniform(self.stages, device, occupied, row, scale)
+        self._grid = SparseGrid(self.stages, device, occupied, row, scale)
 
     @property
     def rays(self) -> int:
@@ -174,7 +174,7 @@ class Plenoxels(Field):
             gradient, scale = self._grid.gradient(seen, upload("v_rgb", v_rgb)), len(self._grid.occupied) / TV_CELLS
             weights = part * scale * self._variation[0] / 2, part * scale * self._variation[1]
             self._grid.descend(gradient, weights, RATE * rate, self.iteration)
-        if self._spheres is not None and behind is not None and behind.samples.total:
+        if self._spheres is not None and behind and behind.samples.total:
             v_behind = v_rgb * seen.image.behind.get()[:, None]
             gradient = self._spheres.gradient(behind, upload("v_rgb", v_behind))
             weights = part * SPHERE_TV_DENSITY, part * SPHERE_TV_COLOR

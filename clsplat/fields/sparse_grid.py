@@ -38,8 +38,8 @@ class SparseGrid:
     stages : Launches
     device : Device
     occupied : (nz, ny, nx) uint8
-    table : (M, F) real
-        Rows of the corners of occupied cells, in the order of the corners.
+    row : (F,)
+        Features of all corners at the start.
     density_scale : float
         Density of a stored value of 1.
     closed : bool
@@ -59,28 +59,14 @@ class SparseGrid:
         stages: "Launches",
         device: "Device",
         occupied: NDArray[np.uint8],
-        table: Array,
+        row: Array,
         density_scale: float,
         *,
         closed: bool = False,
     ):
         self._stages, self._device, self._closed, self.density_scale = stages, device, closed, density_scale
-        self.place(occupied, table)
-
-    @classmethod
-    def uniform(
-        cls,
-        stages: "Launches",
-        device: "Device",
-        occupied: NDArray[np.uint8],
-        row: Array,
-        density_scale: float,
-        *,
-        closed: bool = False,
-    ) -> "SparseGrid":
-        """Make a grid with the same row (F,) at all corners."""
         rows = int(corners_of(occupied, closed=closed).sum())
-        return cls(stages, device, occupied, np.tile(row, (rows, 1)), density_scale, closed=closed)
+        self.place(occupied, np.tile(row, (rows, 1)))
 
     def place(self, occupied: NDArray[np.uint8], table: Array) -> None:
         """Set the occupied cells and the rows of their corners, in the order of the corners."""
