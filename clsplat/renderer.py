@@ -224,6 +224,18 @@ class Renderer:
         image = self.stages.composite_fwd(drawn, bins, behind, compositor=config.compositor, disparities=disparities)
         return Pass(gaussians, camera, degree, splats, drawn, bins, image, disparities, dropout, inverse)
 
+    def recolored(self, run: Pass, colors: Any) -> Image:
+        """Composite the splats of a forward pass with other colours, on black.
+
+        Parameters
+        ----------
+        run : Pass
+        colors : (M, 3) array
+            Of all splats that the pass has drawn, where the stages run.
+        """
+        drawn, options = run.drawn._replace(colors=colors), {"compositor": self.config.compositor}
+        return self.stages.composite_fwd(drawn, run.bins, np.zeros(3), disparities=run.disparities, **options)
+
     def _project(
         self, gaussians: Gaussians, camera: Camera, sh_degree: int, channels: int, inverse: bool
     ) -> AnySplats:

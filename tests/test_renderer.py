@@ -7,6 +7,7 @@ import clsplat.device
 from clsplat import Renderer, render
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
+from clsplat.constants import SH_C0
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
@@ -109,3 +110,22 @@ def test_tiles_are_large_where_a_work_item_has_one_and_vectors_are_wide(width, i
     device.vector_width, device.is_cpu = width, is_cpu  # shadow the cached properties
     camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, 1, 0), 50, 40, 30)
     assert Renderer(device, RenderConfig(**settings)).tile_size(camera) == size
+
+
+@pytest.mark.parametrize("where", ["device", "reference"])
+@pytest.mark.parametrize("sort", ["auto", "pixel"])
+def test_a_pass_in_other_colours_is_that_of_gaussians_with_them(device, where, sort):
+    gaussians, camera = synthetic_scene(30)
+    renderer = Renderer(device if where == "device" else "reference", RenderConfig(sort=sort), (0.2, 0.5, 0.1))
+    white = np.random.default_rng(0).random(30) < 0.5
+    sh = np.repeat(np.where(white, 0.5, -0.5) / SH_C0, 3).reshape(30, 1, 3)
+    marked = Gaussians(**gaussians.arrays() | {"sh": sh})
+    black = Renderer(renderer.device or "reference", renderer.config)
+    expected = black.forward(marked.astype(np.float32), camera).image
+
+    marks = renderer.upload("marks", np.repeat(white[:, None], 3, axis=1))
+    found = renderer.recolored(renderer.forward(gaussians.astype(np.float32), camera), marks)
+    # Colours of exactly 0 and 1 instead of those of harmonics in single precision.
+    np.testing.assert_allclose(download(found.rgb), download(expected.rgb), atol=1e-6)
+    np.testing.assert_array_equal(download(found.alpha), download(expected.alpha))
+    assert 0.1 < download(found.rgb).max() <= 1

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,9 +13,10 @@ from numpy.typing import NDArray
 from clsplat.atomic import replacing
 from clsplat.blocks.jobs import Job, read_job
 from clsplat.blocks.partition import EVERYWHERE
-from clsplat.blocks.parts import Part, bounds_of, read_index, read_part, seen_in
-from clsplat.blocks.sight import seen
+from clsplat.blocks.parts import Part, bounds_of, read_index, read_part
+from clsplat.blocks.sight import Bounds, looking_at, seen
 from clsplat.blocks.survey import seen_by_block
+from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset import load_scene, read_depth_maps
 from clsplat.errors import ClsplatError
@@ -116,22 +118,25 @@ def _loaded(job: Job) -> list[View]:
     return read_depth_maps([view for view in views if view.name in job.photos], job.data, job.config.data)
 
 
-def needed_parts(job_file: Path, job: Job) -> Iterator[tuple[bool, Part]]:
-    """Yield the parts of scenes that a block trains or its photos may show, and whether the part's Gaussians are used
-    in the surroundings that are drawn as they were trained, or beyond them; in their order.
+def needed_parts(job_file: Path, job: Job) -> Iterator[tuple[bool, Part, list[Camera]]]:
+    """Yield the parts of scenes that a block trains or its photos may show, in their order: whether the part's
+    Gaussians are used in the surroundings that are drawn as they were trained, or beyond them; the part; and the
+    cameras that may show it.
 
     Raises
     ------
     InputError
         If an index cannot be read or has been changed.
     """
+    cameras = job.posed()
     for near in (True,) if job.near == EVERYWHERE else (True, False):
         parts = read_index(job_file.with_name(job.scene if near else job.far))
         bounds = bounds_of(parts)
-        wanted = job.wide.meets(bounds.low, bounds.high) | seen(job.posed(), bounds, job.config.render)
+        looking = looking_at(cameras, bounds, job.config.render)
+        wanted = job.wide.meets(bounds.low, bounds.high) | looking.any(axis=0)
         if near:
             wanted &= job.near.meets(bounds.low, bounds.high)
-        yield from ((near, part) for part, needed in zip(parts, wanted, strict=True) if needed)
+        yield from ((near, parts[k], [*compress(cameras, looking[:, k])]) for k in np.flatnonzero(wanted))
 
 
 def points_of(job_file: Path, job: Job) -> list[Part]:
@@ -147,11 +152,11 @@ def points_of(job_file: Path, job: Job) -> list[Part]:
 
 def _start(job_file: Path, job: Job) -> Gaussians:
     """The Gaussians from which a block starts, and those around it that its photos may show, in their order."""
-    cameras, coefficients, found = job.posed(), (job.config.init.sh_degree + 1) ** 2, []
-    for near, part in needed_parts(job_file, job):
+    coefficients, found = (job.config.init.sh_degree + 1) ** 2, []
+    for near, part, cameras in needed_parts(job_file, job):
         gaussians = with_coefficients(read_part(job_file.parent, part), coefficients)
         here = gaussians.take(job.near.contains(gaussians.means) == near)
-        found.append(here.take(job.wide.contains(here.means) | seen_in(part, here, cameras, job.config.render)))
+        found.append(here.take(job.wide.contains(here.means) | seen(cameras, Bounds.of(here), job.config.render)))
     return Gaussians.concatenate(found)
 
 

@@ -5,18 +5,15 @@ checked when it is read, and the others need not be read. The rows stay in the f
 """
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
 from clsplat.blocks.jobs import digest_of
-from clsplat.blocks.sight import Bounds, may_see, seen
-from clsplat.camera import Camera
-from clsplat.config import RenderConfig
+from clsplat.blocks.sight import Bounds
 from clsplat.errors import InputError
 from clsplat.formats.ply import REQUIRED, names_of, to_gaussians, with_coefficients
 from clsplat.formats.ply_parts import PlyParts
@@ -121,12 +118,6 @@ def read_index(path: Path) -> list[Part]:
 def bounds_of(parts: list[Part]) -> Bounds:
     """Bounds of parts."""
     return Bounds(*(np.array([part[k] for part in parts], np.float64) for k in (-3, -2, -1)))
-
-
-def seen_in(part: Part, gaussians: Gaussians, cameras: Iterable[Camera], config: RenderConfig) -> NDArray[np.bool_]:
-    """Whether a photo of any camera may show each of the Gaussians (N,) of a part, or of some of them."""
-    looking = [camera for camera in cameras if may_see(camera, bounds_of([part]), config)[0]]
-    return seen(looking, Bounds.of(gaussians), config)
 
 
 def read_part(folder: Path, part: Part) -> Gaussians:

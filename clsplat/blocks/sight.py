@@ -48,6 +48,12 @@ class Bounds(NamedTuple):
         return Bounds(self.low[rows], self.high[rows], self.radius[rows])
 
 
+def looking_at(cameras: Iterable[Camera], bounds: Bounds, config: RenderConfig) -> NDArray[np.bool_]:
+    """Whether each of C cameras may show something in each of N boxes, (C, N)."""
+    rows = [may_see(camera, bounds, config) for camera in cameras]
+    return np.array(rows, bool).reshape(len(rows), len(bounds.radius))
+
+
 def seen(cameras: Iterable[Camera], bounds: Bounds, config: RenderConfig) -> NDArray[np.bool_]:
     """Whether a photo of any camera may show something in each box, (N,)."""
     found = np.zeros(len(bounds.radius), bool)
@@ -123,7 +129,8 @@ def _in_frustum(camera: Camera, bounds: Bounds, rays: bool) -> NDArray[np.bool_]
 
 def _least(normal: Array, bounds: Bounds) -> Array:
     """Least products of a vector (3,) and the points of boxes, (N,)."""
-    return np.asarray(np.where(normal > 0, bounds.low, bounds.high) @ normal)
+    corner = [(bounds.low if sign > 0 else bounds.high)[:, axis] for axis, sign in enumerate(normal)]
+    return np.asarray(normal[0] * corner[0] + normal[1] * corner[1] + normal[2] * corner[2])
 
 
 def _in_cone(camera: Camera, bounds: Bounds) -> NDArray[np.bool_]:

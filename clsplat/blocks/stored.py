@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.blocks.parts import bounds_of, parts_of, read_part, seen_in
-from clsplat.blocks.sight import seen
+from clsplat.blocks.parts import bounds_of, parts_of, read_part
+from clsplat.blocks.sight import Bounds, looking_at, seen
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
@@ -36,6 +36,7 @@ class StoredScene:
 
     def __init__(self, path: Path):
         self._folder, self._parts = path.parent, list(parts_of(path))
+        self._bounds = bounds_of(self._parts)
         self._none = read_part(self._folder, self._parts[0]).take(np.zeros(0, int))
 
     def __len__(self) -> int:
@@ -54,26 +55,26 @@ class StoredScene:
         InputError
             If the file cannot be read or has been changed.
         """
-        cameras = list(cameras)
-        for first in range(0, len(cameras), BATCH):
-            yield from self._shown(renderer, cameras[first : first + BATCH])
-
-    def _shown(self, renderer: Renderer, cameras: list[Camera]) -> Iterator[tuple[list[Camera], Gaussians]]:
-        gaussians = self._read(renderer, cameras)
-        if gaussians is not None:
-            yield cameras, gaussians
-            return
-        half = len(cameras) // 2
-        yield from self._shown(renderer, cameras[:half])
-        yield from self._shown(renderer, cameras[half:])
+        cameras, count, fitted = list(cameras), BATCH, 0
+        while cameras:
+            gaussians = self._read(renderer, cameras[:count])
+            if gaussians is None:
+                count, fitted = min(count, len(cameras)) // 2, 0
+                continue
+            yield cameras[:count], gaussians
+            cameras, fitted = cameras[count:], fitted + 1
+            if fitted % 2 == 0:  # a batch that does not fit is read in vain
+                count = min(BATCH, 2 * count)
 
     def _read(self, renderer: Renderer, cameras: list[Camera]) -> Gaussians | None:
         """Read the Gaussians that cameras may show; None if there are several cameras, and too many Gaussians."""
         most = np.inf if renderer.device is None or len(cameras) == 1 else SHARE * renderer.device.memory_limit
         found, size = [self._none], 0
-        for part in compress(self._parts, seen(cameras, bounds_of(self._parts), renderer.config)):
-            gaussians = read_part(self._folder, part)
-            found.append(gaussians.take(seen_in(part, gaussians, cameras, renderer.config)))
+        looking = looking_at(cameras, self._bounds, renderer.config)
+        for k in np.flatnonzero(looking.any(axis=0)):
+            gaussians = read_part(self._folder, self._parts[k])
+            some = compress(cameras, looking[:, k])
+            found.append(gaussians.take(seen(some, Bounds.of(gaussians), renderer.config)))
             size += sum(array.nbytes for array in found[-1].arrays().values())
             if size > most:
                 return None

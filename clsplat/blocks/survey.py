@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.blocks.sight import Bounds, seen
-from clsplat.constants import ALPHA_MIN, SH_C0
+from clsplat.constants import ALPHA_MIN
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.renderer import Pass, Renderer, download
@@ -164,20 +164,19 @@ def seen_by_block(
     shown : (N,) bool
         The Gaussians that have a weight in any of them.
     """
-    black = Renderer(renderer.device or "reference", renderer.config)
     shown = np.zeros(len(gaussians), bool)
     result = []
     for some, rows in _batches(renderer, gaussians, views, len(gaussians) if most is None else most):
-        drawn = gaussians.take(rows)
-        placed, marks = renderer.place(drawn), renderer.place(marks_of(drawn, trains[rows]))
+        placed = renderer.place(gaussians.take(rows))
+        marks = renderer.upload("marks", np.repeat(trains[rows, None], 3, axis=1))
         for view in in_turn(some):
             run = renderer.forward(placed, view.camera)
             shown[rows[_weights(renderer, run, view.mask) > 0]] = True
             image = np.clip(download(run.image.rgb), 0, 1, dtype=np.float64)
-            del run  # the next image needs its memory
-            marked = black.forward(marks, view.camera, gradients=False).image
+            marked = renderer.recolored(run, marks)
             share = download(marked.rgb)[:, :, :1] / np.maximum(download(marked.alpha)[:, :, None], ALPHA_MIN)
             blended = image + np.clip(share, 0, 1) * (view.image / 255 - image)
+            del run, marked  # the next image needs their memory
             made = replace(view, image=to_uint8(blended))
             result.append(made) if keep is None else keep(made)
         del placed, marks
@@ -197,9 +196,3 @@ def _batches(
     half = len(views) // 2
     yield from _batches(renderer, gaussians, views[:half], most)
     yield from _batches(renderer, gaussians, views[half:], most)
-
-
-def marks_of(gaussians: Gaussians, trains: NDArray[np.bool_]) -> Gaussians:
-    """The Gaussians in white where they train and in black elsewhere, without view dependence."""
-    color = np.where(trains, 0.5, -0.5) / SH_C0
-    return replace(gaussians, sh=np.repeat(color[:, None, None], 3, axis=2).astype(gaussians.sh.dtype))

@@ -293,7 +293,7 @@ def train_from(desk: str, name: str, folder: Path) -> None:
         job = read_job(job_file)
         for scene in {job.scene, job.far, job.points} - {""}:
             cache.file(scene)
-        for part in chain((part for _, part in needed_parts(job_file, job)), points_of(job_file, job)):
+        for part in chain((part for _, part, _ in needed_parts(job_file, job)), points_of(job_file, job)):
             cache.rows(part)
         result = train_block(job_file, cache.photos(job))
         cache.send(log_of(job_file))

@@ -240,10 +240,7 @@ def to_gaussians(path: str | Path, data: Array, names: list[str], first: int = 0
     InputError
         If a value is not finite.
     """
-    from numpy.lib.recfunctions import structured_to_unstructured
-
-    with np.errstate(over="ignore"):  # values that overflow float32 are rejected below
-        table = structured_to_unstructured(data[names], dtype=np.float32)
+    table = _table(data, names)
     means, sh0, opacity, log_scales, quats, rest = np.split(table, np.cumsum([3, 3, 1, 3, 4]), axis=1)
     np.copyto(opacity, np.copysign(np.float32(LOGIT_MAX), opacity), where=np.isinf(opacity))
     log_scales[np.isneginf(log_scales)] = LOG_SCALE_MIN
@@ -253,6 +250,18 @@ def to_gaussians(path: str | Path, data: Array, names: list[str], first: int = 0
     sh = np.concatenate([sh0[:, None], rest.reshape(n, 3, -1).transpose(0, 2, 1)], axis=1)
     gaussians = Gaussians(means, log_scales, normalised(quats), opacity[:, 0], sh)
     return gaussians.astype(np.float32)
+
+
+def _table(data: Array, names: list[str]) -> Array:
+    """Fields of a structured array (N,) as columns of float32."""
+    from numpy.lib.recfunctions import structured_to_unstructured
+
+    stored = data.dtype.names or ()
+    if data.dtype == np.dtype([(name, np.float32) for name in stored]):  # what most programs write
+        columns = [stored.index(name) for name in names]
+        return np.take(data.view(np.float32).reshape(len(data), -1), columns, axis=1)
+    with np.errstate(over="ignore"):  # values that overflow float32 are rejected later
+        return structured_to_unstructured(data[names], dtype=np.float32)
 
 
 def comments_of(mode: Mode, offset: ArrayLike | None) -> list[str]:

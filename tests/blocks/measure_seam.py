@@ -21,7 +21,6 @@ from PIL import Image
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from clsplat.blocks.jobs import read_job
-from clsplat.blocks.survey import marks_of
 from clsplat.blocks.whole import BLOCKS
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset import load_scene
@@ -52,9 +51,10 @@ def boxes(run: Path) -> list[Any]:
 
 def shares(gaussians: Gaussians, cut: list[Any], renderer: Renderer, view: View) -> Array:
     """Shares (B, H, W) of blocks in the compositing weight of pixels."""
-    black, found = Renderer(renderer.device, renderer.config), []
+    run, found = renderer.forward(gaussians, view.camera, gradients=False), []
     for box in cut:
-        image = black.forward(marks_of(gaussians, box.contains(gaussians.means)), view.camera, gradients=False).image
+        marks = np.repeat(box.contains(gaussians.means)[:, None], 3, axis=1)
+        image = renderer.recolored(run, renderer.upload("marks", marks))
         found.append(np.asarray(download(image.rgb)[:, :, 0], np.float64))
     return np.array(found) / np.maximum(np.sum(found, axis=0), 1e-6)
 

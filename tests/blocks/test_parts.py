@@ -81,8 +81,7 @@ def test_a_second_training_reads_what_its_photos_show(
 
     second = replace(job, scene=both.name).write(folder)
     with monkeypatch.context() as everything:
-        for module in ("block", "parts"):
-            everything.setattr(f"clsplat.blocks.{module}.seen", lambda cameras, bounds, config: bounds.radius > 0)
+        everything.setattr("clsplat.blocks.sight.may_see", lambda camera, bounds, config: bounds.radius > 0)
         expected = train_block(second, planned.scene.train, device).read_bytes()
     result_of(second).unlink()
     (folder / "hidden.ply").unlink()

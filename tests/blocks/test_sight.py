@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from clsplat.blocks.sight import Bounds, may_see, seen
+from clsplat.blocks.sight import Bounds, looking_at, may_see, seen
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
 from clsplat.gaussians import Gaussians
@@ -83,6 +83,9 @@ def test_infinite_sizes_are_seen() -> None:
 
 def test_any_of_several_cameras_sees() -> None:
     bounds, cameras = Bounds.of(scattered(0)), [camera(k, "pinhole", 1.2) for k in range(3)]
-    each = [may_see(one, bounds, RenderConfig()) for one in cameras]
+    each = looking_at(cameras, bounds, RenderConfig())
+    for one, found in zip(cameras, each, strict=True):
+        np.testing.assert_array_equal(found, may_see(one, bounds, RenderConfig()))
+    assert looking_at([], bounds, RenderConfig()).shape == (0, len(bounds.radius))
     np.testing.assert_array_equal(seen(cameras, bounds, RenderConfig()), np.logical_or.reduce(each))
     assert (each[0] != each[1]).any()
