@@ -4,8 +4,8 @@ Usage: python tests/blocks/measure_town.py FOLDER -o RESULT.json COUNT [COUNT ..
 
 For each COUNT, ray traces photos of a town that grows with them into FOLDER, and trains it by `clsplat train
 --blocks auto` in a process of its own. The memory limit is the same for all: a third of what the scene of `FIRST`
-photos needs. Each photo has `VISITS` iterations instead of the usual number. Counts that RESULT.json has are not
-measured again, and an interrupted training goes on.
+photos needs. A block trains the usual number of iterations for its photos, without a fewest number, which is for
+scenes of few photos. Counts that RESULT.json has are not measured again, and an interrupted training goes on.
 """
 
 import argparse
@@ -35,12 +35,6 @@ PER_PHOTO = 300
 FIRST = 100
 """Photos of the scene that needs three times the limit."""
 
-VISITS = 6
-"""Iterations for each photo: a fifth of the usual number, which is enough to measure what each takes."""
-
-EVERY = 10
-"""Iterations between two rounds of growth, so that there are as many rounds as in a training of the usual length."""
-
 
 def limit() -> int:
     """Bytes of device memory."""
@@ -53,13 +47,12 @@ def train(data: Path, out: Path, count: int) -> None:
     from clsplat import cli
     from clsplat.training import run_length
 
-    run_length.VISITS, run_length.FEWEST_ITERATIONS = VISITS, 1
+    run_length.FEWEST_ITERATIONS = 1
     resume = ["--resume"] if (out / BLOCKS).exists() else []
     settings = {
         "blocks": "auto",
         "size": "fixed",
         "max-gaussians": count * PER_PHOTO,
-        "error.every": EVERY,
         "memory-limit": f"{limit() / 1e6}MB",
     }
     flags = [word for name, value in settings.items() for word in (f"--{name}", str(value))]

@@ -207,8 +207,7 @@ def test_a_second_training_is_surrounded_by_the_first_ones(
     near = planned.plan.between[0].wide
     path = planned.again([block._replace(near=near) for block in planned.plan.between])[0]
     far = read_scene(path.with_name(job.far), 1)
-    for module in ("block", "parts"):
-        monkeypatch.setattr(f"clsplat.blocks.{module}.seen", lambda cameras, bounds, config: bounds.radius > 0)
+    monkeypatch.setattr("clsplat.blocks.sight.may_see", lambda camera, bounds, config: bounds.radius > 0)
     start = _start(path, read_job(path))
     inside = near.contains(first.means)
     np.testing.assert_array_equal(
