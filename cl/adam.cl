@@ -7,7 +7,8 @@
 //
 // The penalties of the sums of all opacities and scales add o (1 - o) to the gradients of the logits, and the scale
 // to the gradients of its logarithm. The third penalty depends on the effective ranks (adam.h). For it, runs of
-// ln(scales) consist of whole rows. Each penalty is 0 for the other fields.
+// ln(scales) consist of whole rows. Each penalty is 0 for the other fields, and for Gaussians that are not shown:
+// those with extents[N,2] of 0, unless extents is NULL.
 //
 // adam_array takes a step on an array of any parameters, in runs of `run` values. With `sparse`, parameters without a
 // gradient stay as they are, and so do their moments (Müller et al. 2022, section 4).
@@ -53,8 +54,9 @@ static inline void adam_update_some(const Adam *adam, real16 rates, int count, r
 
 __kernel void adam_step(const uint total, const uint stride, const uint width, const uint split,
                         const real split_rate, const real rate, const real opacity_penalty, const real scale_penalty,
-                        const real erank_penalty, const Adam adam, __global real *parameters,
-                        const __global real *gradients, __global real *first, __global real *second) {
+                        const real erank_penalty, const Adam adam, const uint row, const __global real *extents,
+                        __global real *parameters, const __global real *gradients, __global real *first,
+                        __global real *second) {
     const size_t begin = get_global_id(0) * stride;
     if (begin >= total)
         return;
@@ -67,18 +69,26 @@ __kernel void adam_step(const uint total, const uint stride, const uint width, c
     for (size_t i = begin; i < end; i += 16, rates = rate) {
         const int count = LESSER((size_t)16, end - i);
         real16 g = load_some(gradients + i, count);
+        real16 shown = 1;
+        if (extents && (opacity_penalty != 0 || scale_penalty != 0 || erank_penalty != 0))
+#pragma unroll
+            for (int k = 0; k < 16; ++k)
+                if (k < count)
+                    ((real *)&shown)[k] = extents[2 * ((i + k) / row)] > 0;
         if (opacity_penalty != 0 || scale_penalty != 0) {
             const real16 p = load_some(parameters + i, count);
             // o (1 - o) for the logit p of o, even in p
             const real16 below = -ABSOLUTE(p), e = OF16(exp, below);
-            g += opacity_penalty * e / ((1 + e) * (1 + e)) + (scale_penalty != 0 ? scale_penalty * OF16(exp, p) : 0);
+            const real16 of_scales = scale_penalty != 0 ? scale_penalty * OF16(exp, p) : 0;
+            g += shown > 0 ? opacity_penalty * e / ((1 + e) * (1 + e)) + of_scales : 0; // not infinity times 0
         }
         // In this case, runs consist of whole rows.
 #pragma unroll
         for (int k = 0; k < 15; k += 3) {
             if (erank_penalty == 0 || k + 3 > count)
                 continue;
-            const real3 v = erank_penalty * erank_vjp(load3(parameters + i, k / 3), adam.erank_slack);
+            const real weight = erank_penalty * ((const real *)&shown)[k];
+            const real3 v = weight * erank_vjp(load3(parameters + i, k / 3), adam.erank_slack);
             ((real *)&g)[k] += v.x;
             ((real *)&g)[k + 1] += v.y;
             ((real *)&g)[k + 2] += v.z;

@@ -633,13 +633,20 @@ __kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const 
 #endif
     if (i >= n)
         return;
+    const reals zero = 0;
+    const masks shown = load_vectors2(extents, i, n).x > zero; // others would fade before a photo shows them
     if (adam.opacity_penalty != 0 || adam.scale_penalty != 0) {
         const Activated activated = activate(load_vectors3(log_scales, i, n), load_numbers(logit_opacities, i, n));
-        v.logit_opacity += adam.opacity_penalty * activated.opacity * (1 - activated.opacity);
-        v.log_scales = plus3(v.log_scales, scaled3(adam.scale_penalty, activated.scales));
+        const reals3 of_scales = scaled3(adam.scale_penalty, activated.scales);
+        v.logit_opacity += shown ? adam.opacity_penalty * activated.opacity * (1 - activated.opacity) : zero;
+        v.log_scales.x += shown ? of_scales.x : zero;
+        v.log_scales.y += shown ? of_scales.y : zero;
+        v.log_scales.z += shown ? of_scales.z : zero;
     }
     if (adam.erank_penalty != 0) {
         for (int lane = 0; lane < LANES && i + lane < n; ++lane) {
+            if (!(extents[2 * (i + lane)] > 0))
+                continue;
             const real3 penalty = adam.erank_penalty * erank_vjp(load3(log_scales, i + lane), adam.erank_slack);
             ((real *)&v.log_scales.x)[lane] += penalty.x;
             ((real *)&v.log_scales.y)[lane] += penalty.y;

@@ -172,9 +172,10 @@ class AdamStep(NamedTuple):
     """One step of the optimiser: its number, counted from 1, and its constants.
 
     rates: learning rate by field of `clsplat.gaussians.Gaussians`, with sh0 and sh_rest instead of sh. sh_degree: the
-    bands above it have had no gradient yet and do not change. penalties: weights in the loss of the sum
-    of all opacities, of that of all scales, and of that of max(-ln(erank - 1 + ERANK_SLACK), 0), whose gradients
-    are added to those given; erank is a Gaussian's effective rank: 1 for a needle, 2 for a disc, 3 for a ball.
+    bands above it have had no gradient yet and do not change. penalties: weights in the loss of the sums of the
+    opacities, of the scales, and of max(-ln(erank - 1 + ERANK_SLACK), 0), over the Gaussians that the photo shows,
+    whose gradients are added to those given; erank is a Gaussian's effective rank: 1 for a needle, 2 for a disc, 3
+    for a ball.
     """
 
     iteration: int
@@ -290,6 +291,7 @@ class Stages(FieldStages, Protocol):
         first: "Gaussians",
         second: "Gaussians",
         step: AdamStep,
+        extents: Array = None,
     ) -> None: ...
     def adam_array(
         self,

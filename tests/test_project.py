@@ -113,7 +113,7 @@ def random_moments(gaussians, rng):
 @pytest.mark.parametrize(("stored", "degree"), [(0, 0), (1, 0), (1, 1), (2, 1), (2, 2), (3, 0), (3, 2), (3, 3)])
 def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degree, penalties):
     """The gradients in registers are those that project_bwd writes, and each meets its own moments, rate and penalty;
-    invisible Gaussians move on by their moments and penalties."""
+    invisible Gaussians move on by their moments alone."""
     gaussians, camera = wide_scene(300)
     gaussians.sh = gaussians.sh[:, : (stored + 1) ** 2]
     parts = (gaussians, *random_moments(gaussians, np.random.default_rng(stored)))
@@ -130,7 +130,7 @@ def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degr
     assert (v_fused is not None) == options["camera_grad"]
     if v_fused is not None:
         assert_cameras_match(v_fused, v_separate, DOUBLE if any_device.real == np.float64 else FLOAT)
-    ops.adam_step(any_device, separate[0], v, *separate[1:], step)
+    ops.adam_step(any_device, separate[0], v, *separate[1:], step, uploaded[0].extents)
     twin = [part.astype(np.float64) for part in parts]
     reference.project_bwd_adam(twin[0], tuple(twin[1:]), camera, splats, v_splats, step, antialiased=antialiased)
 
@@ -142,6 +142,11 @@ def test_update_matches_gradients_and_adam(any_device, antialiased, stored, degr
             if any_device.real == np.float64:
                 assert_matches(quantity, found, twin[i].arrays()[name], DOUBLE)
             assert (found != before).reshape(len(before), -1)[:, 0].mean() > 0.9, name
+    hidden = splats.extents[:, 0] == 0
+    assert 0 < hidden.sum() < len(hidden)
+    for name in ("log_scales", "logit_opacities"):
+        kept = step.beta1 * parts[1].arrays()[name][hidden]
+        np.testing.assert_allclose(host(fused[1]).arrays()[name][hidden], kept, rtol=1e-6, err_msg=name)
 
 
 @pytest.fixture(scope="module", params=["as it is", "as a GPU"])

@@ -23,6 +23,7 @@ def adam_step(
     first: Gaussians,
     second: Gaussians,
     step: AdamStep,
+    extents: Array | None = None,
 ) -> None:
     """Take one step of Adam (Kingma and Ba 2015, algorithm 1), in place.
 
@@ -31,6 +32,8 @@ def adam_step(
     gaussians, gradients, first, second : Gaussians of N >= 1 rows
         Parameters, their gradients, and the running means of the gradients and of their squares.
     step : AdamStep
+    extents : (N, 2) array, optional
+        Those of the splats. Penalties are added only where they are above 0. Default: everywhere.
     """
     struct = adam_struct(step, device.real)
     for name in SHAPES:
@@ -46,8 +49,8 @@ def adam_step(
             rates = [struct[name]] * 2
         fields = ("logit_opacities", "log_scales", "log_scales")
         penalties = [float(weight) * (name == field) for weight, field in zip(step.penalties, fields, strict=True)]
-        scalars: list[Any] = [total, stride, width, split, *rates, *penalties, struct]
-        device.launch("adam", "adam_step", (-(-total // stride),), [*scalars, *arrays])
+        scalars: list[Any] = [total, stride, width, split, *rates, *penalties, struct, total // len(gaussians)]
+        device.launch("adam", "adam_step", (-(-total // stride),), [*scalars, extents, *arrays])
 
 
 def adam_array(

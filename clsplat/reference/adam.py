@@ -15,12 +15,18 @@ BLOCK = 32768
 
 
 def adam_step(
-    gaussians: Gaussians, gradients: Gaussians, first: Gaussians, second: Gaussians, step: AdamStep
+    gaussians: Gaussians,
+    gradients: Gaussians,
+    first: Gaussians,
+    second: Gaussians,
+    step: AdamStep,
+    extents: Array | None = None,
 ) -> None:
     """Take one step of Adam (Kingma and Ba 2015, algorithm 1), in place. Arguments as for `clsplat.ops.adam_step`."""
     correction1, correction2 = 1 - step.beta1**step.iteration, 1 - step.beta2**step.iteration
+    n = len(gaussians)
+    shown = np.ones((n, 1), bool) if extents is None else extents[:, :1] > 0
     for name in SHAPES:
-        n = len(gaussians)
         width = 3 * (step.sh_degree + 1) ** 2 if name == "sh" else max(1, gaussians.arrays()[name][:1].size)
         rate: Any
         if name == "sh":
@@ -29,7 +35,7 @@ def adam_step(
         else:
             rate = step.rates[name]
         p, g, m, v = (getattr(c, name).reshape(n, -1)[:, :width] for c in (gaussians, gradients, first, second))
-        g = _penalised(name, p, g, step)
+        g = np.where(shown, _penalised(name, p, g, step), g)
         rows = max(1, BLOCK // width)
         for begin in range(0, n, rows):
             block = slice(begin, begin + rows)

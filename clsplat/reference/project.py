@@ -281,5 +281,5 @@ def project_bwd_adam(
     v, v_camera = project_bwd(
         gaussians, camera, step.sh_degree, splats, v_splats, antialiased=antialiased, camera_grad=camera_grad
     )
-    adam_step(gaussians, v, *moments, step)
+    adam_step(gaussians, v, *moments, step, splats.extents)
     return v_camera

@@ -70,7 +70,7 @@ def adam_settings(
     sh_degree : int
         Highest degree of the spherical harmonics that is trained.
     penalties : three floats
-        Weights in the loss of the sums of all opacities, of all scales, and of the penalties of needles.
+        Weights in the loss of the sums of opacities, of scales, and of the penalties of needles.
     """
     factor = config.rates_final ** max(0.0, (progress - FALL) / (1 - FALL))
     rates = {
@@ -195,5 +195,5 @@ class Optimizer:
             v_gaussians = smoothing.backward(stages, self._renderer.place(gaussians), v_gaussians)
         if self.home is None:
             v_gaussians = fetch(v_gaussians)
-        self.stages.adam_step(gaussians, v_gaussians, *both, settings)
+        self.stages.adam_step(gaussians, v_gaussians, *both, settings, self.bring(run.splats.extents))
         return v_camera

@@ -1,5 +1,8 @@
 """The optimiser's moments follow their rows; the schedules at their ends."""
 
+from dataclasses import replace
+from typing import Literal
+
 import numpy as np
 import pytest
 
@@ -7,9 +10,10 @@ from clsplat import reference
 from clsplat.config import OptimConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.renderer import Renderer, fetch
+from clsplat.renderer import Renderer, download, fetch
+from clsplat.stages import Image
 from clsplat.testing import synthetic_scene
-from clsplat.training.optimizer import Adam, Moments, adam_settings, sh_degree_at
+from clsplat.training.optimizer import Adam, Moments, Optimizer, adam_settings, sh_degree_at
 
 CONFIG = OptimConfig()
 
@@ -68,3 +72,31 @@ def test_names_at_the_top_of_the_package() -> None:
 
     assert {"Adam", "Strategy", "initialize", "train"} <= set(training.__all__)
     assert callable(training.initialize) and training.STRATEGIES["error"] is not None
+
+
+@pytest.mark.parametrize("kind", ["device", "numpy"])
+def test_gaussians_keep_their_opacity_until_a_photo_shows_them(
+    device: Device, kind: Literal["device", "numpy"]
+) -> None:
+    """Their moments are 0 at first, so that a penalty alone would move them by whole steps. Each photo of a large scene
+    shows few of them."""
+    gaussians, camera = synthetic_scene(30)
+    away = replace(camera, viewmat=np.diag([-1.0, 1, -1, 1]) @ camera.viewmat)
+    renderer = Renderer(device)
+    optimizer = Optimizer(renderer, kind)
+    start = gaussians.astype(np.float32)
+    opacities = []
+    for looking in (away, camera):
+        place = renderer.place if kind == "device" else fetch
+        trained, zeros = place(start.astype(np.float32)), [place(g) for g in vars(Moments.zeros(start)).values()]
+        run = renderer.forward(trained, looking)
+        black = Image(*(renderer.zeros("black", shape) for shape in (run.image.rgb.shape, run.image.alpha.shape)))
+        for iteration in range(1, 21):
+            run = renderer.forward(trained, looking)
+            settings = adam_settings(iteration, 0.0, 1.0, CONFIG, 0, (1e-6, 0.0, 0.0))
+            v_splats = renderer.backward_to_splats(run, black)
+            optimizer.step(trained, Moments(*zeros), None, run, v_splats, settings)
+        opacities.append(fetch(trained).opacities)
+    np.testing.assert_array_equal(opacities[0], start.opacities)
+    shown = download(run.splats.extents)[:, 0] > 0
+    assert (opacities[1] < start.opacities)[shown].all() and shown.sum() > 20
