@@ -78,8 +78,8 @@ def test_names_at_the_top_of_the_package() -> None:
 def test_gaussians_keep_their_opacity_until_a_photo_shows_them(
     device: Device, kind: Literal["device", "numpy"]
 ) -> None:
-    """Their moments are 0 at first, so that a penalty alone would move them by whole steps. Each photo of a large scene
-    shows few of them."""
+    """Their moments are 0 at first, so that a penalty alone would move them by whole steps. Each photo of a large
+    scene shows few of them."""
     gaussians, camera = synthetic_scene(30)
     away = replace(camera, viewmat=np.diag([-1.0, 1, -1, 1]) @ camera.viewmat)
     renderer = Renderer(device)
