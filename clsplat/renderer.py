@@ -201,16 +201,15 @@ class Renderer:
         """
         gaussians, config = self.place(gaussians), self.config
         degree = gaussians.sh_degree if sh_degree is None else sh_degree
-        if config.near is not None:
-            camera = replace(camera, near=config.near)
+        camera = self._near(camera)
         behind = np.array([*(self.background if background is None else background), *[0.0] * bool(depth)])
         inverse = depth == "inverse"
-        splats = self._project(gaussians, camera, degree, len(behind), inverse)
+        splats = self.project(gaussians, camera, degree, len(behind), inverse)
         if dropout:
             self.stages.dropout_fwd(splats, dropout)
         drawn = splats
         if self.backdrop is not None:
-            others = self._project(self.backdrop, camera, self.backdrop.sh_degree, len(behind), inverse)
+            others = self.project(self.backdrop, camera, self.backdrop.sh_degree, len(behind), inverse)
             drawn = self._joined(splats, others)
         by_pixel = config.sort == "pixel"
         scheme = "auto" if by_pixel else config.sort
@@ -236,11 +235,15 @@ class Renderer:
         drawn, options = run.drawn._replace(colors=colors), {"compositor": self.config.compositor}
         return self.stages.composite_fwd(drawn, run.bins, np.zeros(3), disparities=run.disparities, **options)
 
-    def _project(
-        self, gaussians: Gaussians, camera: Camera, sh_degree: int, channels: int, inverse: bool
+    def _near(self, camera: Camera) -> Camera:
+        return camera if self.config.near is None else replace(camera, near=self.config.near)
+
+    def project(
+        self, gaussians: Gaussians, camera: Camera, sh_degree: int, channels: int = 3, inverse: bool = False
     ) -> AnySplats:
+        """Splats of placed Gaussians. A fourth channel is the depth, or with `inverse` its inverse."""
         options = {"antialiased": self.config.mode == "antialiased", "rays": along_rays(self.config, camera)}
-        splats = self.stages.project_fwd(gaussians, camera, sh_degree, channels=channels, **options)
+        splats = self.stages.project_fwd(gaussians, self._near(camera), sh_degree, channels=channels, **options)
         if inverse:
             self.stages.disparity_fwd(splats)
         return splats

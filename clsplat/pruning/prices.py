@@ -251,6 +251,14 @@ def without_invisible(gaussians: Gaussians) -> Gaussians:
     return gaussians.take(shown)
 
 
+def shown_by_any(gaussians: Gaussians, cameras: Iterable[Camera], renderer: Renderer) -> NDArray[np.bool_]:
+    """Whether the image of any camera may show each Gaussian, (N,): its extents are above 0."""
+    placed, shown = renderer.place(gaussians), np.zeros(len(gaussians), bool)
+    for camera in cameras:
+        shown |= download(renderer.project(placed, camera, 0).extents)[:, 0] > 0
+    return shown
+
+
 def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     """Keep the bands 0 to `degree` of the spherical harmonics, at most those that are stored."""
     return replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])

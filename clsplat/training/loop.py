@@ -11,7 +11,7 @@ from clsplat.config import TrainConfig
 from clsplat.dataset.near_planes import with_near_planes
 from clsplat.errors import BuildError, DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians
-from clsplat.pruning.prices import without_invisible
+from clsplat.pruning.prices import shown_by_any, without_invisible
 from clsplat.renderer import fetch
 from clsplat.run_log import LOG, log_file
 from clsplat.scene import Scene
@@ -167,4 +167,8 @@ def finish(training: Training, out: Path) -> Gaussians:
         held = [view.name for view in split(scene.train)[1]]
         write_report(out / "size.json", state.search, training.config, held)
         gaussians = without_useless_bands(gaussians, state.corrected(scene.train), training.renderer)
+    if state.strategy.leaves_room and training.renderer.backdrop is None:  # other photos may show those of a block
+        cameras = [view.camera for view in state.corrected(scene.train)]
+        shown = shown_by_any(gaussians, cameras, training.renderer)
+        gaussians = gaussians.take(shown) if shown.any() else gaussians
     return without_invisible(gaussians)

@@ -44,18 +44,15 @@ def test_gaussians_next_to_a_camera_are_not_drawn(any_device):
     assert covered[0.01] > 0.3 and covered[0.2] == 0
 
 
-def test_gaussians_that_no_photo_needs_fade_away(device):
-    """The penalty of opacity. Gaussians above the frames of all photos would otherwise wait there for a camera."""
+def test_gaussians_that_no_photo_shows_are_removed(device):
+    """Gaussians above the frames of all photos would otherwise wait there for a camera."""
     scene = small_scene(device)
     above = np.array([[0, -20.0 - i, 0] for i in range(5)])
     scene = replace(
         scene, points=np.vstack([scene.points, above]), colors=np.full((len(scene.points) + 5, 3), 128, np.uint8)
     )
-    config = replace(CONFIG, strategy="error", iterations=60, max_gaussians=len(scene.points))
-    left = {
-        penalty: trained(scene, replace(config, error=replace(config.error, opacity_penalty=penalty)), device)
-        for penalty in (0.0, config.error.opacity_penalty)
-    }
-    waiting = {penalty: gaussians.opacities[gaussians.means[:, 1] < -10] for penalty, gaussians in left.items()}
-    assert len(waiting[0.0]) == 5 and (waiting[0.0] > 0.05).all()
-    assert (waiting[0.01] < 0.5 * waiting[0.0].min()).all()
+    config = replace(CONFIG, iterations=60, max_gaussians=len(scene.points))
+    left = {strategy: trained(scene, replace(config, strategy=strategy), device) for strategy in ("adc", "error")}
+    waiting = {strategy: int((gaussians.means[:, 1] < -10).sum()) for strategy, gaussians in left.items()}
+    assert waiting == {"adc": 5, "error": 0}
+    assert len(left["error"]) == len(scene.points) - 5

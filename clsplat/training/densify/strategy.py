@@ -75,7 +75,8 @@ class Strategy:
     """Opacity of the first Gaussians, where the user gives none (original code of Kerbl et al. 2023)."""
 
     leaves_room = False
-    """Whether Gaussians that reach a viewpoint are shrunk (`clsplat.training.camera_room`)."""
+    """Whether Gaussians that reach a viewpoint are shrunk (`clsplat.training.camera_room`), and those that no photo
+    shows are removed at the end: both would be seen from new viewpoints only."""
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         self.statistics: dict[str, Any] = {}

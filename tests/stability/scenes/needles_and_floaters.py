@@ -117,8 +117,9 @@ FLOATERS = Experiment(
 OUTERMOST = Experiment(
     failure="floaters beyond the last photo",
     source="what few photos show may fit them with Gaussians in front of the next camera",
-    remedy="near planes for each photo, and a penalty of opacity (`--error.opacity-penalty`)",
-    test="tests/stability/test_views.py::test_gaussians_that_no_photo_needs_fade_away",
+    remedy="near planes for each photo, a penalty of opacity (`--error.opacity-penalty`), and what no photo shows is "
+    "removed",
+    test="tests/stability/test_views.py::test_gaussians_that_no_photo_shows_are_removed",
     measure=_outermost,
     figure=f"PSNR of the photos at the end of the path ({ARC:.0%}, none of them trained on) of castle_p30, 96x64, "
     f"1500 iterations of `error` with 8000 Gaussians, mean of {len(SEEDS)} seeds",
