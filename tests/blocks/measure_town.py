@@ -36,8 +36,8 @@ FIRST = 100
 """Photos of the scene that needs three times the limit."""
 
 EVERY = 25
-"""Iterations between two rounds of growth. A round at most doubles the number of Gaussians, and blocks of some hundred
-iterations would not reach their size with the usual 100."""
+"""Iterations between two rounds of growth. A round at most doubles the number of Gaussians: with the usual 100,
+blocks of some hundred iterations would not reach their size."""
 
 
 def limit() -> int:
