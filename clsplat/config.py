@@ -265,9 +265,9 @@ class ErrorConfig:
     error of the photos least."""
     replaced_most: Fraction = 0.05
     """Largest fraction of the Gaussians that is replaced in a round, if their removal lowers the error."""
-    opacity_penalty: NonNegative = 0.01
-    """Weight of the mean opacity in the loss. It removes faint Gaussians that no photo needs and that would show as a
-    haze between the photos' viewpoints."""
+    opacity_penalty: NonNegative = 0.03
+    """Weight in the loss of the sum of the opacities that a photo shows, as a fraction of the number of Gaussians. It
+    removes faint Gaussians that no photo needs and that would show as a haze between the photos' viewpoints."""
 
 
 @dataclass(frozen=True)

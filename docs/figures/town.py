@@ -22,7 +22,7 @@ left.plot(photos, seconds, "o-", color="tab:blue", label=f"measured: power {powe
 left.plot(photos, seconds[0] * photos / photos[0], "--", color="0.6", label="in proportion to the photos")
 left.set_ylabel("processor time, s")
 left.set_yscale("log")
-left.set_yticks([20, 50, 100, 200], ["20", "50", "100", "200"])
+left.set_yticks([50, 100, 200, 500], ["50", "100", "200", "500"])
 
 right.plot(photos, values("MB needed at once"), "--", color="0.6", label="device, if trained at once (predicted)")
 right.plot(photos, values("MB resident"), "s-", color="tab:orange", label="host, largest resident size")
