@@ -265,7 +265,7 @@ class ErrorConfig:
     error of the photos least."""
     replaced_most: Fraction = 0.05
     """Largest fraction of the Gaussians that is replaced in a round, if their removal lowers the error."""
-    opacity_penalty: NonNegative = 0.03
+    opacity_penalty: NonNegative = 0.01
     """Weight in the loss of the sum of the opacities that a photo shows, as a fraction of the number of Gaussians. It
     removes faint Gaussians that no photo needs and that would show as a haze between the photos' viewpoints."""
 
