@@ -633,11 +633,12 @@ __kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const 
 #endif
     if (i >= n)
         return;
-    const reals zero = 0;
-    const masks shown = load_vectors2(extents, i, n).x > zero; // others would fade before a photo shows them
+    // Gaussians that are not shown have no penalties: they would fade before a photo shows them.
     if (adam.opacity_penalty != 0 || adam.scale_penalty != 0) {
         const Activated activated = activate(load_vectors3(log_scales, i, n), load_numbers(logit_opacities, i, n));
         const reals3 of_scales = scaled3(adam.scale_penalty, activated.scales);
+        const reals zero = 0;
+        const masks shown = load_vectors2(extents, i, n).x > zero;
         v.logit_opacity += shown ? adam.opacity_penalty * activated.opacity * (1 - activated.opacity) : zero;
         v.log_scales.x += shown ? of_scales.x : zero;
         v.log_scales.y += shown ? of_scales.y : zero;

@@ -266,7 +266,7 @@ class ErrorConfig:
     replaced_most: Fraction = 0.05
     """Largest fraction of the Gaussians that is replaced in a round, if their removal lowers the error."""
     opacity_penalty: NonNegative = 0.01
-    """Weight in the loss of the sum of the opacities that a photo shows, as a fraction of the number of Gaussians. It
+    """Weight in the loss of the opacities that a photo shows: their sum, divided by the number of all Gaussians. It
     removes faint Gaussians that no photo needs and that would show as a haze between the photos' viewpoints."""
 
 

@@ -232,11 +232,14 @@ class Renderer:
         colors : (M, 3) array
             Of all splats that the pass has drawn, where the stages run.
         """
-        drawn, options = run.drawn._replace(colors=colors), {"compositor": self.config.compositor}
-        return self.stages.composite_fwd(drawn, run.bins, np.zeros(3), disparities=run.disparities, **options)
+        drawn, bins = run.drawn._replace(colors=colors), run.bins._replace(slots=None)  # no gradients follow
+        return self.stages.composite_fwd(
+            drawn, bins, np.zeros(3), compositor=self.config.compositor, disparities=run.disparities
+        )
 
     def _near(self, camera: Camera) -> Camera:
-        return camera if self.config.near is None else replace(camera, near=self.config.near)
+        near = self.config.near
+        return camera if near in (None, camera.near) else replace(camera, near=near)
 
     def project(
         self, gaussians: Gaussians, camera: Camera, sh_degree: int, channels: int = 3, inverse: bool = False
