@@ -56,6 +56,7 @@ def adam_settings(
     config: OptimConfig,
     sh_degree: int,
     penalties: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    factor: float = 1.0,
 ) -> AdamStep:
     """Learning rates and constants of an iteration.
 
@@ -71,15 +72,17 @@ def adam_settings(
         Highest degree of the spherical harmonics that is trained.
     penalties : three floats
         Weights in the loss of the sums of opacities, of scales, and of the penalties of needles.
+    factor : float
+        Factor on all learning rates.
     """
-    factor = config.rates_final ** max(0.0, (progress - FALL) / (1 - FALL))
+    fallen = factor * config.rates_final ** max(0.0, (progress - FALL) / (1 - FALL))
     rates = {
-        "means": extent * config.means_lr * (config.means_lr_final / config.means_lr) ** progress,
-        "log_scales": factor * config.log_scales_lr,
-        "quats": factor * config.quats_lr,
-        "logit_opacities": factor * config.logit_opacities_lr,
-        "sh0": factor * config.sh0_lr,
-        "sh_rest": factor * config.sh_rest_lr,
+        "means": factor * extent * config.means_lr * (config.means_lr_final / config.means_lr) ** progress,
+        "log_scales": fallen * config.log_scales_lr,
+        "quats": fallen * config.quats_lr,
+        "logit_opacities": fallen * config.logit_opacities_lr,
+        "sh0": fallen * config.sh0_lr,
+        "sh_rest": fallen * config.sh_rest_lr,
     }
     return AdamStep(iteration, rates, config.beta1, config.beta2, config.eps, sh_degree, penalties)
 

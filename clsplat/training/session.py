@@ -192,7 +192,8 @@ def step(training: Training, view: View) -> float:
         statistics = optimizer.bring(run.splats.extents), optimizer.bring(v_splats.means2d)
         strategy.observe(optimizer.stages, *statistics, *size)
     penalties = (*strategy.penalties(len(gaussians)), config.optim.erank_penalty / len(gaussians))
-    settings = adam_settings(iteration, progress, state.extent, config.optim, sh_degree, penalties)
+    factor = state.search.rates(iteration, config) if state.search else 1.0
+    settings = adam_settings(iteration, progress, state.extent, config.optim, sh_degree, penalties, factor)
     v_camera = optimizer.step(
         state.gaussians, state.moments, state.filter, run, v_splats, settings, camera_grad=state.poses is not None
     )

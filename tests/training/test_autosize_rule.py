@@ -8,6 +8,7 @@ import pytest
 from clsplat.config import TrainConfig
 from clsplat.training.autosize.rule import (
     LATER_GAIN,
+    TRIAL_RATES,
     Search,
     SmallSide,
     Trial,
@@ -63,6 +64,12 @@ def test_photos_are_held_back_in_the_iteration_that_settles() -> None:
     search = Search(1000, settled=5)
     assert [search.holds_back(iteration) for iteration in (4, 5, 6)] == [True, True, False]
     assert Search(1000).holds_back(6)
+
+
+def test_learning_rates_are_low_in_trials_of_pruning() -> None:
+    search, first = Search(1000), first_pruning(CONFIG)
+    assert [search.rates(i, CONFIG) for i in (first - 1, first, 1600)] == [1, TRIAL_RATES, TRIAL_RATES]
+    assert replace(search, settled=1500).rates(1500, CONFIG) == 1
 
 
 def test_pruning_is_tried_until_it_fails() -> None:

@@ -40,6 +40,8 @@ def test_schedules_at_their_ends() -> None:
         assert first.rates[name] == before.rates[name] == getattr(CONFIG, f"{name}_lr")
         assert falling.rates[name] == pytest.approx(0.1**0.5 * first.rates[name])
         assert last.rates[name] == pytest.approx(0.1 * first.rates[name])
+    lower = adam_settings(1, 0.8, 3.0, CONFIG, 3, factor=0.5)
+    assert lower.rates == pytest.approx({name: 0.5 * rate for name, rate in falling.rates.items()})
     assert [sh_degree_at(i, 1000, 3) for i in (1, 1000, 1001, 3001, 9999)] == [0, 0, 1, 3, 3]
     assert sh_degree_at(9999, 1000, 1) == 1
 

@@ -42,6 +42,7 @@ def test_the_papers_presets_are_its_strategy_and_iterations():
         means_lr_final=1.6e-6,
         log_scales_lr=5e-3,
         quats_lr=1e-3,
+        logit_opacities_lr=5e-2,
         sh0_lr=2.5e-3,
         sh_rest_lr=2.5e-3 / 20,
         rates_final=1.0,

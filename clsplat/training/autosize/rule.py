@@ -30,6 +30,10 @@ back train longer if growth ends earlier (measured: docs/size.md)."""
 TRIAL_LENGTH = 0.05
 """Fraction of the iterations in a trial of pruning."""
 
+TRIAL_RATES = 0.1
+"""Factor on the learning rates in trials of pruning. By large steps Gaussians fluctuate, and the more there are the
+more their image does: the smaller side would win (measured: docs/size.md)."""
+
 PRUNING_END = 0.55
 """Fraction of the iterations at which trials of pruning end; all photos train afterwards."""
 
@@ -206,6 +210,11 @@ class Search:
     def holds_back(self, iteration: int) -> bool:
         """Whether photos are held back in an iteration: up to the one in which the search settles."""
         return not self.settled or iteration <= self.settled
+
+    def rates(self, iteration: int, config: TrainConfig) -> float:
+        """Factor on the learning rates in an iteration."""
+        tries = not self.settled and iteration >= first_pruning(config)
+        return TRIAL_RATES if tries else 1.0
 
 
 def sh_bytes(sh_degree: int) -> int:
