@@ -50,9 +50,9 @@ them, as a fraction of the block's extent. Beyond, the coarse scene is drawn."""
 ROUNDS = 4
 """Cuts after the first one, by which blocks that do not fit the memory become alike (effect: docs/howto/large.md)."""
 
-WHOLE = 2 / 3
-"""Part of a photo that a block and its margin fill, from which on it counts as a whole photo in the block's length. A
-photo that shows less of the block counts in proportion: most of its visits would train nothing."""
+WHOLE = 0.8
+"""Part of a photo that counts as a whole one in the length of the block that fills it, with its margin. Visits of a
+photo that shows less of the block train less (measured: docs/howto/large.md)."""
 
 RESERVE = 1 / 10
 """Fraction of the memory's limit that a plan leaves free: trained Gaussians are not spread as the coarse ones
@@ -319,7 +319,7 @@ def _block(ground: _Ground, box: Box, photos: NDArray[np.intp], everything_near:
     backdrop = max(int(around.sum()), second)
     shown = ground.surveyed[photos].astype(np.float64)
     part = (shown @ trains) / np.maximum(shown.sum(axis=1), np.finfo(float).tiny)
-    visits = float(np.minimum(1, part / WHOLE).sum())
+    visits = float(part.sum() / WHOLE)
     return Block(box, wide, near, photos, max(1, round(ratio * trains.sum())), backdrop, visits)
 
 
