@@ -23,9 +23,11 @@ from clsplat.testing import synthetic_scene
 from clsplat.training.autosize.explanation import size_chart
 from clsplat.training.autosize.reduction import costliest_rows, unvalidated
 from clsplat.training.autosize.rule import (
+    TRIAL_RATES,
     Search,
     SmallSide,
     candidate,
+    first_pruning,
     growth_bounds,
     most_grown,
     start,
@@ -33,6 +35,7 @@ from clsplat.training.autosize.rule import (
 from clsplat.training.autosize.search import _compared
 from clsplat.training.autosize.validation import PERFECT, can_validate, split, validate
 from clsplat.training.loop import train
+from clsplat.training.optimizer import adam_settings
 from clsplat.training.session import Training
 from clsplat.training.state import initial_state
 
@@ -211,6 +214,22 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     logs = [(tmp_path / name / "log.jsonl").read_text() for name in ("parts", "whole")]
     logs = [re.sub(r'"seconds": [0-9.e-]+', "", log) for log in logs]
     assert logs[0] == logs[1] and logs[0].count("loss") == 20
+
+
+def test_trials_of_pruning_train_with_low_rates(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    factors: dict[int, set[float]] = {}
+
+    def spied(iteration: int, *args: Any) -> Any:
+        factors.setdefault(iteration, set()).add(args[-1])
+        return adam_settings(iteration, *args)
+
+    monkeypatch.setattr("clsplat.training.session.adam_settings", spied)
+    config = replace(CONFIG, iterations=200, size_price=8.0)
+    train(known_scene(20, device, copies=4, views=36), config, tmp_path, device)
+    first = first_pruning(config)
+    assert [factors[iteration] for iteration in (first - 1, first, 200)] == [{1.0}, {TRIAL_RATES}, {1.0}]
 
 
 def test_a_step_leaves_what_the_photos_would_miss(device: Device) -> None:
