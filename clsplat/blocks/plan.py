@@ -51,8 +51,8 @@ ROUNDS = 4
 """Cuts after the first one, by which blocks that do not fit the memory become alike (effect: docs/howto/large.md)."""
 
 WHOLE = 0.8
-"""Part of a photo that counts as a whole one in the length of the block that fills it, with its margin. Visits of a
-photo that shows less of the block train less (measured: docs/howto/large.md)."""
+"""Part of a photo that a block and its margin have to fill for one visit in the block's length; other parts count in
+proportion (measured: docs/howto/large.md)."""
 
 RESERVE = 1 / 10
 """Fraction of the memory's limit that a plan leaves free: trained Gaussians are not spread as the coarse ones
@@ -68,7 +68,7 @@ class Block(NamedTuple):
 
     box: what it keeps; wide: what it trains, with the margin; near: what later trainings draw as it was trained;
     photos: indices of training photos; gaussians: expected number, margin included; backdrop: expected Gaussians
-    that its photos show around it in any training; visits: photos, each counted by the part that the block fills.
+    that its photos show around it in any training; visits: photos, each counted by the part that the block fills, over `WHOLE`.
     """
 
     box: Box

@@ -114,6 +114,7 @@ def test_photos_count_by_the_part_that_a_block_fills() -> None:
     photos, visits = np.array([(len(block.photos), block.visits) for block in plan.blocks]).T
     # A block is four photos long, and two more show half of its margin; but it has eight photos.
     assert (photos >= 8).all() and (visits > 3).all() and (visits <= photos / WHOLE).all() and visits.mean() < 6
+    assert (visits > photos).any(), "a photo that a block fills counts as more than one"
 
 
 def test_points_need_not_fit_if_blocks_do() -> None:

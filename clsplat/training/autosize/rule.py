@@ -31,8 +31,8 @@ TRIAL_LENGTH = 0.05
 """Fraction of the iterations in a trial of pruning."""
 
 TRIAL_RATES = 0.1
-"""Factor on the learning rates in trials of pruning. By large steps Gaussians fluctuate, and the more there are the
-more their image does: the smaller side would win (measured: docs/size.md)."""
+"""Factor on the learning rates in trials of pruning. Large steps make each Gaussian fluctuate, and the error by this
+grows with their number, so that the smaller side would win (measured: docs/size.md)."""
 
 PRUNING_END = 0.55
 """Fraction of the iterations at which trials of pruning end; all photos train afterwards."""
