@@ -68,7 +68,8 @@ class Block(NamedTuple):
 
     box: what it keeps; wide: what it trains, with the margin; near: what later trainings draw as it was trained;
     photos: indices of training photos; gaussians: expected number, margin included; backdrop: expected Gaussians
-    that its photos show around it in any training; visits: photos, each counted by the part that the block fills, over `WHOLE`.
+    that its photos show around it in any training; visits: photos, each counted by the part that the block
+    fills, over `WHOLE`.
     """
 
     box: Box
