@@ -30,7 +30,7 @@ back train longer if growth ends earlier (measured: docs/size.md)."""
 TRIAL_LENGTH = 0.05
 """Fraction of the iterations in a trial of pruning."""
 
-TRIAL_RATES = 0.1
+TRIAL_RATES = 0.3
 """Factor on the learning rates in trials of pruning. Large steps make each Gaussian fluctuate, and the error by this
 grows with their number, so that the smaller side would win (measured: docs/size.md)."""
 
