@@ -129,30 +129,30 @@ class InitConfig:
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Adam and its learning rates. The rates of the Gaussians are three times the original's, that of the opacities
-    one and a half times, for runs of fewer iterations. The presets have the original's."""
+    """Adam and its learning rates. The rates of the Gaussians are six times the original's, that of the opacities three
+    times, for runs of fewer iterations. The presets have the original's."""
 
-    means_lr: Positive = 4.8e-4
+    means_lr: Positive = 9.6e-4
     """Learning rate of the means at the start, in extents of the scene."""
-    means_lr_final: Positive = 4.8e-6
+    means_lr_final: Positive = 9.6e-6
     """Learning rate of the means at the last iteration; it changes exponentially in between."""
-    log_scales_lr: NonNegative = 1.5e-2
+    log_scales_lr: NonNegative = 3e-2
     """Learning rate of the logarithms of the scales."""
-    quats_lr: NonNegative = 3e-3
+    quats_lr: NonNegative = 6e-3
     """Learning rate of the quaternions."""
-    logit_opacities_lr: NonNegative = 7.5e-2
+    logit_opacities_lr: NonNegative = 0.15
     """Learning rate of the logits of the opacities."""
-    sh0_lr: NonNegative = 7.5e-3
+    sh0_lr: NonNegative = 1.5e-2
     """Learning rate of the spherical harmonics of degree 0."""
-    sh_rest_lr: NonNegative = 7.5e-3 / 20
+    sh_rest_lr: NonNegative = 1.5e-2 / 20
     """Learning rate of the spherical harmonics of degree 1 and above."""
     rates_final: PositiveFraction = 0.1
     """Factor on the learning rates above, except that of the means, at the last iteration. It falls exponentially
     from 1 over the last two fifths of the iterations."""
     beta1: PartialFraction = 0.9
     """Decay rate of Adam's mean of the gradients."""
-    beta2: PartialFraction = 0.999
-    """Decay rate of Adam's mean of the squared gradients."""
+    beta2: PartialFraction = 0.995
+    """Decay rate of Adam's mean of the squared gradients; lower than the original's 0.999, as gradients are rare."""
     eps: Positive = 1e-15
     """Term that Adam adds to the root of the mean square."""
     ssim_weight: Fraction = 0.2

@@ -46,6 +46,7 @@ def test_the_papers_presets_are_its_strategy_and_iterations():
         sh0_lr=2.5e-3,
         sh_rest_lr=2.5e-3 / 20,
         rates_final=1.0,
+        beta2=0.999,
     )
     paper = TrainConfig(strategy="adc", size="fixed", init=InitConfig(triangulate=False, dense=False), optim=rates)
     assert load_preset("paper-7k") == replace(paper, iterations=7000)
