@@ -102,7 +102,7 @@ bench-quality:
 	@test -n "$(DATA)" || { echo "DATA: expected the folder of the scenes, found none: make bench-quality DATA=..."; exit 2; }
 	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods $(METHODS) \
 	  $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ITERATIONS),--iterations $(ITERATIONS)) -o build/quality
-	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods auto --iterations 750 1500 \
+	$(PYTHON) -m clsplat bench quality $(addprefix $(DATA)/,$(QUALITY_SCENES)) --methods auto --iterations 750 1000 1500 \
 	  -o build/quality
 	cp build/quality/results.jsonl docs/results/quality.jsonl
 	cp build/quality/processor-time-psnr.svg docs/results/quality.svg
