@@ -151,7 +151,7 @@ class OptimConfig:
     from 1 over the last two fifths of the iterations."""
     beta1: PartialFraction = 0.9
     """Decay rate of Adam's mean of the gradients."""
-    beta2: PartialFraction = 0.995
+    beta2: PartialFraction = 0.99
     """Decay rate of Adam's mean of the squared gradients; lower than the original's 0.999, as gradients are rare."""
     eps: Positive = 1e-15
     """Term that Adam adds to the root of the mean square."""
