@@ -129,8 +129,8 @@ class InitConfig:
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Adam and its learning rates. The rates of the Gaussians are six times the original's, that of the opacities three
-    times, for runs of fewer iterations. The presets have the original's."""
+    """Adam and its learning rates: six times the original's, that of the opacities three times, for runs of fewer
+    iterations. The presets have the original's."""
 
     means_lr: Positive = 9.6e-4
     """Learning rate of the means at the start, in extents of the scene."""
