@@ -42,6 +42,8 @@ def failure(gaussians: Gaussians | Stored, views: list[View], renderer: Renderer
         A sentence with what to look at; None if the scene shows something of its photos.
     """
     advice = "look at the photos, their poses and masks, and train for more --iterations"
+    if not any(map(_shows_something, in_turn(views))):
+        return f"training failed: {NOTHING_SHOWN}"
     if len(gaussians) < FEWEST_GAUSSIANS:
         return f"training failed: only {len(gaussians)} Gaussians are left; {advice}"
     chosen = evenly_spaced(views, CHECKED)
@@ -54,7 +56,7 @@ def failure(gaussians: Gaussians | Stored, views: list[View], renderer: Renderer
             errors.append(np.mean((np.clip(rendering.rgb[counts], 0, 1) - photo) ** 2))
             variances.append(photo.var(axis=0).mean())
     if not errors:
-        return None if any(map(_shows_something, in_turn(views))) else f"training failed: {NOTHING_SHOWN}"
+        return None
     if np.mean(errors) < np.mean(variances):
         return None
     found, constant = (-10 * np.log10(np.mean(values)) for values in (errors, variances))
