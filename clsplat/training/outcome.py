@@ -55,9 +55,7 @@ def failure(gaussians: Gaussians | Stored, views: list[View], renderer: Renderer
         if _varies(photo):
             errors.append(np.mean((np.clip(rendering.rgb[counts], 0, 1) - photo) ** 2))
             variances.append(photo.var(axis=0).mean())
-    if not errors:
-        return None
-    if np.mean(errors) < np.mean(variances):
+    if not errors or np.mean(errors) < np.mean(variances):
         return None
     found, constant = (-10 * np.log10(np.mean(values)) for values in (errors, variances))
     return (
