@@ -58,19 +58,15 @@ def save_page(path: str | Path, gaussians: Gaussians, mode: Mode, start: Viewpoi
         If the Gaussians cannot be stored, or the file cannot be written.
     """
     path = Path(path)
-    turn, camera = upright(start.up), start.camera
+    turn = upright(start.up)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         scene = Path(folder) / "scene.sog"
         save_sog(scene, rotated(gaussians, turn), mode)
         data = base64.b64encode(scene.read_bytes()).decode()
-    axis = camera.viewmat[2, :3]
-    target = camera.position + max(abs(float((start.focus - camera.position) @ axis)), 1e-3) * axis
-    # Contrary to the viewer's documentation, this is the field of view across the window's longer edge.
-    fov = math.degrees(2 * math.atan(max(camera.width / camera.fx, camera.height / camera.fy) / 2))
     shown = {
         "contentUrl": f"data:application/octet-stream;base64,{data}",
         "contentFilename": "scene.sog",
-        "settings": _settings(turn @ camera.position, turn @ target, fov, background),
+        "settings": viewer_settings(start, turn, background),
     }
     licence = (VENDOR / "supersplat-viewer.LICENSE").read_text(encoding="utf-8")
     notice = f"<!--\nShown by SuperSplat Viewer, https://github.com/playcanvas/supersplat-viewer\n\n{licence}-->\n"
@@ -89,9 +85,21 @@ def save_page(path: str | Path, gaussians: Gaussians, mode: Mode, start: Viewpoi
         file.write(page.encode())
 
 
-def _settings(position: Array, target: Array, fov: float, background: Background) -> dict[str, Any]:
-    """Settings of the viewer: background and first camera, everything else off."""
-    camera = {"position": _viewer_axes(position), "target": _viewer_axes(target), "fov": fov}
+def viewer_settings(start: Viewpoint, turn: Array, background: Background) -> dict[str, Any]:
+    """Make the settings of the viewer: background and first camera, everything else off.
+
+    Parameters
+    ----------
+    start : Viewpoint
+    turn : (3, 3)
+        Rotation of the scene that makes the viewpoint upright.
+    background : {"black", "white"}
+    """
+    camera, axis = start.camera, start.camera.viewmat[2, :3]
+    target = camera.position + max(abs(float((start.focus - camera.position) @ axis)), 1e-3) * axis
+    # Contrary to the viewer's documentation, this is the field of view across the window's longer edge.
+    fov = math.degrees(2 * math.atan(max(camera.width / camera.fx, camera.height / camera.fy) / 2))
+    pose = {"position": _viewer_axes(turn @ camera.position), "target": _viewer_axes(turn @ target), "fov": fov}
     return {
         "version": 2,
         "tonemapping": "none",
@@ -99,7 +107,7 @@ def _settings(position: Array, target: Array, fov: float, background: Background
         "background": {"color": list(BACKGROUNDS[background])},
         "postEffectSettings": POST_EFFECTS,
         "animTracks": [],
-        "cameras": [{"initial": camera}],
+        "cameras": [{"initial": pose}],
         "annotations": [],
         "startMode": "default",
     }

@@ -36,7 +36,8 @@ def main(scene: Path, data: Path, out: Path) -> None:
     """Make the pictures in the folder `out`."""
     out.mkdir(parents=True, exist_ok=True)
     camera = load_scene(data, DataConfig()).test[0].camera
-    camera = replace(camera, fx=camera.fy)  # viewers have one focal length
+    # Viewers have one focal length, and look at the middle of the picture.
+    camera = replace(camera, fx=camera.fy, cx=camera.width / 2, cy=camera.height / 2)
     gaussians = load_gaussians(scene)[0]
     found: dict[str, dict[str, object]] = {}
     with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as address:
