@@ -66,7 +66,8 @@ def train_block(
     """Train a block, unless its result exists; continue where an interrupted run has left a checkpoint.
 
     The Gaussians of the scene in the block and its margin train; the others that its photos show are drawn and stay
-    as they are. What lies in the block after the training is its result.
+    as they are. What lies in the block after the training is its result; without a margin, all that it has trained
+    is.
 
     Parameters
     ----------
@@ -195,7 +196,7 @@ def _trained(
     work: Path,
     progress: Progress,
 ) -> Gaussians:
-    """Train the block in a folder that is held, and return what lies in it."""
+    """Train the block in a folder that is held, and return what it keeps."""
     config = job.config
     trains = job.wide.contains(start.means)
     device.buffers.forget()  # another block's sizes
@@ -211,6 +212,8 @@ def _trained(
     state.inputs.demand(scene)
     training = Training(scene, config, device, state, start.take(shown & ~trains))
     gaussians = complete(training, work, progress=progress)
+    if job.wide == job.box:  # nothing else trains what has moved out of it
+        return without_invisible(gaussians)
     inside = job.box.contains(gaussians.means)
     if not inside.any():
         raise ClsplatError(

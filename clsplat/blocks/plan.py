@@ -39,9 +39,12 @@ REFINEMENTS = 2
 REFINING_LENGTH = 1 / 2
 """Iterations of each of these trainings, as a fraction of those of a block's first one."""
 
-REFINING_RATE = 1 / 10
+REFINING_MEANS = 1 / 10
 """Factor on the first learning rate of the means in these trainings. It becomes that of the middle of a training,
 in which the rate falls by a factor of 100."""
+
+REFINING_RATES = 1 / 2
+"""Factor on the other learning rates in these trainings (measured: docs/howto/large.md)."""
 
 NEAR = 0.25
 """Width of the surroundings that later trainings draw as they were trained, where memory is too small for all of
@@ -95,8 +98,13 @@ class Plan(NamedTuple):
 
     def cut(self, training: int) -> list[Block]:
         """The blocks of a training, counted from 0: pixels that several blocks share in one are a block's own in the
-        next."""
-        return self.between if training % 2 else self.blocks
+        next.
+
+        In the last training they have no margin. Blocks that change only what they keep, and take their share of each
+        pixel's error, mend the whole error together; what a margin learned would be lost.
+        """
+        blocks = self.between if training % 2 else self.blocks
+        return [block._replace(wide=block.box) for block in blocks] if training == REFINEMENTS else blocks
 
     def describe(self, config: TrainConfig, scene: Scene, seconds: float) -> str:
         """A sentence on blocks, photos, memory, time and size; seconds: of an iteration with photos of full size."""
@@ -178,7 +186,10 @@ def refining_config(config: TrainConfig, scene: Scene, block: Block, gaussians: 
     """The configuration of a block's training among the trained blocks; gaussians: number that the block has."""
     first = block_config(config, scene, block)
     iterations = max(1, round(REFINING_LENGTH * first.iterations))
-    return replace(of_fixed_size(first, gaussians, REFINING_RATE), iterations=iterations)
+    made = of_fixed_size(first, gaussians, REFINING_MEANS)
+    names = ("log_scales_lr", "quats_lr", "logit_opacities_lr", "sh0_lr", "sh_rest_lr")
+    rates = {name: REFINING_RATES * getattr(made.optim, name) for name in names}
+    return replace(made, iterations=iterations, optim=replace(made.optim, **rates))
 
 
 def expected_total(config: TrainConfig, coarse: int) -> int:

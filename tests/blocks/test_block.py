@@ -15,8 +15,9 @@ from clsplat.blocks.block import _start, _trained, result_of, train_block
 from clsplat.blocks.jobs import read_job
 from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.parts import read_index, read_scene
+from clsplat.blocks.plan import REFINEMENTS
 from clsplat.blocks.survey import seen_by_block
-from clsplat.blocks.whole import merge, plan_blocks, write_log
+from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
@@ -214,6 +215,21 @@ def test_a_second_training_is_surrounded_by_the_first_ones(
         start.means, np.concatenate([first.means[inside], far.means[~near.contains(far.means)]])
     )
     assert 0 < inside.sum() < len(first)
+
+
+def test_without_a_margin_a_block_keeps_all_that_it_trains(planned: Planned, device: Device) -> None:
+    for job in planned.jobs:
+        train_block(job, planned.scene.train, device)
+    fast = replace(planned.config, optim=replace(planned.config.optim, means_lr=1.0))
+    last = plan_refinement(planned.jobs, planned.plan.cut(REFINEMENTS), planned.scene, fast, planned.data)
+    for path in last:
+        job = read_job(path)
+        assert job.wide == job.box
+        before = read_scene(path.with_name(job.scene), 1).means
+        after = load_gaussians(train_block(path, planned.scene.train, device))[0].means
+        assert not job.box.contains(after).all(), "some have left the block"
+        count = job.box.contains(before).sum()
+        assert 0.95 * count < len(after) <= count, "of large steps, some end in an invisible Gaussian"
 
 
 def test_blocks_train_with_depth_maps(planned: Planned, dataset: Path, device: Device, tmp_path: Path) -> None:

@@ -55,6 +55,7 @@ def test_auto_takes_the_fewest_blocks_that_fit() -> None:
     assert 3 <= count <= 12
     for training in range(3):
         assert sum(int(block.box.contains(coarse.means).sum()) for block in plan.cut(training)) == len(coarse)
+        assert all((block.wide == block.box) == (training == REFINEMENTS) for block in plan.cut(training))
     text = plan.describe(config, scene, 1.0)
     assert len(plan.between) == count + 1 and REFINEMENTS == 2
     steps = round(40 * (count + REFINING_LENGTH * (count + 1 + count)))
@@ -173,5 +174,6 @@ def test_configurations(device: Device) -> None:
     assert block_config(replace(config, max_gaussians=None), scene, block).max_gaussians is None
     later = refining_config(config, scene, block, 280)
     assert (later.iterations, later.max_gaussians, later.error.stop_fraction) == (1500, 280, 0)
+    assert later.optim.sh0_lr == settings.optim.sh0_lr / 2 and later.optim.means_lr == settings.optim.means_lr / 10
     assert later.error.opacity_penalty == later.mcmc.opacity_penalty == later.mcmc.scale_penalty == 0
     assert settings.error.opacity_penalty > 0
