@@ -66,9 +66,9 @@ class SfmConfig:
     extracted from a video, exhaustive otherwise."""
     vocabulary: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """COLMAP's vocabulary tree for SIFT, for matching by vocabulary."""
-    mapper: Literal["incremental", "global"] = "incremental"
+    mapper: Literal["auto", "incremental", "global"] = "auto"
     """Method that finds the poses. incremental: photos are added one after the other. global: all poses are found at
-    once, in less time for many photos (GLOMAP)."""
+    once (GLOMAP). auto: global for 100 photos or more."""
     camera_model: Annotated[str, name_in("clsplat.dataset.lenses:camera_models")] = "OPENCV"
     """COLMAP camera model to fit; photos are undistorted when they are loaded."""
     single_camera: bool = True

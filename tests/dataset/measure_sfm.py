@@ -40,6 +40,8 @@ WORDS = 4096
 words of noise."""
 
 Matching = Literal["exhaustive", "sequential", "gps", "vocabulary"]
+Mapper = Literal["incremental", "global"]
+MAPPERS = {"incremental": map_incrementally, "global": map_globally}
 
 
 def used() -> float:
@@ -103,7 +105,7 @@ def features(database: Path, folder: Path, names: list[str]) -> None:
     pycolmap.Database.open(database).close()  # merges the write-ahead log into the file
 
 
-def vocabulary(scenes: list[Path], work: Path) -> Path:
+def vocabulary(scenes: tuple[Path, ...], work: Path) -> Path:
     """Build a vocabulary tree from the features of scenes."""
     found: list[np.ndarray] = []
     for k, scene in enumerate(scenes):
@@ -115,6 +117,7 @@ def vocabulary(scenes: list[Path], work: Path) -> Path:
     tree = pycolmap.VisualIndex.create(128, 64)
     options = pycolmap.VisualIndex.BuildOptions()
     options.num_visual_words, options.num_threads = WORDS, 1
+    options.num_iterations, options.num_rounds = 20, 1  # COLMAP's 100 and 3 take half an hour
     tree.build(options, pycolmap.FeatureDescriptorsFloat(type=kind, data=np.concatenate(found).astype(np.float32)))
     tree.write(work / "words.bin")
     return work / "words.bin"
@@ -137,10 +140,11 @@ def compared(model: Any, known: Any) -> dict[str, float]:
 
 def main(
     scene: Path,
-    others: list[Path],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    others: tuple[Path, ...] = (),
     every: int = 1,
     matchings: tuple[Matching, ...] = get_args(Matching),
+    mappers: tuple[Mapper, ...] = get_args(Mapper),
 ) -> None:
     """Measure one scene, and write a row for each choice of pairs and each mapper."""
     source, names = photo_folder(scene), list_photos(scene)[::every]
@@ -163,12 +167,12 @@ def main(
                 with pycolmap.Database.open(matched) as opened:
                     pairs = pairs_to_match(opened, folder, config)
                 match(matched, pairs)
-            for mapper, run in (("incremental", map_incrementally), ("global", map_globally)):
+            for mapper in mappers:
                 database, models = work / "run.db", work / "models"
                 shutil.copyfile(matched, database)
                 models.mkdir()
                 with timed(times, "poses, s"):
-                    made = run(database, folder, models, len(names), config.min_registered)
+                    made = MAPPERS[mapper](database, folder, models, len(names), config.min_registered)
                 shutil.rmtree(models)
                 model = max(made.values(), key=lambda model: model.num_reg_images(), default=None)
                 rows.append(

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 from test_reconstruction import CONFIG, FILES, cameras, take_photos
 
-from clsplat.config import DataConfig
+from clsplat.config import DataConfig, SfmConfig
 from clsplat.dataset import load_scene
-from clsplat.dataset.sfm.reconstruction import read_record, reconstruct
+from clsplat.dataset.sfm.reconstruction import GLOBAL_PHOTOS, _resolved, read_record, reconstruct
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +44,9 @@ def test_it_repeats_and_is_recorded(folders: list[Path]) -> None:
     before = (folders[0] / "sparse" / "0" / FILES[0]).stat().st_mtime_ns
     reconstruct(folders[0], replace(CONFIG, mapper="global"))
     assert (folders[0] / "sparse" / "0" / FILES[0]).stat().st_mtime_ns == before
+
+
+def test_many_photos_are_mapped_globally(tmp_path: Path) -> None:
+    assert _resolved(SfmConfig(), tmp_path, GLOBAL_PHOTOS - 1).mapper == "incremental"
+    assert _resolved(SfmConfig(), tmp_path, GLOBAL_PHOTOS).mapper == "global"
+    assert _resolved(SfmConfig(mapper="incremental"), tmp_path, GLOBAL_PHOTOS).mapper == "incremental"

@@ -21,7 +21,7 @@ from clsplat.dataset.photos import (
     sharpness,
     write_upright_png,
 )
-from clsplat.dataset.sfm.reconstruction import _matched
+from clsplat.dataset.sfm.reconstruction import _resolved
 from clsplat.dataset.video import extract_frames
 from clsplat.errors import InputError
 
@@ -94,10 +94,10 @@ def test_phones_turn_their_videos_by_a_matrix(video, tmp_path):
 
 
 def test_frames_are_matched_with_their_neighbours(video, tmp_path):
-    assert _matched(SfmConfig(), tmp_path).matching == "exhaustive"
+    assert _resolved(SfmConfig(), tmp_path, 3).matching == "exhaustive"
     extract_frames(video, tmp_path / "out", 1.0)
-    assert _matched(SfmConfig(), tmp_path / "out").matching == "sequential"
-    assert _matched(SfmConfig(matching="exhaustive"), tmp_path / "out").matching == "exhaustive"
+    assert _resolved(SfmConfig(), tmp_path / "out", 3).matching == "sequential"
+    assert _resolved(SfmConfig(matching="exhaustive"), tmp_path / "out", 3).matching == "exhaustive"
 
 
 def test_the_command(video, tmp_path, capsys):

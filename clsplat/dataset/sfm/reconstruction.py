@@ -38,6 +38,11 @@ RECORD = "clsplat_sfm.json"
 """Name of the file next to the model's folder ``0`` that records the photos and options from which the model was
 made."""
 
+GLOBAL_PHOTOS = 100
+"""Fewest photos whose poses are found all at once. With 20 to 50 photos both mappers are alike; with fewer, global
+mapping fails more often, and incremental mapping of 146 photos took ten times as long and drifted (measured:
+docs/howto/large.md)."""
+
 WORK, LOCK = ".clsplat_sfm_", "lock"
 """Beginning of the names of temporary folders, and name of the file in each that the process locks which uses it."""
 
@@ -150,7 +155,7 @@ def reconstruct(photos: Path, config: SfmConfig, output: Path | None = None, ver
 
     with _workspace(output) as work, quiet(verbose):
         readable = _readable(folder, names, work, config.max_image_size)
-        registered = _solved(work, readable, names, _matched(config, folder), verbose)
+        registered = _solved(work, readable, names, _resolved(config, folder, len(names)), verbose)
         _check_registered(registered, len(names), photos, config)
         _check_written(work / "sparse" / "0", registered, output)
         where = "." if output.resolve() == photos.resolve() else str(photos.resolve())
@@ -184,11 +189,13 @@ def _registered_before(output: Path, hashes: dict[str, str], config: SfmConfig) 
     return int(record["registered"]) if made_with == config else None
 
 
-def _matched(config: SfmConfig, folder: Path) -> SfmConfig:
-    """Resolve `matching` "auto" for the photos in `folder`."""
-    if config.matching != "auto":
-        return config
-    return replace(config, matching="sequential" if (folder / FRAMES).is_file() else "exhaustive")
+def _resolved(config: SfmConfig, folder: Path, count: int) -> SfmConfig:
+    """Resolve `matching` and `mapper` "auto" for the photos in `folder`, `count` of them."""
+    if config.matching == "auto":
+        config = replace(config, matching="sequential" if (folder / FRAMES).is_file() else "exhaustive")
+    if config.mapper == "auto":
+        config = replace(config, mapper="global" if count >= GLOBAL_PHOTOS else "incremental")
+    return config
 
 
 def _check_registered(registered: int, count: int, photos: Path, config: SfmConfig) -> None:

@@ -26,7 +26,7 @@ def solve(work: Path, folder: str, names: list[str], options: dict[str, Any], ve
     names : list of str
         Their names.
     options : dict
-        Fields of the `SfmConfig`; its `matching` is not "auto".
+        Fields of the `SfmConfig`; its `matching` and `mapper` are not "auto".
     verbose : bool
         Whether to show COLMAP's own messages.
 
