@@ -33,11 +33,9 @@ COARSE_LENGTH = 1 / 3
 COARSE_SHARE = 1 / COARSE_FACTOR**2
 """Gaussians of the coarse run, as a fraction of those of the whole scene: as many per pixel."""
 
-REFINEMENTS = 2
-"""Trainings of each block among the trained ones (measured: docs/howto/large.md)."""
-
-REFINING_LENGTH = 1 / 2
-"""Iterations of each of these trainings, as a fraction of those of a block's first one."""
+REFINING_LENGTHS = 1 / 2, 1
+"""Iterations of the trainings of a block among the trained ones, as fractions of those of its first one (measured:
+docs/howto/large.md)."""
 
 REFINING_MEANS = 1 / 10
 """Factor on the first learning rate of the means in these trainings. It becomes that of the middle of a training,
@@ -104,7 +102,7 @@ class Plan(NamedTuple):
         pixel's error, mend the whole error together; what a margin learned would be lost.
         """
         blocks = self.between if training % 2 else self.blocks
-        return [block._replace(wide=block.box) for block in blocks] if training == REFINEMENTS else blocks
+        return [block._replace(wide=block.box) for block in blocks] if training == len(REFINING_LENGTHS) else blocks
 
     def describe(self, config: TrainConfig, scene: Scene, seconds: float) -> str:
         """A sentence on blocks, photos, memory, time and size; seconds: of an iteration with photos of full size."""
@@ -113,7 +111,7 @@ class Plan(NamedTuple):
             sum(3 * scene.train[i].camera.width * scene.train[i].camera.height for i in block.photos)
             for block in self.blocks
         ]
-        lengths = [1.0, *[REFINING_LENGTH] * REFINEMENTS]
+        lengths = [1.0, *REFINING_LENGTHS]
         steps = round(
             sum(
                 length * block_config(config, scene, block).iterations
@@ -182,10 +180,11 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
     )
 
 
-def refining_config(config: TrainConfig, scene: Scene, block: Block, gaussians: int) -> TrainConfig:
-    """The configuration of a block's training among the trained blocks; gaussians: number that the block has."""
+def refining_config(config: TrainConfig, scene: Scene, block: Block, gaussians: int, length: float) -> TrainConfig:
+    """The configuration of a block's training among the trained blocks; gaussians: number that the block has; length:
+    its iterations, as a fraction of those of the first training."""
     first = block_config(config, scene, block)
-    iterations = max(1, round(REFINING_LENGTH * first.iterations))
+    iterations = max(1, round(length * first.iterations))
     made = of_fixed_size(first, gaussians, REFINING_MEANS)
     names = ("log_scales_lr", "quats_lr", "logit_opacities_lr", "sh0_lr", "sh_rest_lr")
     rates = {name: REFINING_RATES * getattr(made.optim, name) for name in names}

@@ -125,7 +125,7 @@ def _written(gaussians: Gaussians, folder: Path, config: TrainConfig) -> Path:
 
 
 def plan_refinement(
-    latest: list[Path], blocks: list[Block], scene: Scene, config: TrainConfig, data: Path
+    latest: list[Path], blocks: list[Block], length: float, scene: Scene, config: TrainConfig, data: Path
 ) -> list[Path]:
     """Write the jobs of trainings in which each block has the trained ones around it.
 
@@ -138,6 +138,8 @@ def plan_refinement(
         The jobs of the latest trainings, all of which have results.
     blocks : list of Block
         Those of a cut of the plan: not that of the latest trainings, whose borders need mending most.
+    length : float
+        Iterations, as a fraction of those of the first trainings.
     scene : Scene
     config : TrainConfig
     data : Path
@@ -156,7 +158,7 @@ def plan_refinement(
     photos, coarse, refined = _read_photos(scene), read_job(latest[0]).far, []
     for block, count in zip(blocks, counts.tolist(), strict=True):
         views = [scene.train[i] for i in block.photos]
-        settings = refining_config(config, scene, block, count)
+        settings = refining_config(config, scene, block, count, length)
         job = make_job(data.resolve(), coarse, block, views, photos, settings)
         refined.append(replace(job, scene=index.name, near=block.near).write(folder))
     return refined

@@ -35,7 +35,7 @@ def train_in_blocks(
     JobsPrinted
         If `where.print_jobs` is set, and blocks have to be trained.
     """
-    from clsplat.blocks.plan import REFINEMENTS
+    from clsplat.blocks.plan import REFINING_LENGTHS
     from clsplat.blocks.stored import StoredScene
     from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
     from clsplat.evaluate import mean_metrics
@@ -53,8 +53,8 @@ def train_in_blocks(
         return None
     _run(first, scene, renderer.device, watch, where)
     trained = [first]
-    for training in range(1, 1 + REFINEMENTS):
-        trained.append(plan_refinement(trained[-1], plan.cut(training), scene, config, data))
+    for training, length in enumerate(REFINING_LENGTHS, 1):
+        trained.append(plan_refinement(trained[-1], plan.cut(training), length, scene, config, data))
         _run(trained[-1], scene, renderer.device, watch, where)
     merge(trained[-1], out / SCENE, scene.offset)
     gaussians = StoredScene(out / SCENE)

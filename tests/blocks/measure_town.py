@@ -22,7 +22,7 @@ import numpy as np
 from town import write_town
 
 from clsplat.atomic import replacing
-from clsplat.blocks.plan import REFINEMENTS
+from clsplat.blocks.plan import REFINING_LENGTHS
 from clsplat.blocks.whole import BLOCKS
 from clsplat.device import Device
 from clsplat.training.memory import Footprint
@@ -86,7 +86,7 @@ def measure(folder: Path, count: int) -> dict[str, Any]:
     return found | {
         "MB limit": round(limit() / 1e6, 2),
         "MB needed at once": round(Footprint(WIDTH, HEIGHT, 3, gpu=False).total(count * PER_PHOTO) / 1e6, 1),
-        "blocks": len(list((out / BLOCKS).glob("*.jsonl"))) // (1 + REFINEMENTS),
+        "blocks": len(list((out / BLOCKS).glob("*.jsonl"))) // (1 + len(REFINING_LENGTHS)),
         "iterations": log[-1]["iteration"],
         "Gaussians": log[-1]["num_gaussians"],
         "PSNR": round(log[-1].get("psnr", float("nan")), 2),

@@ -15,7 +15,7 @@ from clsplat.blocks.block import _start, _trained, result_of, train_block
 from clsplat.blocks.jobs import read_job
 from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.parts import read_index, read_scene
-from clsplat.blocks.plan import REFINEMENTS
+from clsplat.blocks.plan import REFINING_LENGTHS
 from clsplat.blocks.survey import seen_by_block
 from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
 from clsplat.device import Device
@@ -221,7 +221,9 @@ def test_without_a_margin_a_block_keeps_all_that_it_trains(planned: Planned, dev
     for job in planned.jobs:
         train_block(job, planned.scene.train, device)
     fast = replace(planned.config, optim=replace(planned.config.optim, means_lr=1.0))
-    last = plan_refinement(planned.jobs, planned.plan.cut(REFINEMENTS), planned.scene, fast, planned.data)
+    last = plan_refinement(
+        planned.jobs, planned.plan.cut(len(REFINING_LENGTHS)), 1.0, planned.scene, fast, planned.data
+    )
     for path in last:
         job = read_job(path)
         assert job.wide == job.box

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from cli_runs import fails, run
 
-from clsplat.blocks.plan import REFINEMENTS
+from clsplat.blocks.plan import REFINING_LENGTHS
 from clsplat.formats import load_gaussians
 
 TRAIN = (
@@ -32,7 +32,7 @@ def test_a_run_is_like_any_other_and_printed_jobs_make_the_same(
 
     printed = tmp_path / "printed"
     arguments = ["train", dataset, "-o", printed, *TRAIN, "--blocks", 2, "--print-jobs"]
-    assert REFINEMENTS == 2
+    assert len(REFINING_LENGTHS) == 2
     for resume, count in (([], 2), (["--resume"], 3), (["--resume"], 2)):
         run(*arguments, *resume)
         jobs = capsys.readouterr().out.splitlines()

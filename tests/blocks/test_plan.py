@@ -9,8 +9,7 @@ from small_run import known_scene
 
 from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.plan import (
-    REFINEMENTS,
-    REFINING_LENGTH,
+    REFINING_LENGTHS,
     RESERVE,
     WHOLE,
     Block,
@@ -55,10 +54,11 @@ def test_auto_takes_the_fewest_blocks_that_fit() -> None:
     assert 3 <= count <= 12
     for training in range(3):
         assert sum(int(block.box.contains(coarse.means).sum()) for block in plan.cut(training)) == len(coarse)
-        assert all((block.wide == block.box) == (training == REFINEMENTS) for block in plan.cut(training))
+        assert all((block.wide == block.box) == (training == len(REFINING_LENGTHS)) for block in plan.cut(training))
     text = plan.describe(config, scene, 1.0)
-    assert len(plan.between) == count + 1 and REFINEMENTS == 2
-    steps = round(40 * (count + REFINING_LENGTH * (count + 1 + count)))
+    assert len(plan.between) == count + 1
+    second, third = REFINING_LENGTHS
+    steps = round(40 * (count + second * (count + 1) + third * count))
     assert text.startswith(f"blocks: {count}, each with 8 to ") and " of 12 photos" in text
     assert f"about {SIZE} Gaussians in all, {steps} iterations, {round(steps / 60)} minutes" in text
 
@@ -172,7 +172,7 @@ def test_configurations(device: Device) -> None:
     assert block_config(replace(config, iterations=24_000), scene, block._replace(visits=2.0)).iterations == 4000
     assert block_config(replace(config, iterations=70), scene, block).iterations == 70
     assert block_config(replace(config, max_gaussians=None), scene, block).max_gaussians is None
-    later = refining_config(config, scene, block, 280)
+    later = refining_config(config, scene, block, 280, 0.5)
     assert (later.iterations, later.max_gaussians, later.error.stop_fraction) == (1500, 280, 0)
     assert later.optim.sh0_lr == settings.optim.sh0_lr / 2 and later.optim.means_lr == settings.optim.means_lr / 10
     assert later.error.opacity_penalty == later.mcmc.opacity_penalty == later.mcmc.scale_penalty == 0
