@@ -66,8 +66,8 @@ def train_block(
     """Train a block, unless its result exists; continue where an interrupted run has left a checkpoint.
 
     The Gaussians of the scene in the block and its margin train; the others that its photos show are drawn and stay
-    as they are. What lies in the block after the training is its result; without a margin, all that it has trained
-    is.
+    as they are. The result is what lies in the block after the training. A block without a margin keeps all that it has
+    trained, since nothing else trains what has left it.
 
     Parameters
     ----------
@@ -212,11 +212,9 @@ def _trained(
     state.inputs.demand(scene)
     training = Training(scene, config, device, state, start.take(shown & ~trains))
     gaussians = complete(training, work, progress=progress)
-    if job.wide == job.box:  # nothing else trains what has moved out of it
-        return without_invisible(gaussians)
-    inside = job.box.contains(gaussians.means)
-    if not inside.any():
+    kept = gaussians if job.wide == job.box else gaussians.take(job.box.contains(gaussians.means))
+    if not len(kept):
         raise ClsplatError(
             f"{work.name}: expected Gaussians in the block after its training, found none; use fewer --blocks"
         )
-    return without_invisible(gaussians.take(inside))
+    return without_invisible(kept)

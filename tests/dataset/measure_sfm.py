@@ -36,8 +36,7 @@ DEGREE = 111_195.0
 """Length of a degree of latitude, m."""
 
 WORDS = 4096
-"""Visual words of the tree. COLMAP's smallest tree has 32 768; fewer features than a hundred for each word would make
-words of noise."""
+"""Visual words of the tree, fewer than in COLMAP's trees (32 768 or more), as it is built from few photos."""
 
 Matching = Literal["exhaustive", "sequential", "gps", "vocabulary"]
 Mapper = Literal["incremental", "global"]

@@ -32,10 +32,10 @@ SETTLED = 0.01
 """Difference of the PSNR of two pictures in a row of a viewer that has sorted its splats, dB."""
 
 
-def main(scene: Path, data: Path, out: Path) -> None:
+def main(scene: Path, data: Path, out: Path, downscale: int = 1) -> None:
     """Make the pictures in the folder `out`."""
     out.mkdir(parents=True, exist_ok=True)
-    camera = load_scene(data, DataConfig()).test[0].camera
+    camera = load_scene(data, DataConfig(downscale=downscale)).test[0].camera
     # Viewers have one focal length, and look at the middle of the picture.
     camera = replace(camera, fx=camera.fy, cx=camera.width / 2, cy=camera.height / 2)
     gaussians = load_gaussians(scene)[0]

@@ -39,9 +39,8 @@ RECORD = "clsplat_sfm.json"
 made."""
 
 GLOBAL_PHOTOS = 100
-"""Fewest photos whose poses are found all at once. With 20 to 50 photos both mappers are alike; with fewer, global
-mapping fails more often, and incremental mapping of 146 photos took ten times as long and drifted (measured:
-docs/howto/large.md)."""
+"""Fewest photos whose poses are found all at once: global mapping fails more often with few photos, incremental
+mapping drifts with many (measured: docs/howto/large.md)."""
 
 WORK, LOCK = ".clsplat_sfm_", "lock"
 """Beginning of the names of temporary folders, and name of the file in each that the process locks which uses it."""
