@@ -66,8 +66,8 @@ def train_block(
     """Train a block, unless its result exists; continue where an interrupted run has left a checkpoint.
 
     The Gaussians of the scene in the block and its margin train; the others that its photos show are drawn and stay
-    as they are. The result is what lies in the block after the training. A block without a margin keeps all that it has
-    trained, since nothing else trains what has left it.
+    as they are. The result is what lies in the block after the training. A block without a margin keeps all that it
+    has trained, since nothing else trains what has left it.
 
     Parameters
     ----------
