@@ -244,7 +244,7 @@ class McmcConfig:
 @dataclass(frozen=True)
 class ErrorConfig:
     """Growth to a cap in the places of the photos' errors (sources: clsplat.training.densify.error_guided; values
-    measured: docs/howto/strategies.md)."""
+    measured: docs/experiments/strategies.md)."""
 
     start: Annotated[int, within(least=0)] = 500
     """First iteration after which Gaussians are split or removed; earlier in short runs."""
@@ -272,7 +272,7 @@ class ErrorConfig:
 
 @dataclass(frozen=True)
 class FewViewsConfig:
-    """Settings for few photos (reasons: clsplat.training.few_views; effects: docs/howto/strategies.md)."""
+    """Settings for few photos (reasons: clsplat.training.few_views; effects: docs/experiments/strategies.md)."""
 
     below: Annotated[int, within(least=0)] = 17
     """Number of training photos below which the settings for few photos apply (0: never)."""

@@ -30,7 +30,7 @@ folder has of a scene."""
 
 PART = 1 << 13
 """Most rows of a part, 2 MB of degree 3. In smaller parts fewer rows are read that no photo shows; in larger ones the
-index is shorter, and a disk reads faster (effect: docs/howto/large.md)."""
+index is shorter, and a disk reads faster (effect: docs/experiments/blocks.md)."""
 
 
 class Part(NamedTuple):

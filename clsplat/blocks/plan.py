@@ -35,33 +35,33 @@ COARSE_SHARE = 1 / COARSE_FACTOR**2
 
 REFINING_LENGTHS = 1 / 2, 1
 """Iterations of the trainings of a block among the trained ones, as fractions of those of its first one (measured:
-docs/howto/large.md)."""
+docs/experiments/blocks.md)."""
 
 REFINING_MEANS = 1 / 10
 """Factor on the first learning rate of the means in these trainings. It becomes that of the middle of a training,
 in which the rate falls by a factor of 100."""
 
 REFINING_RATES = 1 / 2
-"""Factor on the other learning rates in these trainings (measured: docs/howto/large.md)."""
+"""Factor on the other learning rates in these trainings (measured: docs/experiments/blocks.md)."""
 
 NEAR = 0.25
 """Width of the surroundings that later trainings draw as they were trained, where memory is too small for all of
 them, as a fraction of the block's extent. Beyond, the coarse scene is drawn."""
 
 ROUNDS = 4
-"""Cuts after the first one, by which blocks that do not fit the memory become alike (effect: docs/howto/large.md)."""
+"""Cuts after the first one, by which blocks that do not fit become alike (effect: docs/experiments/blocks.md)."""
 
 WHOLE = 0.8
 """Part of a photo that a block and its margin have to fill for one visit in the block's length; other parts count in
-proportion (measured: docs/howto/large.md)."""
+proportion (measured: docs/experiments/blocks.md)."""
 
 RESERVE = 1 / 10
 """Fraction of the memory's limit that a plan leaves free: trained Gaussians are not spread as the coarse ones
-(effect: docs/howto/large.md)."""
+(effect: docs/experiments/blocks.md)."""
 
 COARSE_MEMORY = 1 / 2
 """Fraction of the memory's limit that the Gaussians of the coarse run may take. With less, they are larger, and
-photos belong to more blocks (effect: docs/howto/large.md)."""
+photos belong to more blocks (effect: docs/experiments/blocks.md)."""
 
 
 class Block(NamedTuple):

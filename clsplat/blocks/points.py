@@ -16,7 +16,7 @@ def sparse_start(scene: Scene, means: NDArray[np.float64], block: Block, config:
     """Make Gaussians at a block's sparse points, as a training that is not in blocks starts with.
 
     The coarse run has trained without the details that it could not show. Growth finds them again more slowly than
-    sparse points mark them (effect: docs/howto/large.md).
+    sparse points mark them (effect: docs/experiments/blocks.md).
 
     Parameters
     ----------

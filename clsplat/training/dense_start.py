@@ -3,7 +3,7 @@
 Each photo is compared with its neighbours on planes of constant depth (stage sweep). A depth counts if the windows
 are alike, and if the depths of other photos agree. Features leave gaps, where few large Gaussians would have to be
 split many times; with a denser start, growth begins where surfaces are (Kotovenko et al. 2025, "EDGS", begin with
-dense matches of a network). Measured: docs/howto/strategies.md.
+dense matches of a network). Measured: docs/experiments/strategies.md.
 """
 
 from collections.abc import Iterable

@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 FALL = 0.6
 """Fraction of the iterations after which the learning rates, except that of the means, fall (measured:
-docs/howto/strategies.md)."""
+docs/experiments/schedules.md)."""
 
 
 @dataclass

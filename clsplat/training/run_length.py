@@ -20,7 +20,7 @@ MOST_ITERATIONS = 30_000
 """Most iterations, those of the paper's longer setting."""
 
 FIRST_FACTOR: Final = 4
-"""Divisor of the edges of larger photos at the start (measured: docs/howto/strategies.md)."""
+"""Divisor of the edges of larger photos at the start (measured: docs/experiments/schedules.md)."""
 
 
 def largest_photo(scene: Scene) -> int:

@@ -21,7 +21,7 @@ PRICING_SHARE = 1 / 5
 photos show has no price in the others."""
 
 BAND_SHARES = (1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
-"""Fractions, tried in turn, of the bands that seem useless when each is removed alone (measured: docs/size.md)."""
+"""Fractions, tried in turn, of the bands that seem useless one by one (measured: docs/experiments/size.md)."""
 
 T = TypeVar("T")
 

@@ -25,14 +25,14 @@ from clsplat.training.run_length import SMALL_PHOTO, detail, largest_photo
 
 GROWTH_END = 0.4
 """Fraction of the iterations at which growth ends. The paper's densification ends at 0.5; the photos that are held
-back train longer if growth ends earlier (measured: docs/size.md)."""
+back train longer if growth ends earlier (measured: docs/experiments/size.md)."""
 
 TRIAL_LENGTH = 0.05
 """Fraction of the iterations in a trial of pruning."""
 
 TRIAL_RATES = 0.3
 """Factor on the learning rates in trials of pruning. Large steps make each Gaussian fluctuate, and the error by this
-grows with their number, so that the smaller side would win (measured: docs/size.md)."""
+grows with their number, so that the smaller side would win (measured: docs/experiments/size.md)."""
 
 PRUNING_END = 0.55
 """Fraction of the iterations at which trials of pruning end; all photos train afterwards."""
@@ -53,7 +53,7 @@ PATIENCE = 2.0
 
 PACE = 3.0
 """Multiple of the first Gaussians, or of the sparse points if these are fewer, that growth reaches by its end, unless
-`PER_PIXEL` allows more. Faster growth ends worse (measured: docs/size.md)."""
+`PER_PIXEL` allows more. Faster growth ends worse (measured: docs/experiments/size.md)."""
 
 PER_PIXEL = 1.0
 """Gaussians per pixel of a small photo that growth reaches by its end, unless `PACE` allows more. Larger photos allow
@@ -65,14 +65,14 @@ high."""
 
 FEWEST_PRUNING = 4
 """Fewest held-back photos that decide on pruning: by fewer a scene is halved that then loses in other photos
-(measured: docs/size.md)."""
+(measured: docs/experiments/size.md)."""
 
 HALVING = 0.5
 """Fraction of the Gaussians that a trial of pruning leaves."""
 
 LATER_GAIN = 0.12
 """Gain, dB, that twice the Gaussians still make between a trial of pruning and the end of the run: few Gaussians
-learn faster. The least of three captures (docs/size.md)."""
+learn faster. The least of three captures (docs/experiments/size.md)."""
 
 RANDOM_START = 10_000
 """Gaussians of a random start. Few are enough, since they only have to fill the scene before growth adds detail."""

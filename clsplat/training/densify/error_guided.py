@@ -24,22 +24,22 @@ CHILD_OPACITY = 1 / (2 * CHILD_SCALE)
 OTHERS = 8
 """Number k of other removals with the same effect on the image that a price allows for. If d is that effect, and r
 the render less the photo, k + 1 of them change the squared error by 2 r d + (k + 1) d^2 each: the price of one alone,
-2 r d + d^2, and k times the difference d^2 (measured: docs/howto/strategies.md)."""
+2 r d + d^2, and k times the difference d^2 (measured: docs/experiments/strategies.md)."""
 
 MEMORY = 0.9
 """Factor per round on the differences of earlier surveys. Ten rounds, which survey 100 photos, leave a third."""
 
 HARM = 1.0
 """Fall of the error, in even shares of it, above which Gaussians are removed while others grow (measured:
-docs/howto/strategies.md)."""
+docs/experiments/strategies.md)."""
 
 TOLL = 1.0
 """Squared error that a Gaussian pays for each pair of it and a pixel, in even shares of the error per pair:
-compositing takes the same time for every pair (measured: docs/howto/strategies.md)."""
+compositing takes the same time for every pair (measured: docs/experiments/strategies.md)."""
 
 SHARE_MIN = 0.1
 """Fraction of the training photos that must be surveyed for Gaussians to be removed by price: a Gaussian that few
-photos show seems useless in most surveys (measured: docs/howto/strategies.md)."""
+photos show seems useless in most surveys (measured: docs/experiments/strategies.md)."""
 
 
 class ErrorGuided(Strategy):

@@ -12,7 +12,7 @@ WINDOW = 0.1
 
 GROWTH = 1.25
 """Factor by which the number of Gaussians grows in a round with ``--size auto``, if the rounds before the next cap
-are enough to reach this one (measured: docs/size.md)."""
+are enough to reach this one (measured: docs/experiments/size.md)."""
 
 MOST_GROWTH = 2.0
 """Largest factor of a round with ``--size auto``: every Gaussian is split."""
