@@ -12,6 +12,10 @@ VISITS = 30
 FEWEST_ITERATIONS = 3000
 """Fewest iterations with photos of at most `SMALL_PHOTO` pixels: few photos, too, need time for growth."""
 
+FEW_LENGTH = 1 / 2
+"""Factor on the fewest iterations if the photos are too few to search the size (`FewViewsConfig`). Each photo trains
+often enough, and more iterations fit these photos only (measured: docs/experiments/schedules.md)."""
+
 SMALL_PHOTO = 90_000
 """Pixels up to which photos count as small. With larger ones the fewest iterations, and the number of Gaussians that
 growth may reach, are in proportion to the root of their edges (measured: docs/benchmarks.md)."""
@@ -48,8 +52,9 @@ def with_length(config: TrainConfig, scene: Scene) -> TrainConfig:
         size is fixed.
     """
     if not config.iterations:
-        fewest = round(FEWEST_ITERATIONS * detail(scene))
-        wanted = max(fewest, VISITS * len(scene.train))
+        few = len(scene.train) < config.few.below
+        fewest = FEWEST_ITERATIONS * detail(scene) * (FEW_LENGTH if few else 1)
+        wanted = max(round(fewest), VISITS * len(scene.train))
         config = replace(config, iterations=min(MOST_ITERATIONS, wanted))
     if not config.coarse.factor:
         factor: Literal[1, 4] = FIRST_FACTOR if config.size == "auto" and detail(scene) > 1 else 1

@@ -13,7 +13,10 @@ from clsplat.training.loop import train
 from clsplat.training.run_length import with_length
 
 
-@pytest.mark.parametrize(("photos", "iterations"), [(1, 3000), (100, 3000), (101, 3030), (255, 7650), (2000, 30_000)])
+@pytest.mark.parametrize(
+    ("photos", "iterations"),
+    [(1, 1500), (16, 1500), (17, 3000), (100, 3000), (101, 3030), (255, 7650), (2000, 30_000)],
+)
 def test_more_photos_take_more_iterations(device, photos, iterations):
     scene = small_scene(device)
     many = Scene(scene.train[:1] * photos, [], scene.points, scene.colors)
@@ -29,7 +32,13 @@ def with_photos(width: int, height: int, count: int) -> Scene:
 
 @pytest.mark.parametrize(
     ("size", "count", "iterations", "factor"),
-    [((300, 300), 3, 3000, 1), ((600, 600), 3, 4243, 4), ((600, 600), 300, 9000, 4), ((6000, 4000), 3, 12_123, 4)],
+    [
+        ((300, 300), 17, 3000, 1),
+        ((600, 600), 17, 4243, 4),
+        ((600, 600), 3, 2121, 4),
+        ((600, 600), 300, 9000, 4),
+        ((6000, 4000), 17, 12_123, 4),
+    ],
 )
 def test_larger_photos_take_more_iterations_and_start_smaller(size, count, iterations, factor):
     scene = with_photos(*size, 1)
