@@ -288,9 +288,9 @@ class TrainConfig:
     """Settings of a training; saved as ``config.json``, from which it can be repeated."""
 
     iterations: Annotated[int, within(least=0, most=UINT32_MAX)] = 0
-    """Optimisation steps; 0: 30 for each training photo, at least 3000 (1500 with few photos; more for photos over
-    90 000 pixels, in proportion to the root of their edges) and at most 30 000. In runs of fewer than 7000 (the
-    paper's shorter setting), the first densification and the bands of spherical harmonics come earlier."""
+    """Optimisation steps; 0: chosen by the photos. The choice is 30 for each training photo, at most 30 000 and at
+    least 3000, or 1500 with few photos; more with photos over 90 000 pixels, by the root of their edges. In runs of
+    fewer than 7000, the first densification and the bands of spherical harmonics come earlier."""
     seed: Annotated[int, within(least=0, most=UINT64_MAX)] = 0
     """Seed of the random start, of the order of the photos and of the strategy's random numbers."""
     optimizer: Literal["device", "numpy"] = "device"
