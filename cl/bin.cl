@@ -100,7 +100,7 @@ static inline void tile_columns(const Ellipses *e, ints row, int width, int heig
     pixels_between(e->x + x_min, e->x + x_max, width, &first, &last);
     const ints none = 0, column_end = last / TILE + 1;
     *begin = first / TILE;
-    *end = TO_INTS(met) & (first <= last) ? column_end : none;
+    *end = (TO_INTS(met) & (first <= last)) ? column_end : none;
 }
 
 // Action on a tile of splat g.

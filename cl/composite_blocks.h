@@ -174,6 +174,8 @@ DEFINE_POWER(8)
 #define POWERV power8
 #endif
 
+#include "composite_bands.h"
+
 // Counting zeros in one instruction makes compositing a tenth faster. OpenCL C 1.2 has no function for it, and Oclgrind
 // 21.10, which is based on Clang, cannot run the built-in (-DWITHOUT_CTZ).
 static inline uint lowest_bit(ulong bits) {
@@ -249,31 +251,24 @@ static inline void set_outline(Outlines *outlines, uint j, const Splat *s) {
 
 // Finds the blocks of the tile with corner (x0, y0) whose pixel centres the ellipses of LANES splats meet.
 static inline void find_blocks(const Outlines *outlines, uint g, int x0, int y0, Batch *batch) {
-    const REALV x = outlines->x[g] - (real)x0, y = outlines->y[g] - ((real)y0 + (real)0.5), zero = 0;
-    const REALV half_height = outlines->half_height[g], right = outlines->at_right[g], left = -right;
+    const REALV x = outlines->x[g] - (real)x0, y = outlines->y[g] - (real)y0;
 #if RAYS
-    const REALV inv_half_height = outlines->inv_half_height[g], slope = outlines->slope[g];
-    const REALV half_sq = outlines->half_sq[g];
+    const BandOutline outline = {x,
+                                 y - (real)0.5,
+                                 outlines->half_height[g],
+                                 outlines->inv_half_height[g],
+                                 outlines->at_right[g],
+                                 outlines->slope[g],
+                                 outlines->half_sq[g]};
 #else
-    const REALV inv_a = 1 / outlines->a[g], inv_half_height = 1 / half_height;
-    const REALV slope = (real)-0.5 * outlines->b[g] * inv_a;
-    const REALV half_sq = ((real)(LOG2_ALPHA_MIN - LOG2_E * EXTENT_SLACK) - outlines->level[g]) * inv_a;
+    const BandOutline outline = band_outline(x, y, outlines->half_height[g], outlines->at_right[g], outlines->a[g],
+                                             outlines->b[g], outlines->level[g]);
 #endif
     INTV halves[HALVES];
     _Pragma("unroll") for (int h = 0; h < HALVES; ++h) halves[h] = 0;
     _Pragma("unroll") for (int r = 0; r < ROWS; ++r) {
-        const REALV top = BLOCK_ROWS * r - y, bottom = top + (BLOCK_ROWS - 1);
-        const REALV at_left = CLAMP(left, top, bottom), at_right = CLAMP(right, top, bottom);
-        const REALV t_left = at_left * inv_half_height, t_right = at_right * inv_half_height;
-        const REALV sq_left = half_sq * GREATER(1 - t_left * t_left, zero);
-        const REALV sq_right = half_sq * GREATER(1 - t_right * t_right, zero);
-        const REALV x_min = x + slope * at_left - SQRTV(sq_left), x_max = x + slope * at_right + SQRTV(sq_right);
-        const MASKV met = (top <= half_height) & (bottom >= -half_height) & (x_min <= x_max);
-        // Block i has pixels from 4 i + 0.5 to 4 i + 3.5. Comparisons with NaN are false.
-        const REALV limit = COLUMNS;
-        REALV begin = (x_min + (real)0.5) / 4, end = (x_max + (real)3.5) / 4;
-        begin = LESSER(GREATER(begin, zero), limit);
-        end = met ? LESSER(GREATER(end, zero), limit) : begin;
+        REALV begin, end;
+        blocks_in_band(&outline, BLOCK_ROWS * r, BLOCK_ROWS * (r + 1) - 1, 4, COLUMNS, &begin, &end);
         const INTV bits = ((INTV)1 << TO_INTV(end)) - ((INTV)1 << TO_INTV(begin));
         halves[r * COLUMNS / 32] |= bits << (r * COLUMNS % 32);
     }

@@ -6,7 +6,9 @@
 // Forward mapping: one work-group per tile, one work-item per pixel, or for several pixels ITEMS apart if the device
 // has no groups of TILE*TILE work-items. The group loads BATCH splats at a time into local memory, and each work-item
 // composites them onto its pixels. A work-item whose pixels are finished or outside the image continues to load. The
-// group stops when live_pixels, the number of unfinished pixels, is 0.
+// group stops when live_pixels, the number of unfinished pixels, is 0. Small splats meet few of a tile's blocks of 8x4
+// pixels. The work-item that loads a splat finds these blocks, and the others skip the splat for all other blocks: work-items
+// that run in lockstep have the pixels of one block or of two.
 //
 // Backward mapping: one work-group of BATCH work-items per segment of SEGMENT splats of a tile's list, one work-item per
 // splat of a batch. The pixels of the tile pass from work-item to work-item. So long lists are shared by many groups:
@@ -35,7 +37,7 @@
 //
 // Buffers: as in composite_cpu.cl; states[M/SEGMENT,1+CHANNELS,TILE^2], the transmittance (0 or less: finished) and the
 // colours of the pixels where segments begin; reached[T], the number of entries of the tile's list that pixels met.
-// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (11 + CHANNELS), with RAYS (26 + CHANNELS),
+// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (12 + CHANNELS), with RAYS (27 + CHANNELS),
 // backward TILE^2 (2 + CHANNELS). With TILE 16, BATCH 64 and CHANNELS 4 this is 4 KiB (RAYS 7.5 KiB) and 6 KiB (double:
 // twice as much) of the 32 KiB that OpenCL 1.2 guarantees.
 // -DTILE=8|16|32   edge of a tile, px
@@ -51,6 +53,8 @@
 #error "-DITEMS must divide TILE*TILE, the number of pixels of a tile"
 #endif
 #include "composite_tiles.h"
+#define SQRTV(x) sqrt(x)
+#include "composite_bands.h"
 
 #if !defined(SEGMENT) || SEGMENT < 1
 #error "-DSEGMENT must give the number of splats per segment, 1 or more"
@@ -62,6 +66,25 @@
 // Number of splats in the batch at `first` of a list. Batches end where segments end.
 static inline uint batch_at(uint first, uint length) {
     return min(min((uint)BATCH, length - first), SEGMENT - first % SEGMENT);
+}
+
+// The blocks of 8x4 pixels of the tile with corner (x0, y0) that a splat meets, as bits, numbered as in pixel_of.
+static inline uint blocks_met(const Splat *s, int x0, int y0) {
+#if RAYS
+    const Outline *e = &s->outline;
+    const BandOutline outline = {
+        e->x - x0, e->y - y0 - (real)0.5, e->half_height, e->inv_half_height, e->at_right, e->slope, e->half_sq};
+#else
+    const BandOutline outline = band_outline(s->x - x0, s->y - y0, s->half_height, s->at_right, s->a, s->b, s->level);
+#endif
+    uint blocks = 0;
+    for (int row = 0; row < TILE / 4; ++row) {
+        real begin, end;
+        blocks_in_band(&outline, 4 * row, 4 * row + 3, 8, TILE / 8, &begin, &end);
+        for (int column = (int)begin; column < (int)end; ++column)
+            blocks |= 1u << (column * (TILE / 4) + row);
+    }
+    return blocks;
 }
 
 // Tile of a segment by its number: the last one whose first segment has at most this number.
@@ -81,6 +104,7 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
               const __global uint *tile_ranges, const __global real *background, __global real *image,
               __global real *alpha_image, const int saves, __global real *states, __global uint *reached DIRECTIONS) {
     __local Splat staged[BATCH];
+    __local uint met[BATCH];
     __local int live_pixels;
     const uint tile = get_group_id(0), lane = get_local_id(0);
     const int tiles_x = (width + TILE - 1) / TILE;
@@ -111,14 +135,20 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
                     state[(1 + k) * PIXELS + lane + o * ITEMS] = sums[o][k];
             }
         }
-        for (uint j = lane; j < count; j += ITEMS)
-            staged[j] = splats[gauss_ids[begin + first + j]];
+        for (uint j = lane; j < count; j += ITEMS) {
+            const Splat s = splats[gauss_ids[begin + first + j]];
+            staged[j] = s;
+            met[j] = blocks_met(&s, x0, y0);
+        }
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int o = 0; o < OWNED; ++o) {
             const int was_live = transmittance[o] > 0;
             const int2 pixel = pixel_of(x0, y0, lane + o * ITEMS);
             const real3 ray = was_live ? DIRECTIONS_OF((size_t)pixel.y * width + pixel.x) : (real3)0;
+            const uint block = (lane + o * ITEMS) / 32;
             for (uint j = 0; j < count && transmittance[o] > 0; ++j) {
+                if (!(met[j] >> block & 1))
+                    continue;
                 const Splat s = staged[j];
                 const Offset offset = offset_of(pixel, ray, &s);
                 Bend bend;

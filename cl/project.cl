@@ -10,7 +10,11 @@
 // If each pixel is sorted, also the disparity 1/z at which the ray of a pixel meets it (project_disparities).
 // docs/stages/project.md derives the gradients; clsplat/reference/project.py is the float64 twin.
 //
-// Mapping: a work-item takes the next LANES Gaussians (lanes.h); no local memory except for CAMERA_GRAD.
+// Mapping: a work-item takes the next LANES Gaussians (lanes.h). With LANES=1, the coefficients of spherical harmonics
+// are 4/5 of all parameters, and those of one Gaussian lie together: work-items that each went through a row of their
+// own would read and write scattered addresses. In the backward kernels, the work-items of a group therefore take the
+// coefficients of the group's Gaussians one after the other, from the gradients in local memory.
+// Local memory: 19 GROUP reals with LANES=1, and 16 GROUP with CAMERA_GRAD: 9 KiB for 64 work-items.
 //
 // Buffers, N Gaussians with K = (degree + 1)^2 coefficients stored, C = CHANNELS:
 //   in   means[N,3] world, log_scales[N,3] ln(world), quats[N,4] wxyz of any norm, logit_opacities[N], sh[N,K,3]
@@ -27,10 +31,11 @@
 //
 // -DCHANNELS=3|4      4: the depth is composited as a fourth channel
 // -DANTIALIASED=0|1   1: opacity compensation
-// -DCAMERA_GRAD=0|1   1: the backward kernels also write v_camera; requires -DGROUP, the work-group size
+// -DCAMERA_GRAD=0|1   1: the backward kernels also write v_camera
 // -DLENS=PINHOLE|ORTHOGRAPHIC|FISHEYE|EQUIRECTANGULAR  camera model (lens.h); the last one needs RAYS
 // -DRAYS=0|1          1: Gaussians are evaluated along rays; not with ORTHOGRAPHIC, whose affine projection is exact
 // -DLANES=1|8         Gaussians of a work-item
+// -DGROUP             number of work-items of a work-group of the backward kernels
 #ifndef LANES
 #error "-DLANES, the number of Gaussians of a work-item, must be given"
 #endif
@@ -52,8 +57,8 @@
 #if LENS == EQUIRECTANGULAR && !RAYS || LENS == ORTHOGRAPHIC && RAYS
 #error "-DLENS=EQUIRECTANGULAR needs -DRAYS=1, and -DLENS=ORTHOGRAPHIC needs -DRAYS=0"
 #endif
-#if CAMERA_GRAD && (!defined(GROUP) || GROUP < 1)
-#error "-DCAMERA_GRAD=1 needs -DGROUP, the work-group size of the backward kernels"
+#if !defined(GROUP) || GROUP < 1
+#error "-DGROUP must give the work-group size of the backward kernels, 1 or more"
 #endif
 
 // Number of spherical harmonics' coefficients that are rearranged together, and of their chunks. FOR_COEFFICIENTS takes
@@ -77,6 +82,7 @@
 #else
 #define VECTORS
 #endif
+#define GROUPED __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 
 // Scales and opacities after their activations.
 typedef struct {
@@ -482,6 +488,42 @@ static inline void sum_camera(const GaussianGrad *v, __local real *partial, __gl
 }
 #endif
 
+#if LANES == 1
+// What the gradients of a Gaussian's coefficients are made of, in local memory: the basis, then the gradient of the
+// colour. The number of values is odd, so that the rows of neighbouring work-items begin in different banks.
+#define ROW 19
+
+static inline void share_row(const real *basis, reals3 v_color, __local real *rows) {
+    __local real *row = rows + ROW * get_local_id(0);
+#pragma unroll
+    for (int k = 0; k < 16; ++k)
+        row[k] = basis[k];
+    row[16] = v_color.x;
+    row[17] = v_color.y;
+    row[18] = v_color.z;
+    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); // the coefficients are read before others change them
+}
+
+// A number of a group's coefficients: that of its Gaussian in the group, and its own in the Gaussian's row.
+typedef struct {
+    uint gaussian, number;
+} Place;
+
+// The place GROUP numbers behind, if rows have `width` numbers.
+static inline Place place_after(Place place, uint width) {
+    Place next = {place.gaussian + GROUP / width, place.number + GROUP % width};
+    if (next.number >= width) {
+        next.number -= width;
+        ++next.gaussian;
+    }
+    return next;
+}
+
+static inline real coefficient_grad(const __local real *rows, Place place) {
+    const __local real *row = rows + ROW * place.gaussian;
+    return row[place.number / 3] * row[16 + place.number % 3];
+}
+#else
 // Gradients of the coefficients from `first` on, in chunks: values[LANES k + lane] is the k-th chunk of a Gaussian.
 static inline void coefficients_grad(const reals *basis, reals3 v_color, int first, reals *values) {
     for (int k = 0; k < COEFFICIENTS; ++k) {
@@ -493,8 +535,9 @@ static inline void coefficients_grad(const reals *basis, reals3 v_color, int fir
     for (int k = 0; k < CHUNKS; ++k)
         transpose(values + LANES * k);
 }
+#endif
 
-__kernel VECTORS void
+__kernel VECTORS GROUPED void
 project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree, const __global real *means,
             const __global real *log_scales, const __global real *quats, const __global real *logit_opacities,
             const __global real *sh, const __global real *conics, const __global real *extents,
@@ -529,15 +572,22 @@ project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh
     __local real partial[16 * GROUP];
     sum_camera(&v, partial, v_camera);
 #endif
+#if LANES == 1
+    __local real rows[ROW * GROUP];
+    share_row(basis, v.color, rows);
+    const uint first_row = GROUP * get_group_id(0), width = 3 * sh_stride;
+    const uint count = min((uint)GROUP, n - first_row) * width;
+    Place place = {get_local_id(0) / width, get_local_id(0) % width};
+    for (uint k = get_local_id(0); k < count; k += GROUP, place = place_after(place, width))
+        v_sh[(size_t)first_row * width + k] = coefficient_grad(rows, place);
+#endif
     if (i >= n)
         return;
     store_vectors3(v_means, i, n, v.mean);
     store_vectors3(v_log_scales, i, n, v.log_scales);
     store_vectors4(v_quats, i, n, v.quat);
     store_numbers(v_logit_opacities, i, n, v.logit_opacity);
-#if LANES == 1
-#pragma unroll
-#endif
+#if LANES == 8
     FOR_COEFFICIENTS(first, sh_stride) {
         reals values[3 * COEFFICIENTS];
         coefficients_grad(basis, v.color, first, values);
@@ -548,6 +598,7 @@ project_bwd(const uint n, const Camera camera, const int sh_stride, const int sh
                              values + LANES * k + lane);
         }
     }
+#endif
 }
 
 DEFINE_ADAM()
@@ -591,24 +642,60 @@ static inline void update_vectors3(const Adam *adam, real rate, reals3 g, size_t
         update_chunk(adam, rate, c[k], 3 * i + LANES * k, 3 * n, a);
 }
 
-// project_bwd and the step of Adam (adam.cl) in one pass, with the gradients in registers.
-__kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
-                                       const Adam adam, __global real *means, __global real *log_scales,
-                                       __global real *quats, __global real *logit_opacities, __global real *sh,
-                                       __global real *means_1, __global real *log_scales_1, __global real *quats_1,
-                                       __global real *logit_opacities_1, __global real *sh_1, __global real *means_2,
-                                       __global real *log_scales_2, __global real *quats_2,
-                                       __global real *logit_opacities_2, __global real *sh_2,
-                                       const __global real *conics, const __global real *extents,
-                                       const __global real *colors, const __global real *v_means2d,
-                                       const __global real *v_conics,
-#if RAYS
-                                       const __global real *v_slopes,
+#if LANES == 1
+// Number of values that a work-item loads before it stores the first of them, so that their latencies overlap.
+#define OVERLAPPED 4
+
+// Updates the first `active` coefficients of all Gaussians of the group.
+static inline void update_coefficients(const Adam *adam, const __local real *rows, uint n, int sh_stride, int active,
+                                       AdamArrays a) {
+    const uint first_row = GROUP * get_group_id(0), width = 3 * active;
+    const uint count = min((uint)GROUP, n - first_row) * width;
+    Place place = {get_local_id(0) / width, get_local_id(0) % width};
+    for (uint k = get_local_id(0); k < count; k += OVERLAPPED * GROUP) {
+        real p[OVERLAPPED], m[OVERLAPPED], v[OVERLAPPED], g[OVERLAPPED], rates[OVERLAPPED];
+        size_t at[OVERLAPPED];
+#pragma unroll
+        for (int o = 0; o < OVERLAPPED; ++o) {
+            if (k + o * GROUP < count) {
+                at[o] = (size_t)(first_row + place.gaussian) * (3 * sh_stride) + place.number;
+                p[o] = a.parameters[at[o]];
+                m[o] = a.first[at[o]];
+                v[o] = a.second[at[o]];
+                g[o] = coefficient_grad(rows, place);
+                rates[o] = place.number < 3 ? adam->sh0 : adam->sh_rest;
+            }
+            place = place_after(place, width);
+        }
+#pragma unroll
+        for (int o = 0; o < OVERLAPPED; ++o) {
+            if (k + o * GROUP < count) {
+                a.parameters[at[o]] = adam_update(adam, rates[o], p[o], g[o], &m[o], &v[o]);
+                a.first[at[o]] = m[o];
+                a.second[at[o]] = v[o];
+            }
+        }
+    }
+}
 #endif
-                                       const __global real *v_opacities, const __global real *v_colors
+
+// project_bwd and the step of Adam (adam.cl) in one pass, with the gradients in registers or in local memory.
+__kernel VECTORS GROUPED void
+project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const int sh_degree, const Adam adam,
+                 __global real *means, __global real *log_scales, __global real *quats,
+                 __global real *logit_opacities, __global real *sh, __global real *means_1,
+                 __global real *log_scales_1, __global real *quats_1, __global real *logit_opacities_1,
+                 __global real *sh_1, __global real *means_2, __global real *log_scales_2, __global real *quats_2,
+                 __global real *logit_opacities_2, __global real *sh_2, const __global real *conics,
+                 const __global real *extents, const __global real *colors, const __global real *v_means2d,
+                 const __global real *v_conics,
+#if RAYS
+                 const __global real *v_slopes,
+#endif
+                 const __global real *v_opacities, const __global real *v_colors
 #if CAMERA_GRAD
-                                       ,
-                                       __global real *v_camera
+                 ,
+                 __global real *v_camera
 #endif
 ) {
     const size_t i = LANES * get_global_id(0);
@@ -630,6 +717,12 @@ __kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const 
 #if CAMERA_GRAD
     __local real partial[16 * GROUP];
     sum_camera(&v, partial, v_camera);
+#endif
+    const AdamArrays of_sh = {sh, sh_1, sh_2};
+#if LANES == 1
+    __local real rows[ROW * GROUP];
+    share_row(basis, v.color, rows);
+    update_coefficients(&adam, rows, n, sh_stride, coefficients_of(sh_degree), of_sh);
 #endif
     if (i >= n)
         return;
@@ -656,7 +749,7 @@ __kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const 
     }
 
     const AdamArrays of_means = {means, means_1, means_2}, of_scales = {log_scales, log_scales_1, log_scales_2};
-    const AdamArrays of_quats = {quats, quats_1, quats_2}, of_sh = {sh, sh_1, sh_2};
+    const AdamArrays of_quats = {quats, quats_1, quats_2};
     const AdamArrays of_opacities = {logit_opacities, logit_opacities_1, logit_opacities_2};
     update_vectors3(&adam, adam.means, v.mean, i, n, of_means);
     update_vectors3(&adam, adam.log_scales, v.log_scales, i, n, of_scales);
@@ -666,15 +759,12 @@ __kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const 
         update_chunk(&adam, adam.quats, quat[k], 4 * i + LANES * k, 4 * n, of_quats);
     update_chunk(&adam, adam.logit_opacities, v.logit_opacity, i, n, of_opacities);
 
+#if LANES == 8
     const int active = coefficients_of(sh_degree);
     const reals sh0 = adam.sh0, sh_rest = adam.sh_rest;
-#if LANES == 1
-#pragma unroll
-#endif
     FOR_COEFFICIENTS(first, active) {
         reals values[3 * COEFFICIENTS];
         coefficients_grad(basis, v.color, first, values);
-#if LANES == 8
         if (i + LANES <= n && first + COEFFICIENTS <= active) {
             for (int lane = 0; lane < LANES; ++lane) {
                 const size_t begin = 3 * ((i + lane) * sh_stride + first);
@@ -686,7 +776,6 @@ __kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const 
             }
             continue;
         }
-#endif
         for (int lane = 0; lane < LANES && i + lane < n; ++lane) {
             const size_t row = (i + lane) * sh_stride;
             for (int k = 0; k < CHUNKS; ++k) {
@@ -696,4 +785,5 @@ __kernel VECTORS void project_bwd_adam(const uint n, const Camera camera, const 
             }
         }
     }
+#endif
 }

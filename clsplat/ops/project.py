@@ -11,8 +11,9 @@ from clsplat.gaussians import Gaussians
 from clsplat.stages import AdamStep, AnyGrads, AnySplats, CameraGrads, RaySplats, Splats
 from clsplat.structs import adam_struct, camera_struct, lens_define
 
-CAMERA_GROUP = 64
-"""Gaussians per work-group of a backward kernel that adds up the gradient of the camera, in 4 KiB of local memory."""
+GROUPED = 64
+"""Gaussians per work-group of the backward kernels on a GPU, and of those that add up the gradient of the camera. Each
+has 76 to 140 bytes of local memory."""
 
 LANES = 8
 """Gaussians per work-item on a CPU, in the vectors of cl/lanes.h."""
@@ -156,20 +157,24 @@ def _defines(
     device: Device, camera: Camera, channels: int, antialiased: bool, camera_grad: bool = False, rays: bool = False
 ) -> dict[str, Any]:
     """Defines of the kernels for a camera. With those of a wide lens, a work-item takes one Gaussian (cl/lens.h)."""
+    lanes = LANES if device.is_cpu and camera.model in ("pinhole", "orthographic") else 1
+    # Groups of several work-items make PoCL keep the intermediate values of all of them in memory.
+    group = device.group(GROUPED // lanes) if camera_grad or not device.is_cpu else 1
     return {
         "CHANNELS": channels,
         "ANTIALIASED": int(antialiased),
         "CAMERA_GRAD": int(camera_grad),
         "LENS": lens_define(camera, rays),
         "RAYS": int(rays),
-        "LANES": LANES if device.is_cpu and camera.model in ("pinhole", "orthographic") else 1,
+        "LANES": lanes,
+        "GROUP": group,
     }
 
 
 def _launch(device: Device, kernel: str, n: int, arguments: list[Any], defines: dict[str, Any]) -> None:
-    # Groups of several work-items would make PoCL keep the intermediate values of all of them in memory.
-    lanes, group = defines["LANES"], (1,) if device.is_cpu else None
-    device.launch("project", kernel, (-(-n // lanes),), arguments, defines=defines, group=group)
+    group = defines["GROUP"]
+    groups = -(-n // (group * defines["LANES"]))
+    device.launch("project", kernel, (groups * group,), arguments, defines=defines, group=(group,))
 
 
 def _backward(
@@ -179,17 +184,8 @@ def _backward(
     if not defines["CAMERA_GRAD"]:
         _launch(device, kernel, n, arguments, defines)
         return None
-    group = device.group(CAMERA_GROUP // defines["LANES"])
-    groups = -(-n // (group * defines["LANES"]))
-    partial = device.empty("v_camera", (groups, 16))
-    device.launch(
-        "project",
-        kernel,
-        (groups * group,),
-        [*arguments, partial],
-        defines=defines | {"GROUP": group},
-        group=(group,),
-    )
+    partial = device.empty("v_camera", (-(-n // (defines["GROUP"] * defines["LANES"])), 16))
+    _launch(device, kernel, n, [*arguments, partial], defines)
     total = partial.get().astype(np.float64).sum(axis=0)
     v_viewmat = np.zeros((4, 4))
     v_viewmat[:3, :3] = total[:9].reshape(3, 3)

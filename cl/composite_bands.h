@@ -1,0 +1,47 @@
+// Where splats meet bands of pixel rows: the blocks of pixels that a splat visits follow from it. REALV is the type of
+// one number for each splat that is looked at, MASKV that of a comparison; SQRTV and CLAMP work on them.
+#ifndef CLSPLAT_COMPOSITE_BANDS_H
+#define CLSPLAT_COMPOSITE_BANDS_H
+
+// Outlines of splats (ellipse.h), relative to pixel 0 of a tile's first row.
+typedef struct {
+    REALV x, y; // of the centre from the tile's corner, px; y from the centre of the first row
+    REALV half_height, inv_half_height, at_right, slope, half_sq;
+} BandOutline;
+
+#if !RAYS
+// The outlines of splats with the centre (x, y) from the corner of a tile; their other numbers as in Splat.
+static inline BandOutline band_outline(REALV x, REALV y, REALV half_height, REALV at_right, REALV a, REALV b,
+                                       REALV level) {
+    const REALV inv_a = 1 / a;
+    const BandOutline o = {x,
+                           y - (real)0.5,
+                           half_height,
+                           1 / half_height,
+                           at_right,
+                           (real)-0.5 * b * inv_a,
+                           ((real)(LOG2_ALPHA_MIN - LOG2_E * EXTENT_SLACK) - level) * inv_a};
+    return o;
+}
+#endif
+
+// The numbers [begin, end) of the blocks of `width` pixels, of `count` in a row, that splats meet in the pixel rows
+// from `first` to `last` of the tile. Equal for splats that meet none.
+static inline void blocks_in_band(const BandOutline *o, int first, int last, int width, int count, REALV *begin,
+                                  REALV *end) {
+    const REALV zero = 0, limit = count, right = o->at_right, left = -right;
+    const REALV top = first - o->y, bottom = top + (last - first);
+    const REALV at_left = CLAMP(left, top, bottom), at_right = CLAMP(right, top, bottom);
+    const REALV t_left = at_left * o->inv_half_height, t_right = at_right * o->inv_half_height;
+    const REALV sq_left = o->half_sq * GREATER(1 - t_left * t_left, zero);
+    const REALV sq_right = o->half_sq * GREATER(1 - t_right * t_right, zero);
+    const REALV x_min = o->x + o->slope * at_left - SQRTV(sq_left);
+    const REALV x_max = o->x + o->slope * at_right + SQRTV(sq_right);
+    const MASKV met = (top <= o->half_height) & (bottom >= -o->half_height) & (x_min <= x_max);
+    // Block i has pixels from width i + 0.5 to width (i + 1) - 0.5. Comparisons with NaN are false.
+    const REALV from = (x_min + (real)0.5) / width, to = (x_max + (width - (real)0.5)) / width;
+    *begin = LESSER(GREATER(from, zero), limit);
+    *end = met ? LESSER(GREATER(to, zero), limit) : *begin;
+}
+
+#endif
