@@ -38,8 +38,8 @@ class RenderConfig:
     mode: Mode = "classic"
     """classic: the paper's dilation by 0.3 px^2. antialiased: the opacity is compensated for it (Mip-Splatting)."""
     tile_size: Literal["auto", 8, 16, 32] = "auto"
-    """Edge of a tile, px. It changes the speed, not the image. auto: 32 on CPUs with vectors of 16 numbers (AVX-512),
-    otherwise 16."""
+    """Edge of a tile, px. It changes the speed, not the image. auto: 8 on GPUs, 32 on CPUs with vectors of 16 numbers
+    (AVX-512), otherwise 16."""
     compositor: Literal["auto", "cpu", "gpu"] = "auto"
     """Kernel variant of the compositing stage; auto chooses by the type of the device."""
     sort: Literal["auto", "global", "per_tile", "pixel"] = "auto"

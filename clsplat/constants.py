@@ -62,8 +62,17 @@ drawn, not the rounding of an extent in float32, so that all tile sizes give the
 0.02 % at opacity 1."""
 
 TILE = 16
-"""Edge of a tile, px. 16x16 work-items are a work-group that every GPU accepts. CPUs with vectors of 8 numbers gain
-nothing from larger tiles."""
+"""Edge of a tile, px, on CPUs with vectors of 8 numbers, which gain nothing from larger tiles, and where each pixel
+sorts its splats."""
+
+GPU_TILE = 8
+"""Edge of a tile on GPUs, px. Each work-item takes all splats of its tile, so that small tiles save work where splats
+are small (measured: docs/stages/composite.md)."""
+
+SEGMENT = 64
+"""Splats of a tile's list that a work-group of a GPU's backward pass composites. Lists that are longer are shared by
+several groups, for each of which the forward pass saves 4 (1 + C) bytes per pixel of the tile (measured:
+docs/stages/composite.md)."""
 
 WIDE_TILE = 32
 """Edge of a tile on CPUs with vectors of 16 numbers, px: fewer lists, which such CPUs process faster (measured:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clsplat import reference
 from clsplat.camera import Camera
 from clsplat.config import RenderConfig
-from clsplat.constants import TILE, WIDE_TILE
+from clsplat.constants import GPU_TILE, TILE, WIDE_TILE
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.ranges import check
@@ -136,8 +136,12 @@ class Renderer:
             return max(camera.width, camera.height)
         if self.config.tile_size != "auto":
             return self.config.tile_size
-        by_tile = self.device.is_cpu and self.config.compositor != "gpu" and self.config.sort != "pixel"
-        return WIDE_TILE if by_tile and self.device.vector_width == WIDE_TILE // 2 else TILE
+        if self.config.sort == "pixel":
+            return TILE
+        compositor = self.config.compositor
+        if compositor == "gpu" or (compositor == "auto" and not self.device.is_cpu):
+            return GPU_TILE
+        return WIDE_TILE if self.device.vector_width == WIDE_TILE // 2 else TILE
 
     def upload(self, name: str, array: Any, dtype: Any = None) -> Any:
         """An array where the stages run: on the device in its precision, or float64; `dtype` names another type."""

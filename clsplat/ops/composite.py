@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from clsplat.constants import SEGMENT
 from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.stages import AnyGrads, AnySplats, Bins, Image, RayGrads, RaySplats, SplatGrads
@@ -11,10 +12,6 @@ from clsplat.stages import AnyGrads, AnySplats, Bins, Image, RayGrads, RaySplats
 # Number of splats per batch of the GPU variant without subgroups. Each is a work-item of the backward kernel. Known
 # GPUs run 16 or 32 work-items in lockstep.
 GPU_BATCH = 64
-
-SEGMENT = 256
-"""Splats of a tile's list that a work-group of the GPU variant's backward pass composites. Lists that are longer are
-shared by several groups, for each of which the forward pass saves 4 (1 + C) bytes per pixel of the tile."""
 
 # Number of splats that a pixel composites in one round if pixels are sorted. It changes the speed, not the image.
 WINDOW = 32

@@ -12,8 +12,8 @@ from clsplat.stages import AdamStep, AnyGrads, AnySplats, CameraGrads, RaySplats
 from clsplat.structs import adam_struct, camera_struct, lens_define
 
 GROUPED = 64
-"""Gaussians per work-group of the backward kernels on a GPU, and of those that add up the gradient of the camera. Each
-has 76 to 140 bytes of local memory."""
+"""Gaussians per work-group of the backward kernels on a GPU, and of those that add up the gradient of the camera, in
+76 to 140 bytes of local memory each."""
 
 LANES = 8
 """Gaussians per work-item on a CPU, in the vectors of cl/lanes.h."""

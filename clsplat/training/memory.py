@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clsplat.config import TrainConfig
+from clsplat.constants import GPU_TILE, SEGMENT
 from clsplat.errors import InputError
 from clsplat.scene import Scene, View
 
@@ -38,7 +39,8 @@ PER_INTERSECTION = {
 }
 PER_INTERSECTION_RAYS = 4  # gradients per intersection
 PER_GAUSSIAN_GPU = 2  # bin: tiles per Gaussian and their sums, in the order by depth
-PER_INTERSECTION_GPU = 6 + 4  # bin: intersections twice more, sort keys and sort order twice; states of 256 pixels
+PER_INTERSECTION_GPU = 6  # bin: intersections twice more, sort keys and sort order twice
+PER_STATE = 4  # composite: transmittance and colour of a pixel where a segment begins
 PER_INTERSECTION_PER_TILE = 4  # bin: list keys; of the sorts, what is not shared with the sort by depth
 PER_PIXEL = {
     "composite": 4,  # image 3, alpha
@@ -72,7 +74,7 @@ class Footprint:
     sh_degree : int
         Highest degree of the spherical harmonics.
     gpu : bool
-        Whether the device is not a CPU: intersections are then sorted differently.
+        Whether the device is not a CPU: intersections are then sorted differently, and states of pixels saved.
     per_tile : bool
         Whether ``--sort per_tile`` is used.
     exposure : bool
@@ -83,6 +85,8 @@ class Footprint:
         With ``--projection ray`` 1, or 2 if a photo is not of a pinhole; otherwise 0.
     depth : bool
         Whether photos have depth maps.
+    gpu_tile : int
+        Edge of the tiles on a GPU, px.
     """
 
     width: int
@@ -94,6 +98,7 @@ class Footprint:
     backdrop: int = 0
     rays: int = 0
     depth: bool = False
+    gpu_tile: int = GPU_TILE
 
     @classmethod
     def of(cls, scene: Scene, config: TrainConfig, device: "Device", backdrop: int = 0) -> "Footprint":
@@ -105,7 +110,8 @@ class Footprint:
         rays = (config.render.projection == "ray") * (1 + own_charts)
         depth = any(view.depth is not None for view in scene.train)
         gpu, degree = not device.is_cpu, config.init.sh_degree
-        return cls(width, height, degree, gpu, per_tile, config.exposure, backdrop, rays, depth)
+        tile = GPU_TILE if config.render.tile_size == "auto" else config.render.tile_size
+        return cls(width, height, degree, gpu, per_tile, config.exposure, backdrop, rays, depth, tile)
 
     def per_gaussian(self, intersections: float = INTERSECTIONS) -> float:
         """Bytes per Gaussian, if each meets `intersections` tiles."""
@@ -119,10 +125,12 @@ class Footprint:
         return 11 + 3 * (self.sh_degree + 1) ** 2
 
     @property
-    def _per_intersection(self) -> int:
-        per_intersection = sum(PER_INTERSECTION.values()) + (self.rays > 0) * PER_INTERSECTION_RAYS
+    def _per_intersection(self) -> float:
+        per_intersection: float = sum(PER_INTERSECTION.values()) + (self.rays > 0) * PER_INTERSECTION_RAYS
         per_intersection += self.depth * PER_INTERSECTION_DEPTH
-        return per_intersection + self.gpu * PER_INTERSECTION_GPU + self.per_tile * PER_INTERSECTION_PER_TILE
+        if self.gpu:
+            per_intersection += PER_INTERSECTION_GPU + PER_STATE * self.gpu_tile**2 / SEGMENT
+        return per_intersection + self.per_tile * PER_INTERSECTION_PER_TILE
 
     @property
     def fixed(self) -> int:

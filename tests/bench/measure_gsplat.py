@@ -1,8 +1,8 @@
 """Time gsplat's CUDA kernels and clsplat's on the same GPU, scenes and views, alternately.
 
-gsplat's step is its forward and backward pass and Adam as in its trainer, without a loss: the gradient of the image is
-given. clsplat's step is a whole training step, with the loss. Both show the same image; the difference is printed.
-Needs torch with CUDA and gsplat: pip install torch gsplat.
+gsplat's step is its forward and backward pass and Adam as in its trainer, without a loss: the gradient of the image
+is given. clsplat's step is a whole training step, with the loss. Both show the same image; the difference is printed.
+Needs torch with CUDA, and gsplat: pip install torch gsplat.
 """
 
 import argparse

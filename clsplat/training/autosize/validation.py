@@ -84,8 +84,12 @@ def _quality(image: NDArray[np.uint8], view: View, renderer: Renderer, fitted: b
     counts = np.ones(image.shape[:2], bool) if view.mask is None else view.mask
     if fitted:
         image = to_uint8(colors_fitted(image / 255, view.image / 255, counts))
-    square = float(np.mean((image[counts] / 255 - view.image[counts] / 255) ** 2))
-    rgb, photo = renderer.upload("rgb", image / 255), renderer.upload("photo", view.image, np.uint8)
+    differences = np.subtract(image, view.image, dtype=np.int32)
+    if view.mask is not None:
+        differences = differences[counts]
+    square = float(np.mean(differences**2)) / 255**2
+    rgb = renderer.upload("rgb", np.divide(image, 255, dtype=renderer.real))
+    photo = renderer.upload("photo", view.image, np.uint8)
     unlike, _ = renderer.stages.l1_ssim(rgb, photo, 1.0, renderer.upload("mask", counts, np.uint8))
     return (decibels(square) + decibels(float(unlike) / counts.mean())) / 2
 

@@ -92,7 +92,8 @@ class ErrorGuided(Strategy):
         wanted = max(0, target - len(live))
         blamed = live[np.argsort(-errors[live], kind="stable")[:wanted]]
         parents = np.sort(blamed[errors[blamed] > 0])
-        kept = np.setdiff1d(live, parents)
+        doomed[parents] = True
+        kept = np.flatnonzero(~doomed)
         result = Gaussians.concatenate([gaussians.take(kept), *split(gaussians.take(parents))])
         rows = np.concatenate([kept, parents, parents])
         fresh = np.arange(len(rows)) >= len(kept)
