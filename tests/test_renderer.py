@@ -99,13 +99,15 @@ def test_a_backdrop_is_drawn_and_has_no_gradients(device, where, sort):
     [
         (16, True, {}, 32),
         (8, True, {}, 16),
-        (16, False, {}, 16),
-        (16, True, {"compositor": "gpu"}, 16),
+        (16, False, {}, 8),
+        (16, True, {"compositor": "gpu"}, 8),
+        (16, False, {"compositor": "cpu"}, 32),
+        (16, False, {"sort": "pixel"}, 16),
         (16, True, {"sort": "pixel"}, 16),
         (8, True, {"tile_size": 32}, 32),
     ],
 )
-def test_tiles_are_large_where_a_work_item_has_one_and_vectors_are_wide(width, is_cpu, settings, size):
+def test_the_size_of_tiles_follows_the_variant_and_its_vectors(width, is_cpu, settings, size):
     device = Device()
     device.vector_width, device.is_cpu = width, is_cpu  # shadow the cached properties
     camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, 1, 0), 50, 40, 30)

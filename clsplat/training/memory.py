@@ -39,9 +39,9 @@ PER_INTERSECTION = {
 }
 PER_INTERSECTION_RAYS = 4  # gradients per intersection
 PER_GAUSSIAN_GPU = 2  # bin: tiles per Gaussian and their sums, in the order by depth
-PER_INTERSECTION_GPU = 6  # bin: intersections twice more, sort keys and sort order twice
+PER_INTERSECTION_GPU = 4  # bin: six lists while they are sorted, two of which are kept
 PER_STATE = 4  # composite: transmittance and colour of a pixel where a segment begins
-PER_INTERSECTION_PER_TILE = 4  # bin: list keys; of the sorts, what is not shared with the sort by depth
+PER_INTERSECTION_PER_TILE = 4  # bin, on a CPU: list keys; of the sorts, what is not shared with the sort by depth
 PER_PIXEL = {
     "composite": 4,  # image 3, alpha
     "loss": 3 + 9 + 1,  # v_image, derivatives of SSIM, v_alpha
@@ -129,7 +129,7 @@ class Footprint:
         per_intersection: float = sum(PER_INTERSECTION.values()) + (self.rays > 0) * PER_INTERSECTION_RAYS
         per_intersection += self.depth * PER_INTERSECTION_DEPTH
         if self.gpu:
-            per_intersection += PER_INTERSECTION_GPU + PER_STATE * self.gpu_tile**2 / SEGMENT
+            return per_intersection + PER_INTERSECTION_GPU + PER_STATE * self.gpu_tile**2 / SEGMENT
         return per_intersection + self.per_tile * PER_INTERSECTION_PER_TILE
 
     @property
