@@ -40,7 +40,7 @@ def main():
         splats = ops.project_fwd(device, gaussians, camera, 0)
         m = ops.bin_splats(device, splats, camera.width, camera.height, TILE_SIZE).gauss_ids.shape[0]
         cells = [
-            f"{wall:.1f} ({cpu:.1f})" for wall, cpu in measure(device, splats, camera.width, camera.height).values()
+            f"{wall:.2f} ({cpu:.2f})" for wall, cpu in measure(device, splats, camera.width, camera.height).values()
         ]
         print(f"| {name} | {m / 1e6:.2f} M | " + " | ".join(cells) + " |", flush=True)
 
