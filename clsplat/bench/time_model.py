@@ -51,15 +51,11 @@ class Hardware:
     source: str
 
 
-LAUNCH_DISCRETE, LAUNCH_MOBILE = 5e-6, 2e-5
-"""Assumed seconds per queued launch of a discrete GPU and of one in a mobile chip. No vendor publishes them."""
+LAUNCH_DISCRETE, LAUNCH_MOBILE = 1.5e-5, 2e-5
+"""Assumed seconds per launch of a discrete GPU and of one in a mobile chip, with the wait for its end. No vendor
+publishes them; an NVIDIA H200 took 13 to 17 us (docs/results/kernels-h200.json)."""
 
 HARDWARE = (
-    Hardware(
-        "NVIDIA H200",
-        Limits(LAUNCH_DISCRETE, 4.8e12, 67e12, 132 * 16 * 1.98e9),
-        "data sheet: 4.8 TB/s, 67 TFLOPS; CUDA C++ programming guide: 16 exp2 per multiprocessor and cycle",
-    ),
     Hardware(
         "AMD RX 7900 XTX",
         Limits(LAUNCH_DISCRETE, 0.96e12, 61.4e12, 96 * 16 * 2.5e9),

@@ -13,7 +13,9 @@ COLUMNS = ("launches", "bytes", "exps", "operations")
 
 
 def model_text(results: Results) -> str:
-    """Coefficients of the model, its errors on workloads that were left out, and its predictions for other devices.
+    """Coefficients of the model, its errors on workloads that were left out, and, from a GPU, predictions for others.
+
+    GPUs run other kernels than CPUs, so that a CPU's results predict no GPU (docs/benchmarks.md).
 
     Parameters
     ----------
@@ -27,6 +29,8 @@ def model_text(results: Results) -> str:
         cells = [f"{named[name]:.3g}" if name in named else "" for name in COLUMNS]
         name = f"`{stage}`" if stage in model else "whole step"
         rows.append((name, *cells, _percent(np.median(np.abs(found))), _percent(np.abs(found).max())))
+    if results["device"]["kind"] == "cpu":
+        return table(rows)
     largest = max(results["workloads"], key=lambda w: w["gaussians"] * w["width"] * w["height"])
     times = {hardware.name: predicted(model, largest, hardware.limits) for hardware in HARDWARE}
     header = ("device, step of " + largest["name"], "step, ms", *(f"`{stage}`" for stage in model))

@@ -88,7 +88,7 @@ def projected(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Places in the image (N, 2), depths (N,), and whether the points (N, 3) of the world are in the image."""
     with np.errstate(divide="ignore", invalid="ignore"):  # a point in the plane of the camera has no place
-        found = lens(camera, points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3])
+        found = lens(camera, points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3], derivatives=False)
         places = found["means2d"]
         inside = found["seen"] & ((places >= 0) & (places < [camera.width, camera.height])).all(axis=1)
     return places, found["depths"], inside

@@ -15,8 +15,15 @@ AXIS = 1e-3
 digits than the truncation of the series, O((rho/z)^6)."""
 
 
-def lens(camera: Camera, points: Array) -> dict[str, Any]:
+def lens(camera: Camera, points: Array, *, derivatives: bool = True) -> dict[str, Any]:
     """Image positions of points (N, 3) in the camera's frame, with derivatives to second order.
+
+    Parameters
+    ----------
+    camera : Camera
+    points : (N, 3) array
+    derivatives : bool
+        False to leave out what only derivatives need: jacobian to jacobian_by below.
 
     Returns
     -------
@@ -31,11 +38,9 @@ def lens(camera: Camera, points: Array) -> dict[str, Any]:
         return _sphere(camera, points)
     n, focal = len(points), np.array([camera.fx, camera.fy])
     x, y, z = points.T
-    hessian, means2d_by, jacobian_by = np.zeros((n, 2, 3, 3)), np.zeros((n, 2, 4)), np.zeros((n, 2, 3, 4))
-    means2d_by[:, [0, 1], [2, 3]] = 1
     depths, onward, seen = z, np.broadcast_to([0.0, 0.0, 1.0], (n, 3)), z > camera.near_depth
     if camera.model == "orthographic":
-        slopes, slope_jacobian = points[:, :2], np.tile(np.eye(2, 3), (n, 1, 1))
+        slopes = points[:, :2]
     elif camera.model == "fisheye":
         depths = np.linalg.norm(points, axis=1)
         onward, seen = (
@@ -45,6 +50,17 @@ def lens(camera: Camera, points: Array) -> dict[str, Any]:
         s, gradient, second = _radial(camera, points)
         # (x s)_jk = e_j s_k + e_k s_j + x s_jk, and the same for y
         slopes = points[:, :2] * s[:, None]
+    else:
+        slopes = points[:, :2] / z[:, None]
+    found = dict(means2d=slopes * focal + [camera.cx, camera.cy], depths=depths, onward=onward, seen=seen)
+    if not derivatives:
+        return found
+
+    hessian, means2d_by, jacobian_by = np.zeros((n, 2, 3, 3)), np.zeros((n, 2, 4)), np.zeros((n, 2, 3, 4))
+    means2d_by[:, [0, 1], [2, 3]] = 1
+    if camera.model == "orthographic":
+        slope_jacobian = np.tile(np.eye(2, 3), (n, 1, 1))
+    elif camera.model == "fisheye":
         across = np.eye(2, 3)
         slope_jacobian = across * s[:, None, None] + points[:, :2, None] * gradient[:, None]
         hessian = (
@@ -52,7 +68,6 @@ def lens(camera: Camera, points: Array) -> dict[str, Any]:
         )
         hessian = focal[:, None, None] * (hessian + points[:, :2, None, None] * second[:, None])
     else:
-        slopes = points[:, :2] / z[:, None]
         slope_jacobian = np.zeros((n, 2, 3))
         slope_jacobian[:, [0, 1], [0, 1]] = 1 / z[:, None]
         slope_jacobian[:, :, 2] = -slopes / z[:, None]
@@ -72,10 +87,9 @@ def lens(camera: Camera, points: Array) -> dict[str, Any]:
             hessian[:, i, 2, 2] = np.where(free[:, i], 2, 1) * focal[i] * clamped[:, i] / z**2
             jacobian_by[:, i, 2, i] = np.where(free[:, i], -slopes[:, i] / z, 0)
             jacobian_by[:, i, 2, 2 + i] = np.where(free[:, i], 0, 1 / z)
-    return dict(
-        means2d=slopes * focal + [camera.cx, camera.cy], jacobian=jacobian, hessian=hessian,
-        slope_jacobian=focal[:, None] * slope_jacobian, means2d_by=means2d_by, jacobian_by=jacobian_by,
-        depths=depths, onward=onward, seen=seen,
+    return found | dict(
+        jacobian=jacobian, hessian=hessian, slope_jacobian=focal[:, None] * slope_jacobian, means2d_by=means2d_by,
+        jacobian_by=jacobian_by,
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ dense matches of a network). Measured: docs/experiments/strategies.md.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -158,19 +159,16 @@ def neighbours(cameras: list[Camera], points: Array) -> list[list[int]]:
     seen = np.array([projected(camera, points)[2] for camera in cameras])
     towards = np.array([points - camera.position for camera in cameras])
     towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-12)
-    result = []
-    for i in range(len(cameras)):
-        weights = np.zeros(len(cameras))
-        for j in range(len(cameras)):
-            both = seen[i] & seen[j]
-            if j != i and both.sum() >= COMMON:
-                cosines = (towards[i, both] * towards[j, both]).sum(axis=1)
-                angle = np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1))))
-                spread = NARROWER if angle < ANGLE else WIDER
-                weights[j] = both.sum() * np.exp(-0.5 * ((angle - ANGLE) / spread) ** 2)
-        order = np.argsort(-weights, kind="stable")[:SOURCES]
-        result.append([int(j) for j in order if weights[j] > 0])
-    return result
+    weights = np.zeros((len(cameras), len(cameras)))
+    for i, j in combinations(range(len(cameras)), 2):
+        both = seen[i] & seen[j]
+        if both.sum() >= COMMON:
+            cosines = (towards[i, both] * towards[j, both]).sum(axis=1)
+            angle = np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1))))
+            spread = NARROWER if angle < ANGLE else WIDER
+            weights[i, j] = weights[j, i] = both.sum() * np.exp(-0.5 * ((angle - ANGLE) / spread) ** 2)
+    orders = np.argsort(-weights, axis=1, kind="stable")[:, :SOURCES]
+    return [[int(j) for j in order if row[j] > 0] for row, order in zip(weights, orders, strict=True)]
 
 
 def depths_of(

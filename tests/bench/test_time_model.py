@@ -49,7 +49,7 @@ def results(noise: float = 0.0) -> dict[str, Any]:
                 measured["median_ms"] = 1e3 * time * (1 + noise * rng.uniform(-1, 1))
             workload["step"] = {"median_ms": sum(s["median_ms"] for s in workload["stages"].values())}
             workloads.append(workload)
-    return {"roof": ROOF, "workloads": workloads}
+    return {"device": {"kind": "gpu"}, "roof": ROOF, "workloads": workloads}
 
 
 def test_limits_are_those_measured() -> None:
@@ -91,7 +91,7 @@ def test_few_workloads() -> None:
         model_of(few)
 
 
-@pytest.mark.parametrize("name", ["kernels", "kernels-intel"])
+@pytest.mark.parametrize("name", ["kernels", "kernels-intel", "kernels-h200"])
 def test_the_recorded_measurements_predict_each_other(name: str) -> None:
     """Within 25 % in the median, for each stage and for whole steps."""
     for stage, errors in checked(json.loads((RECORDED / f"{name}.json").read_text())).items():
@@ -106,3 +106,9 @@ def test_the_text_has_all_stages_and_devices() -> None:
         assert any(line.startswith(f"| {name}") for line in lines), name
     assert "device, step of 1000000-640" in text
     assert all(f"* {hardware.name}: {hardware.source}." in lines for hardware in HARDWARE)
+
+
+def test_a_cpu_predicts_no_gpu() -> None:
+    text = model_text(results() | {"device": {"kind": "cpu"}})
+    assert model_text(results()).startswith(text)
+    assert "whole step" in text and HARDWARE[0].name not in text
