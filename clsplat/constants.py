@@ -67,12 +67,12 @@ sorts its splats."""
 
 GPU_TILE = 8
 """Edge of a tile on GPUs, px. Each work-item takes all splats of its tile, so that small tiles save work where splats
-are small (measured: docs/stages/composite.md)."""
+are small (measured: docs/gpu.md)."""
 
 SEGMENT = 64
 """Splats of a tile's list that a work-group of a GPU's backward pass composites. Lists that are longer are shared by
 several groups, for each of which the forward pass saves 4 (1 + C) bytes per pixel of the tile (measured:
-docs/stages/composite.md)."""
+docs/gpu.md)."""
 
 WIDE_TILE = 32
 """Edge of a tile on CPUs with vectors of 16 numbers, px: fewer lists, which such CPUs process faster (measured:

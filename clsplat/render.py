@@ -279,20 +279,33 @@ def _renderings(
     renderer: Renderer, gaussians: Gaussians, cameras: Iterable[Camera], degree: int, depth: bool, gradients: bool
 ) -> Iterator[Rendering]:
     """Generator of the images. It is separate so that errors of `renderings` come before the first image."""
+    for run, image, alpha in _drawings(renderer, gaussians, cameras, degree, depth, gradients):
+        yield Rendering(renderer, run if gradients else None, gaussians, download(image), download(alpha))
+
+
+def images(renderer: Renderer, gaussians: Gaussians, cameras: Iterable[Camera], sh_degree: int) -> Iterator[Any]:
+    """Images (H, W, 3) of cameras, one after the other, where the renderer's stages run."""
+    for _, image, _ in _drawings(renderer, gaussians, cameras, sh_degree, depth=False, gradients=False):
+        yield renderer.upload("image", image) if isinstance(image, np.ndarray) else image
+
+
+def _drawings(
+    renderer: Renderer, gaussians: Gaussians, cameras: Iterable[Camera], degree: int, depth: bool, gradients: bool
+) -> Iterator[tuple[Pass | None, Any, Any]]:
+    """What `_drawn` returns, for each camera."""
     placed = renderer.place(gaussians) if len(gaussians) else gaussians
     near: float | None = None
     for camera in cameras:
         if camera.near is None and len(gaussians):
             near = near or default_near(np.asarray(download(gaussians.means)))
             camera = replace(camera, near=near)
-        run, image, alpha = _rendered(renderer, placed, camera, degree, depth, gradients)
-        yield Rendering(renderer, run if gradients else None, gaussians, image, alpha)
+        yield _drawn(renderer, placed, camera, degree, depth, gradients)
 
 
-def _rendered(
+def _drawn(
     renderer: Renderer, gaussians: Gaussians, camera: Camera, degree: int, depth: bool, gradients: bool
-) -> tuple[Pass | None, Array, Array]:
-    """The pass, where there is one, its image and its alpha, on the host."""
+) -> tuple[Pass | None, Any, Any]:
+    """The pass, where there is one, its image and its alpha: on the host, or where the stages ran."""
     if len(gaussians) == 0:
         behind = np.array([*renderer.background, *[0.0] * depth], renderer.real)
         image: Array = np.broadcast_to(behind, (camera.height, camera.width, len(behind)))
@@ -300,7 +313,8 @@ def _rendered(
     if camera.model == "equirectangular" and not along_rays(renderer.config, camera):
         layers = []
         for face in panorama.faces(camera):
-            _, image, alpha = _rendered(renderer, gaussians, face, degree, depth, gradients=False)
+            drawn = _drawn(renderer, gaussians, face, degree, depth, gradients=False)
+            image, alpha = download(drawn[1]), download(drawn[2])
             if depth:  # from depths to distances
                 u, v = np.meshgrid(np.arange(face.width) + 0.5, np.arange(face.height) + 0.5)
                 image = image.copy()
@@ -309,4 +323,4 @@ def _rendered(
         whole = panorama.assemble(camera, layers)
         return None, whole[:, :, :-1], whole[:, :, -1]
     run = renderer.forward(gaussians, camera, degree, depth=depth, gradients=gradients)
-    return run, download(run.image.rgb), download(run.image.alpha)
+    return run, run.image.rgb, run.image.alpha

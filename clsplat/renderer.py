@@ -136,11 +136,11 @@ class Renderer:
             return max(camera.width, camera.height)
         if self.config.tile_size != "auto":
             return self.config.tile_size
-        if self.config.sort == "pixel":
-            return TILE
-        compositor = self.config.compositor
+        compositor = "auto" if self.config.sort == "pixel" else self.config.compositor
         if compositor == "gpu" or (compositor == "auto" and not self.device.is_cpu):
             return GPU_TILE
+        if self.config.sort == "pixel":
+            return TILE
         return WIDE_TILE if self.device.vector_width == WIDE_TILE // 2 else TILE
 
     def upload(self, name: str, array: Any, dtype: Any = None) -> Any:

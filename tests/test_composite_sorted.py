@@ -213,7 +213,7 @@ def test_a_gpu_without_memory_for_the_windows_is_refused():
         device.is_cpu = is_cpu  # shadows the cached property
         gaussians, camera = synthetic_scene(5, width=16, height=16)
         # A pixel has 32 splats of three numbers in its window, three colours and four states; a unit 2048 items.
-        reserved = 16**2 * (3 * 32 + 3 + 4) * 4 * 2048 * device.cl_device.max_compute_units / 2**30
+        reserved = 8**2 * (3 * 32 + 3 + 4) * 4 * 2048 * device.cl_device.max_compute_units / 2**30
         message = rf"--sort pixel: .* would reserve {reserved:.1f} GiB for .*, but 0\.0 GiB are left"
         with pytest.raises(DeviceError, match=message) if refused else nullcontext():
             render(gaussians, camera, RenderConfig(sort="pixel"), device)

@@ -102,7 +102,7 @@ def test_a_backdrop_is_drawn_and_has_no_gradients(device, where, sort):
         (16, False, {}, 8),
         (16, True, {"compositor": "gpu"}, 8),
         (16, False, {"compositor": "cpu"}, 32),
-        (16, False, {"sort": "pixel"}, 16),
+        (16, False, {"sort": "pixel"}, 8),
         (16, True, {"sort": "pixel"}, 16),
         (8, True, {"tile_size": 32}, 32),
     ],

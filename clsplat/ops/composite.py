@@ -28,7 +28,7 @@ def check_private(device: Device, tile_size: int, channels: int) -> None:
     if not device.is_cpu and reserved > left:
         raise DeviceError(
             f"--sort pixel: {device.label} would reserve {reserved / 2**30:.1f} GiB for windows of sorted pixels, "
-            f"but {left / 2**30:.1f} GiB are left; use --sort global, --tile-size 8 or a CPU"
+            f"but {left / 2**30:.1f} GiB are left; use --sort global or a CPU"
         )
 
 

@@ -1,14 +1,14 @@
 """Validation of a scene on photos that are held back from training."""
 
 from math import log10
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.gaussians import Gaussians
-from clsplat.metrics import colors_fitted, to_uint8
-from clsplat.render import renderings
-from clsplat.renderer import Renderer
+from clsplat.metrics import colors_fitted
+from clsplat.render import images
+from clsplat.renderer import Renderer, download
 from clsplat.scene import View, in_turn
 
 HELD_SHARE = 1 / 6
@@ -76,24 +76,23 @@ def validate(
         Both parts are at most `PERFECT`.
     """
     cameras, degree = [view.camera for view in views], min(sh_degree, gaussians.sh_degree)
-    pairs = zip(renderings(renderer, gaussians, cameras, degree), in_turn(views), strict=True)
-    return [_quality(to_uint8(rendering.rgb), view, renderer, fitted) for rendering, view in pairs]
+    pairs = zip(images(renderer, gaussians, cameras, degree), in_turn(views), strict=True)
+    return [_quality(image, view, renderer, fitted) for image, view in pairs]
 
 
-def _quality(image: NDArray[np.uint8], view: View, renderer: Renderer, fitted: bool) -> float:
+def _quality(image: Any, view: View, renderer: Renderer, fitted: bool) -> float:
+    """Quality of an image that lies where the stages run."""
     counts = np.ones(image.shape[:2], bool) if view.mask is None else view.mask
     if fitted:
-        image = to_uint8(colors_fitted(image / 255, view.image / 255, counts))
-    differences = np.subtract(image, view.image, dtype=np.int32)
-    if view.mask is not None:
-        differences = differences[counts]
-    square = float(np.mean(differences**2)) / 255**2
-    rgb = renderer.upload("rgb", np.divide(image, 255, dtype=renderer.real))
+        shown = np.clip(download(image), 0, 1)
+        image = renderer.upload("image", np.clip(colors_fitted(shown, view.image / 255, counts), 0, 1))
     photo = renderer.upload("photo", view.image, np.uint8)
-    unlike, _ = renderer.stages.l1_ssim(rgb, photo, 1.0, renderer.upload("mask", counts, np.uint8))
-    return (decibels(square) + decibels(float(unlike) / counts.mean())) / 2
+    residuals = download(renderer.stages.removal_residuals(image, photo, clamped=True))
+    square = np.square(residuals if view.mask is None else residuals[counts]).mean(dtype=np.float64)
+    unlike, _ = renderer.stages.l1_ssim(image, photo, 1.0, renderer.upload("mask", counts, np.uint8))
+    return (decibels(float(square)) + decibels(float(unlike) / counts.mean())) / 2
 
 
 def decibels(error: float) -> float:
-    """An error in decibels, at most `PERFECT`."""
-    return min(PERFECT, -10 * log10(error)) if error > 0 else PERFECT
+    """An error in decibels, at most `PERFECT`; NaN if it is not a number."""
+    return -10 * log10(max(error, 10 ** (-PERFECT / 10)))
