@@ -4,7 +4,7 @@
 // contains the mathematics of both. Only the mapping differs.
 //
 // Forward mapping: one work-group per tile, one work-item per pixel, or for several pixels ITEMS apart if the device
-// has no groups of TILE*TILE work-items. The group loads BATCH splats at a time into local memory, and each work-item
+// has no groups of TILE*TILE work-items. The group loads STAGED splats at a time into local memory, and each work-item
 // composites them onto its pixels. A work-item whose pixels are finished or outside the image continues to load. The
 // group stops when live_pixels, the number of unfinished pixels, is 0. Small splats meet few of a tile's blocks of 8x4
 // pixels. The work-item that loads a splat finds these blocks, and the others skip the splat for all other blocks: work-items
@@ -37,13 +37,14 @@
 //
 // Buffers: as in composite_cpu.cl; states[M/SEGMENT,1+CHANNELS,TILE^2], the transmittance (0 or less: finished) and the
 // colours of the pixels where segments begin; reached[T], the number of entries of the tile's list that pixels met.
-// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward BATCH (12 + CHANNELS), with RAYS (27 + CHANNELS),
-// backward TILE^2 (2 + CHANNELS). With TILE 16, BATCH 64 and CHANNELS 4 this is 4 KiB (RAYS 7.5 KiB) and 6 KiB (double:
+// Local memory, in reals (of 4 bytes, or 8 with USE_DOUBLE): forward STAGED (12 + CHANNELS), with RAYS (27 + CHANNELS),
+// backward TILE^2 (2 + CHANNELS). With TILE 16, STAGED 64 and CHANNELS 4 this is 4 KiB (RAYS 7.5 KiB) and 6 KiB (double:
 // twice as much) of the 32 KiB that OpenCL 1.2 guarantees.
 // -DTILE=8|16|32   edge of a tile, px
 // -DCHANNELS    number of colour channels, 1 or more
 // -DITEMS       number of work-items of the forward work-group, a divisor of TILE*TILE
-// -DBATCH       number of splats per batch, 1 or more; the backward work-group has BATCH work-items
+// -DSTAGED      number of splats that the forward pass loads at a time, 1 or more
+// -DBATCH       number of splats per batch of the backward pass, 1 or more; its work-group has BATCH work-items
 // -DSEGMENT     number of splats per segment
 // -DRAYS=0|1|2  as in composite_cpu.cl
 // -DSUBGROUPS=0|1   1: the device has the functions of subgroups, by cl_khr_subgroups or OpenCL 2.1 and later
@@ -56,6 +57,9 @@
 #define SQRTV(x) sqrt(x)
 #include "composite_bands.h"
 
+#if !defined(STAGED) || STAGED < 1
+#error "-DSTAGED must give the number of splats that the forward pass loads at a time, 1 or more"
+#endif
 #if !defined(SEGMENT) || SEGMENT < 1
 #error "-DSEGMENT must give the number of splats per segment, 1 or more"
 #endif
@@ -63,9 +67,9 @@
 #define OWNED (PIXELS / ITEMS) // pixels of a work-item of the forward pass
 #define STATE (1 + CHANNELS)   // numbers of a pixel's state
 
-// Number of splats in the batch at `first` of a list. Batches end where segments end.
-static inline uint batch_at(uint first, uint length) {
-    return min(min((uint)BATCH, length - first), SEGMENT - first % SEGMENT);
+// Number of splats, at most `most`, in the batch at `first` of a list. Batches end where segments end.
+static inline uint batch_at(uint first, uint length, uint most) {
+    return min(min(most, length - first), SEGMENT - first % SEGMENT);
 }
 
 // The blocks of 8x4 pixels of the tile with corner (x0, y0) that a splat meets, as bits, numbered as in pixel_of.
@@ -103,8 +107,8 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void
 composite_fwd(const int width, const int height, const __global Splat *splats, const __global uint *gauss_ids,
               const __global uint *tile_ranges, const __global real *background, __global real *image,
               __global real *alpha_image, const int saves, __global real *states, __global uint *reached DIRECTIONS) {
-    __local Splat staged[BATCH];
-    __local uint met[BATCH];
+    __local Splat staged[STAGED];
+    __local uint met[STAGED];
     __local int live_pixels;
     const uint tile = get_group_id(0), lane = get_local_id(0);
     const int tiles_x = (width + TILE - 1) / TILE;
@@ -126,7 +130,7 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
         barrier(CLK_LOCAL_MEM_FENCE); // live_pixels is written, and the last batch is no longer read
         if (live_pixels == 0)
             break;
-        count = batch_at(first, length);
+        count = batch_at(first, length, STAGED);
         if (saves && first > 0 && first % SEGMENT == 0) {
             __global real *state = states + (size_t)(begin / SEGMENT + first / SEGMENT - 1) * STATE * PIXELS;
             for (int o = 0; o < OWNED; ++o) {
@@ -224,7 +228,7 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
     barrier(CLK_LOCAL_MEM_FENCE);
 
     for (uint count; first < end && unfinished; first += count) {
-        count = batch_at(first, end);
+        count = batch_at(first, end, BATCH);
         const uint i = begin + first + lane;
         Splat s;
         Moments sums = NO_MOMENTS;

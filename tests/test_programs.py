@@ -124,7 +124,16 @@ class TestPrograms:
         """OpenCL C 1.2 does not declare their functions. The warning comes once, and the device runs without them."""
         device = Device()
         device.subgroup_size, device._subgroups = 16, Subgroups(16, BASE_LANGUAGE)
-        defines = {"TILE": 8, "CHANNELS": 3, "ITEMS": 64, "BATCH": 16, "SEGMENT": 64, "RAYS": 0, "SUBGROUPS": 1}
+        defines = {
+            "TILE": 8,
+            "CHANNELS": 3,
+            "ITEMS": 64,
+            "STAGED": 16,
+            "BATCH": 16,
+            "SEGMENT": 64,
+            "RAYS": 0,
+            "SUBGROUPS": 1,
+        }
         with pytest.warns(UserWarning, match=r"cl/composite_gpu\.cl is built without subgroups: "):
             program = device.program("composite_gpu", defines)
         assert program.all_kernels() and device.subgroup_size == 0

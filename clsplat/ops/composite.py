@@ -9,9 +9,9 @@ from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.stages import AnyGrads, AnySplats, Bins, Image, RayGrads, RaySplats, SplatGrads
 
-# Number of splats per batch of the GPU variant without subgroups. Each is a work-item of the backward kernel. Known
-# GPUs run 16 or 32 work-items in lockstep.
-GPU_BATCH = 64
+# Number of splats that the GPU variant's forward pass loads at a time, and per batch of its backward pass without
+# subgroups, where each is a work-item. GPUs without subgroups run 32 work-items in lockstep (measured: docs/gpu.md).
+GPU_STAGED, GPU_BATCH = 64, 32
 
 # Number of splats that a pixel composites in one round if pixels are sorted. It changes the speed, not the image.
 WINDOW = 32
@@ -69,6 +69,7 @@ def _defines(device: Device, bins: Bins, channels: int, stage: str, rays: int = 
         "composite_cpu": {"LANES": lanes},
         "composite_gpu": {
             "ITEMS": device.group(bins.tile_size**2),
+            "STAGED": GPU_STAGED,
             "BATCH": gpu_batch(device),
             "SEGMENT": SEGMENT,
             "SUBGROUPS": int(device.subgroup_size > 0),

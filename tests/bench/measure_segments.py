@@ -22,8 +22,9 @@ def main():
     print(f"{device.label}; ms")
     print("| tile, batch, segment | workload | intersections | step | bin | composite forward | backward |")
     print("|---|---|---|---|---|---|---|")
+    # Both passes take batches of this size here.
     for tile, batch, segment in product(TILES, BATCHES, SEGMENTS):
-        composite.GPU_BATCH, composite.SEGMENT = batch, segment
+        composite.GPU_STAGED, composite.GPU_BATCH, composite.SEGMENT = batch, batch, segment
         for name in sys.argv[1:] or NAMES:
             found = bench_workload(synthetic(name), RenderConfig(tile_size=tile), device, REPEATS)
             times = [found["stages"][s]["median_ms"] for s in ("bin_splats", "composite_fwd", "composite_bwd")]
