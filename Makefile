@@ -1,7 +1,7 @@
 PYTHON = python
 
 .PHONY: test test-slow stability fuzz fuzz-cases faults faults-below mutants soak lint docs check-races check-variants \
-  check-runtimes check-builds bench bench-knobs bench-quality bench-full-size bench-fields bench-captures \
+  check-gpu check-runtimes check-builds bench bench-knobs bench-quality bench-full-size bench-fields bench-captures \
   bench-stability formats \
   foreign works-with foreign-packages
 
@@ -75,6 +75,11 @@ check-races:
 # Run the tests of the stages, of rendering and of training with the kernels for GPUs, on any device.
 check-variants:
 	CLSPLAT_VARIANTS=gpu $(PYTHON) -m pytest $(shell ls tests/test_*.py) tests/training/test_loop.py
+
+# Run the tests of the stages, of rendering and of training on a GPU. Its compiler may take minutes for kernels for CPUs,
+# whose tests are left out, and several processes may lack the private memory that --sort pixel reserves.
+check-gpu:
+	$(PYTHON) -m pytest -n 8 -k "not cpu" $(shell ls tests/test_*.py) tests/training/test_loop.py
 
 # Run the tests of the stages on every OpenCL implementation that is there: the drivers in /etc/OpenCL/vendors, Intel's
 # runtime for CPUs beside PYTHON, and those of DRIVERS, libraries. TESTS selects others.
