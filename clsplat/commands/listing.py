@@ -2,6 +2,7 @@
 
 import re
 import sys
+from ctypes.util import find_library
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +28,9 @@ KNOWN_FAULTS = (
 )
 """Drivers, as patterns of platform, version and driver version, and what is known to be wrong with them (tried in:
 docs/howto/devices.md)."""
+
+NVIDIA = "nvidia-opencl"
+"""Name of the library of NVIDIA's driver for OpenCL, for the linker."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,12 @@ class Devices:
             for stage, fault in faults.items():
                 print(f"    FAILS: {stage}: {fault}")
         print("* is the default; choose another device with --device and part of its name, or with PYOPENCL_CTX")
+        library = find_library(NVIDIA)
+        if library and not any("NVIDIA" in device.platform.name for device in devices):
+            print(
+                f"NVIDIA's driver is installed ({library}), but OpenCL shows no device of it. In containers, the list "
+                "of drivers often lacks it: docs/howto/install.md, NVIDIA GPU, says what to do"
+            )
         if self.check and failed:
             sys.exit(1)
 

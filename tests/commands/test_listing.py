@@ -47,3 +47,27 @@ def test_devices_shows_known_faults_and_what_a_driver_refuses(capsys: pytest.Cap
     out = capsys.readouterr().out
     assert "  rusticl: llvmpipe" in out and "0 compute units" in out
     assert "known: declares subgroups in OpenCL C 3.0 alone" in out
+
+
+@pytest.mark.parametrize(
+    ("library", "platform", "said"),
+    [
+        ("libnvidia-opencl.so.1", "Portable Computing Language", True),
+        ("libnvidia-opencl.so.1", "NVIDIA CUDA", False),
+        (None, "Portable Computing Language", False),
+    ],
+)
+def test_devices_says_that_a_driver_is_installed_and_not_listed(
+    library: str | None,
+    platform: str,
+    said: bool,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("clsplat.commands.listing.find_library", {"nvidia-opencl": library}.get)
+    only = SimpleNamespace(name="a device", platform=SimpleNamespace(name=platform))
+    monkeypatch.setattr(clsplat.device, "list_devices", lambda: [only])
+    monkeypatch.setattr(clsplat.device, "select_device", lambda: only)
+    monkeypatch.setattr(clsplat.selftest, "faults_of", lambda index: {})
+    run("devices")
+    assert ("NVIDIA's driver is installed (libnvidia-opencl.so.1)" in capsys.readouterr().out) == said
