@@ -61,8 +61,8 @@ class Devices:
         library = find_library(NVIDIA)
         if library and not any("NVIDIA" in device.platform.name for device in devices):
             print(
-                f"NVIDIA's driver is installed ({library}), but OpenCL shows no device of it. In containers, the list "
-                "of drivers often lacks it: docs/howto/install.md, NVIDIA GPU, says what to do"
+                f"NVIDIA's driver is installed ({library}), but OpenCL shows no device of it. In containers, the "
+                "list of drivers often lacks it: docs/howto/install.md, NVIDIA GPU, says what to do"
             )
         if self.check and failed:
             sys.exit(1)
