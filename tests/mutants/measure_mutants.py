@@ -60,6 +60,7 @@ REMOVAL = ("tests/test_removal.py",)
 TESTS: dict[str, tuple[str, ...]] = {
     "common": (*(f"tests/test_{name}.py" for name in ("programs", "observe", "dropout", "composite")), *PROJECT),
     "composite": COMPOSITE,
+    "composite_bands": COMPOSITE,
     "composite_blocks": COMPOSITE,
     "composite_cpu": (COMPOSITE[0], LIMITS),
     "composite_gpu": (*COMPOSITE[:2], LIMITS),
