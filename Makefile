@@ -76,8 +76,8 @@ check-races:
 check-variants:
 	CLSPLAT_VARIANTS=gpu $(PYTHON) -m pytest $(shell ls tests/test_*.py) tests/training/test_loop.py
 
-# Run the tests of the stages, of rendering and of training on a GPU. Its compiler may take minutes for kernels for CPUs,
-# whose tests are left out, and several processes may lack the private memory that --sort pixel reserves.
+# Run the tests of the stages, of rendering and of training on a GPU. Those of the kernels for CPUs are left out, because
+# a GPU's compiler may take minutes for them. If --sort pixel lacks private memory, run fewer processes.
 check-gpu:
 	$(PYTHON) -m pytest -n 8 -k "not cpu" $(shell ls tests/test_*.py) tests/training/test_loop.py
 

@@ -1,21 +1,21 @@
-// Where splats meet bands of pixel rows: the blocks of pixels that a splat visits follow from it. REALV is the type of
-// one number for each splat that is looked at, MASKV that of a comparison; SQRTV and CLAMP work on them.
+// Blocks of pixels that splats meet, for one band of pixel rows at a time. REALV holds one number per splat, MASKV the
+// result of a comparison, and SQRTV is the square root of a REALV.
 #ifndef CLSPLAT_COMPOSITE_BANDS_H
 #define CLSPLAT_COMPOSITE_BANDS_H
 
-// Outlines of splats (ellipse.h), relative to pixel 0 of a tile's first row.
+// Outlines of splats (ellipse.h).
 typedef struct {
-    REALV x, y; // of the centre from the tile's corner, px; y from the centre of the first row
+    REALV x, y; // centre, from the tile's corner, px
     REALV half_height, inv_half_height, at_right, slope, half_sq;
 } BandOutline;
 
 #if !RAYS
-// The outlines of splats with the centre (x, y) from the corner of a tile; their other numbers as in Splat.
+// Outlines of splats with these numbers of Splat; (x, y) counts from the tile's corner.
 static inline BandOutline band_outline(REALV x, REALV y, REALV half_height, REALV at_right, REALV a, REALV b,
                                        REALV level) {
     const REALV inv_a = 1 / a;
     const BandOutline o = {x,
-                           y - (real)0.5,
+                           y,
                            half_height,
                            1 / half_height,
                            at_right,
@@ -30,7 +30,7 @@ static inline BandOutline band_outline(REALV x, REALV y, REALV half_height, REAL
 static inline void blocks_in_band(const BandOutline *o, int first, int last, int width, int count, REALV *begin,
                                   REALV *end) {
     const REALV zero = 0, limit = count, right = o->at_right, left = -right;
-    const REALV top = first - o->y, bottom = top + (last - first);
+    const REALV top = (first + (real)0.5) - o->y, bottom = top + (last - first);
     const REALV at_left = CLAMP(left, top, bottom), at_right = CLAMP(right, top, bottom);
     const REALV t_left = at_left * o->inv_half_height, t_right = at_right * o->inv_half_height;
     const REALV sq_left = o->half_sq * GREATER(1 - t_left * t_left, zero);

@@ -254,7 +254,7 @@ static inline void find_blocks(const Outlines *outlines, uint g, int x0, int y0,
     const REALV x = outlines->x[g] - (real)x0, y = outlines->y[g] - (real)y0;
 #if RAYS
     const BandOutline outline = {x,
-                                 y - (real)0.5,
+                                 y,
                                  outlines->half_height[g],
                                  outlines->inv_half_height[g],
                                  outlines->at_right[g],

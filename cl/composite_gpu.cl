@@ -6,9 +6,9 @@
 // Forward mapping: one work-group per tile, one work-item per pixel, or for several pixels ITEMS apart if the device
 // has no groups of TILE*TILE work-items. The group loads STAGED splats at a time into local memory, and each work-item
 // composites them onto its pixels. A work-item whose pixels are finished or outside the image continues to load. The
-// group stops when live_pixels, the number of unfinished pixels, is 0. Small splats meet few of a tile's blocks of 8x4
-// pixels. The work-item that loads a splat finds these blocks, and the others skip the splat for all other blocks: work-items
-// that run in lockstep have the pixels of one block or of two.
+// group stops when live_pixels, the number of unfinished pixels, is 0. A small splat meets few of a tile's blocks of 8x4
+// pixels. The work-item that loads a splat finds these blocks, and work-items with pixels of other blocks skip the splat.
+// Work-items that run in lockstep have the pixels of one block or of two, so that they skip it together.
 //
 // Backward mapping: one work-group of BATCH work-items per segment of SEGMENT splats of a tile's list, one work-item per
 // splat of a batch. The pixels of the tile pass from work-item to work-item. So long lists are shared by many groups:
@@ -76,8 +76,8 @@ static inline uint batch_at(uint first, uint length, uint most) {
 static inline uint blocks_met(const Splat *s, int x0, int y0) {
 #if RAYS
     const Outline *e = &s->outline;
-    const BandOutline outline = {
-        e->x - x0, e->y - y0 - (real)0.5, e->half_height, e->inv_half_height, e->at_right, e->slope, e->half_sq};
+    const BandOutline outline = {e->x - x0,   e->y - y0, e->half_height, e->inv_half_height,
+                                 e->at_right, e->slope,  e->half_sq};
 #else
     const BandOutline outline = band_outline(s->x - x0, s->y - y0, s->half_height, s->at_right, s->a, s->b, s->level);
 #endif

@@ -292,7 +292,7 @@ def images(renderer: Renderer, gaussians: Gaussians, cameras: Iterable[Camera], 
 def _drawings(
     renderer: Renderer, gaussians: Gaussians, cameras: Iterable[Camera], degree: int, depth: bool, gradients: bool
 ) -> Iterator[tuple[Pass | None, Any, Any]]:
-    """What `_drawn` returns, for each camera."""
+    """Results of `_drawn` for each camera."""
     placed = renderer.place(gaussians) if len(gaussians) else gaussians
     near: float | None = None
     for camera in cameras:

@@ -136,12 +136,11 @@ class Renderer:
             return max(camera.width, camera.height)
         if self.config.tile_size != "auto":
             return self.config.tile_size
-        compositor = "auto" if self.config.sort == "pixel" else self.config.compositor
-        if compositor == "gpu" or (compositor == "auto" and not self.device.is_cpu):
+        by_pixel = self.config.sort == "pixel"  # the same kernels on all devices
+        compositor = "auto" if by_pixel else self.config.compositor
+        if not (self.device.is_cpu if compositor == "auto" else compositor == "cpu"):
             return GPU_TILE
-        if self.config.sort == "pixel":
-            return TILE
-        return WIDE_TILE if self.device.vector_width == WIDE_TILE // 2 else TILE
+        return WIDE_TILE if self.device.vector_width == WIDE_TILE // 2 and not by_pixel else TILE
 
     def upload(self, name: str, array: Any, dtype: Any = None) -> Any:
         """An array where the stages run: on the device in its precision, or float64; `dtype` names another type."""

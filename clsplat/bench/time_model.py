@@ -53,7 +53,7 @@ class Hardware:
 
 LAUNCH_DISCRETE, LAUNCH_MOBILE = 1.5e-5, 2e-5
 """Assumed seconds per launch of a discrete GPU and of one in a mobile chip, with the wait for its end. No vendor
-publishes them; an NVIDIA H200 took 13 to 17 us (docs/results/kernels-h200.json)."""
+publishes them. The first is about that of an NVIDIA H200 (docs/gpu.md)."""
 
 HARDWARE = (
     Hardware(

@@ -64,11 +64,17 @@ def test_no_size(text: str) -> None:
         parse_bytes(text, "--memory-limit")
 
 
-@pytest.mark.parametrize("sort", ["auto", "per_tile"])
+@pytest.mark.parametrize(("sort", "tile_size"), [("auto", "auto"), ("per_tile", "auto"), ("auto", 16)])
 @pytest.mark.parametrize("gpu", [False, True], ids=["as it is", "as a GPU"])
 @pytest.mark.parametrize(("n", "width", "height"), [(20_000, 160, 120), (5_000, 400, 300)])
 def test_what_is_predicted_is_allocated(
-    tmp_path: Path, gpu: bool, n: int, width: int, height: int, sort: Literal["auto", "per_tile"]
+    tmp_path: Path,
+    gpu: bool,
+    n: int,
+    width: int,
+    height: int,
+    sort: Literal["auto", "per_tile"],
+    tile_size: Literal["auto", 16],
 ) -> None:
     device = Device()
     if gpu:
@@ -80,13 +86,15 @@ def test_what_is_predicted_is_allocated(
         iterations=6,
         eval_every=3,
         adc=FIXED_N,
-        render=RenderConfig(sort=sort),
+        render=RenderConfig(sort=sort, tile_size=tile_size),
         exposure=gpu,
         init=InitConfig(dense=False),  # dense points are found before the training, in a memory of their own
     )
 
     def evaluate(gaussians: Gaussians) -> dict[str, float]:
-        return {"mean": float(np.mean([r.rgb.mean() for r in render_views(gaussians, cameras, device=device)]))}
+        return {
+            "mean": float(np.mean([r.rgb.mean() for r in render_views(gaussians, cameras, config.render, device)]))
+        }
 
     cameras = [view.camera for view in scene.train]
     train(scene, config, tmp_path, device, evaluate=evaluate)
