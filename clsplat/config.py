@@ -250,14 +250,14 @@ class ErrorConfig:
     """First iteration after which Gaussians are split or removed; earlier in short runs."""
     stop_fraction: Fraction = 0.8
     """Fraction of the iterations after which Gaussians are no longer split or removed."""
-    every: Count = 100
-    """Iterations between two rounds; fewer with --size auto in runs shorter than 3000, in proportion."""
+    every: Annotated[int, within(least=0)] = 0
+    """Iterations between two rounds (0: a twentieth of all until the cap is reached, and a tenth afterwards)."""
     growth: NonNegative = 0.05
     """Gaussians added per round, as a fraction of all; more if the cap would otherwise be reached too late."""
     full_fraction: Fraction = 0.4
     """Fraction of the iterations by which the cap is reached."""
     views: Count = 10
-    """Photos rendered per round to locate the errors."""
+    """Photos rendered per round to locate the errors, or a tenth of them if this is more."""
     opacity_min: PartialFraction = 0.005
     """Opacity up to which Gaussians are removed."""
     replaced: Fraction = 0.02

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable
 from copy import copy
 from functools import cached_property, lru_cache
+from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -156,11 +157,12 @@ class Training:
         state = self.state
         sh_degree = state.sh_degree(state.iteration, self.config)
 
-        def survey(count: int) -> Contributions:
+        def survey(count: int, fraction: float) -> Contributions:
+            count = max(count, ceil(fraction * len(self._views)))
             order = stream(self.config.seed, "surveyed views", state.iteration).permutation(len(self._views))
             chosen = state.corrected([self._views[i] for i in order[:count]])
             found = contributions(self.renderer, state.shown(self.renderer), chosen, sh_degree)
-            return found._replace(share=len(chosen) / len(self._views))
+            return found._replace(photos=len(self._views))
 
         state.rows = state.rows._replace(strategy=state.strategy.on(None))
         gaussians = without_harmonics(state.gaussians)

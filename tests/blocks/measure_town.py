@@ -35,10 +35,6 @@ PER_PHOTO = 300
 FIRST = 100
 """Photos of the scene that needs three times the limit."""
 
-EVERY = 25
-"""Iterations between two rounds of growth. A round at most doubles the number of Gaussians: with the usual 100,
-blocks of some hundred iterations would not reach their size."""
-
 
 def limit() -> int:
     """Bytes of device memory."""
@@ -57,7 +53,6 @@ def train(data: Path, out: Path, count: int) -> None:
         "blocks": "auto",
         "size": "fixed",
         "max-gaussians": count * PER_PHOTO,
-        "error.every": EVERY,
         "memory-limit": f"{limit() / 1e6}MB",
     }
     flags = [word for name, value in settings.items() for word in (f"--{name}", str(value))]

@@ -1,7 +1,8 @@
 """Every strategy keeps rows, moments and statistics in step; ADC does what the paper says."""
 
 from dataclasses import replace
-from typing import Literal
+from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from clsplat.config import AdcConfig, ErrorConfig, McmcConfig, TrainConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
 from clsplat.testing import synthetic_scene
-from clsplat.training.densify import STRATEGIES, Contributions, Strategy
+from clsplat.training.autosize.rule import growth_bounds, validation_times
+from clsplat.training.densify import STRATEGIES, Contributions, ErrorGuided, Mcmc, Strategy
 from clsplat.training.densify.adc import CHILD_SHRINK, Adc
 from clsplat.training.densify.schedule import Schedule
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
@@ -29,7 +31,7 @@ def scene() -> Gaussians:
     return gaussians
 
 
-def survey(views: int) -> Contributions:
+def survey(views: int, fraction: float) -> Contributions:
     """As of photos that see each Gaussian the better the later it stands."""
     assert views > 0
     return Contributions(np.arange(N) / 2.0, np.arange(N) ** 2 / 100.0, np.arange(N) - 9.0, np.zeros(N), np.ones(N))
@@ -187,12 +189,20 @@ def test_gradients_count_in_normalised_device_coordinates() -> None:
     assert strategy.statistics["seen"].tolist() == [1, 1]
 
 
-@pytest.mark.parametrize("settings", [McmcConfig(), ErrorConfig()])
+def schedule_of(strategy: str, **changes: Any) -> Schedule:
+    made = STRATEGIES[strategy](replace(CONFIG, strategy=strategy, **changes), 1.0, N)
+    assert isinstance(made, Mcmc | ErrorGuided)
+    return made.schedule
+
+
+@pytest.mark.parametrize(("strategy", "settings"), [("mcmc", McmcConfig()), ("error", ErrorConfig())])
 @pytest.mark.parametrize("iterations", [300, 700, 2000, 7000, 30_000])
 @pytest.mark.parametrize("cap", [50, 1001, 4000, 1_000_000])
-def test_growth_reaches_the_cap_in_time(settings: McmcConfig | ErrorConfig, iterations: int, cap: int) -> None:
+def test_growth_reaches_the_cap_in_time(
+    strategy: str, settings: McmcConfig | ErrorConfig, iterations: int, cap: int
+) -> None:
     n, sizes = min(1000, cap), []
-    schedule = Schedule(replace(CONFIG, iterations=iterations, max_gaussians=cap), settings)
+    schedule = schedule_of(strategy, iterations=iterations, max_gaussians=cap)
     for iteration in filter(schedule.due, range(1, iterations + 1)):
         before, n = n, schedule.count_after(iteration, n, cap)
         assert n == cap or n >= round(before * (1 + settings.growth))
@@ -206,44 +216,64 @@ def test_growth_reaches_the_cap_in_time(settings: McmcConfig | ErrorConfig, iter
 
 def test_rounds_are_from_the_start_to_before_the_end() -> None:
     settings = McmcConfig(start=200, every=100, stop_fraction=0.5)
-    schedule = Schedule(replace(CONFIG, iterations=30_000, max_gaussians=5000), settings)
-    start = schedule.start
-    assert (start % 100, schedule.stop) == (0, 15_000)
-    times = (start - 100, start, start + 50, 14_900, 15_000, 15_100)
+    schedule = schedule_of("mcmc", iterations=30_000, max_gaussians=5000, mcmc=settings)
+    times = (100, 200, 250, 14_900, 15_000, 15_100)
     assert [schedule.due(i) for i in times] == [False, True, False, True, False, False]
 
 
 def test_growth_takes_nothing_away() -> None:
     """Where less than there is fits the device."""
-    schedule = Schedule(replace(CONFIG, max_gaussians=5000), McmcConfig())
+    schedule = schedule_of("mcmc", max_gaussians=5000)
     assert [schedule.count_after(200, 1000, cap) for cap in (900, 1010)] == [1000, 1010]
 
 
 def test_the_search_grows_by_a_quarter_up_to_its_cap() -> None:
-    schedule = Schedule(replace(CONFIG, size="auto", max_gaussians=None, iterations=6000), ErrorConfig())
+    schedule = schedule_of("mcmc", size="auto", max_gaussians=None, iterations=6000)
     assert [schedule.count_after(200, 1000, cap) for cap in (3000, 1050)] == [1250, 1050]
 
 
 def test_the_search_grows_faster_where_its_cap_is_far_away() -> None:
     """A tenth of the points of three scenes ended with a quarter of the Gaussians, and 1 to 2 dB worse."""
-    schedule = Schedule(replace(CONFIG, size="auto", max_gaussians=None, iterations=3000), ErrorConfig())
-    assert [schedule.count_after(300, 1000, cap) for cap in (1500, 2250, 10_000)] == [1250, 1500, 2000]
+    schedule = schedule_of("error", size="auto", max_gaussians=None, iterations=3000)
+    assert [schedule.count_after(300, 1000, cap) for cap in (1100, 1500, 10_000)] == [1100, 1500, 2000]
 
 
-@pytest.mark.parametrize(("size", "rounds"), [("auto", 21), ("fixed", 10)])
+@pytest.mark.parametrize(("size", "rounds"), [("auto", 23), ("fixed", 11)])
 def test_the_search_has_as_many_rounds_in_short_runs(size: Literal["auto", "fixed"], rounds: int) -> None:
-    """Since a round grows by at most a quarter."""
+    """Of mcmc, whose rounds have an interval in iterations, since a round grows by at most a quarter."""
 
     def due(iterations: int) -> int:
-        config = replace(CONFIG, size=size, iterations=iterations, max_gaussians=5000)
-        return sum(map(Schedule(config, ErrorConfig()).due, range(1, iterations + 1)))
+        schedule = schedule_of("mcmc", size=size, iterations=iterations, max_gaussians=5000)
+        return sum(map(schedule.due, range(1, iterations + 1)))
 
-    assert (due(3000), due(1500)) == (21, rounds)
+    assert (due(3000), due(1500)) == (23, rounds)
+
+
+@pytest.mark.parametrize("size", ["auto", "fixed"])
+@pytest.mark.parametrize(("iterations", "growth"), [(1000, 50), (3000, 150), (4337, 217)])
+def test_error_has_a_round_in_each_twentieth_of_growth_and_each_tenth_afterwards(
+    size: Literal["auto", "fixed"], iterations: int, growth: int
+) -> None:
+    schedule = schedule_of("error", size=size, iterations=iterations, max_gaussians=5000)
+    times = [i for i in range(1, iterations + 1) if schedule.due(i)]
+    full = round(0.4 * iterations)
+    assert {*times} >= {full - k * growth for k in range(5)}
+    assert [i for i in times if i > full] == [full + k * round(iterations / 10) for k in (1, 2, 3)]
+
+
+@pytest.mark.parametrize("iterations", [700, 1005, 3000, 4337, 7650])
+def test_growth_comes_first_in_a_window(iterations: int) -> None:
+    """Each window has a round at its begin, and the Gaussians it adds train before they are validated."""
+    config = replace(CONFIG, strategy="error", size="auto", iterations=iterations)
+    schedule = schedule_of("error", size="auto", iterations=iterations)
+    for begin, end in pairwise(growth_bounds(config)):
+        first = next(i for i in range(begin, end) if schedule.due(i))
+        assert first <= min(begin + 4, *(t for t in validation_times(config) if t > begin))
 
 
 def test_in_short_runs_too_gaussians_are_shrunk_until_an_interval_before_the_end() -> None:
     strategy = STRATEGIES["error"](replace(CONFIG, strategy="error", size="auto", iterations=1500), 1.0, N)
-    assert [strategy.due(iteration) for iteration in (1400, 1450, 1500)] == [True, True, False]
+    assert [strategy.due(iteration) for iteration in (1350, 1425, 1500)] == [True, True, False]
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "error"])

@@ -10,7 +10,7 @@ from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations
 from clsplat.testing import synthetic_scene
 from clsplat.training.densify import Contributions, Survey
-from clsplat.training.densify.error_guided import HARM, MEMORY, SHARE_MIN, TOLL, ErrorGuided, split
+from clsplat.training.densify.error_guided import HARM, MEMORY, PRICED_PHOTOS, SURVEYED, TOLL, ErrorGuided, split
 
 N = 100
 CONFIG = TrainConfig(size="fixed", iterations=2000, strategy="error", max_gaussians=N)
@@ -26,16 +26,16 @@ def seeing(
     weights: np.ndarray,
     errors: np.ndarray,
     prices: np.ndarray | None = None,
-    share: float = 1.0,
+    photos: int = 1,
     differences: np.ndarray | None = None,
     pairs: np.ndarray | None = None,
 ) -> Survey:
     none = np.zeros(N)
 
-    def survey(views: int) -> Contributions:
-        assert views == CONFIG.error.views
+    def survey(views: int, fraction: float) -> Contributions:
+        assert (views, fraction) == (CONFIG.error.views, SURVEYED)
         rest = (none if array is None else array for array in (differences, pairs))
-        return Contributions(weights, errors, weights if prices is None else prices, *rest, share)
+        return Contributions(weights, errors, weights if prices is None else prices, *rest, photos)
 
     return survey
 
@@ -166,14 +166,14 @@ def test_children_inherit_a_quarter_of_the_squared_effect() -> None:
     np.testing.assert_array_equal(strategy.statistics["differences"], expected.astype(np.float32))
 
 
-@pytest.mark.parametrize(("share", "gone"), [(SHARE_MIN, 5), (0.99 * SHARE_MIN, 0)])
-def test_none_makes_room_by_a_survey_of_few_photos(share: float, gone: int) -> None:
+@pytest.mark.parametrize(("photos", "gone"), [(PRICED_PHOTOS, 5), (PRICED_PHOTOS + 1, 0)])
+def test_none_makes_room_where_there_are_many_photos(photos: int, gone: int) -> None:
     """Neither the least useful nor those that do harm in it: the other photos may need them."""
     for cap in (N, 2 * N):
         strategy = ErrorGuided(CONFIG, 1.0, N)
         prices = np.full(N, 1.0)
         prices[:5] = -2 * HARM
-        edit = strategy.edit(200, scene(), cap, seeing(np.ones(N), np.ones(N), prices, share))
+        edit = strategy.edit(200, scene(), cap, seeing(np.ones(N), np.ones(N), prices, photos))
         assert len(np.setdiff1d(np.arange(N), edit.rows)) == gone
 
 
@@ -181,7 +181,7 @@ def test_what_has_no_error_is_not_split() -> None:
     errors = np.zeros(N)
     errors[:3] = 1
     strategy = ErrorGuided(CONFIG, 1.0, N)
-    edit = strategy.edit(1500, scene(), 2 * N, seeing(np.zeros(N), errors))
+    edit = strategy.edit(1400, scene(), 2 * N, seeing(np.zeros(N), errors))
     assert len(edit.rows) == N + 3
 
 

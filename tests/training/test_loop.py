@@ -172,16 +172,16 @@ def test_each_round_surveys_photos_of_its_own(
     scene: Scene, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rounds: list[list[str]] = []
-    shares: list[float] = []
+    photos: list[int] = []
     edit = ErrorGuided.edit
 
     def watched(strategy: ErrorGuided, iteration: int, gaussians: Gaussians, cap: int, survey: Survey) -> Edit:
-        def shared(count: int) -> Contributions:
-            found = survey(count)
-            shares.append(found.share)
+        def counted(count: int, fraction: float) -> Contributions:
+            found = survey(count, fraction)
+            photos.append(found.photos)
             return found
 
-        return edit(strategy, iteration, gaussians, cap, shared)
+        return edit(strategy, iteration, gaussians, cap, counted)
 
     def recorded(renderer: Renderer, gaussians: Gaussians, views: list[View], *rest: Any) -> Any:
         rounds.append([view.name for view in views])
@@ -191,9 +191,9 @@ def test_each_round_surveys_photos_of_its_own(
     monkeypatch.setattr(sys.modules["clsplat.training.session"], "contributions", recorded)
     config = replace(with_strategy("error"), error=ErrorConfig(every=10, views=5))
     train(scene, config, tmp_path, device)
-    assert len(rounds) == 5 - 1  # after iterations 10 to 40, before 0.8 of 60
+    assert len(rounds) == 5  # after iterations 4 to 44: from 500/7000 of 60 until 0.8 of it, one of them after 24
     assert all(len(set(names)) == 5 for names in rounds)
-    assert shares == [5 / len(scene.train)] * 4
+    assert photos == [len(scene.train)] * 5
     assert len({tuple(sorted(names)) for names in rounds}) > 1
     assert set().union(*rounds) <= {view.name for view in scene.train}
 

@@ -18,7 +18,7 @@ N = 300
 CONFIG = TrainConfig(size="fixed", iterations=2000, strategy="mcmc", max_gaussians=N)
 
 
-def survey(views: int) -> Contributions:
+def survey(views: int, fraction: float) -> Contributions:
     raise AssertionError("this strategy asks for no survey")
 
 

@@ -23,7 +23,7 @@ def left_by_pruning(min_gaussians: int, n: int = 1000) -> int:
     gaussians = synthetic_scene(n)[0].astype(np.float32)
     gaussians.logit_opacities[:] = logit(np.float32(0.001))
 
-    def unused(views: int) -> Contributions:
+    def unused(views: int, fraction: float) -> Contributions:
         raise AssertionError("adc surveys no photos")
 
     return len(STRATEGIES["adc"](config, 1.0, n).edit(600, gaussians, n, unused).gaussians)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from clsplat.config import TrainConfig
 from clsplat.gaussians import Gaussians, logit
 from clsplat.reference.project import rotations
-from clsplat.training.densify.schedule import Schedule
+from clsplat.training.densify.schedule import WINDOW, Schedule
 from clsplat.training.densify.strategy import Contributions, Edit, Strategy, Survey
 
 Array = NDArray[Any]
@@ -29,6 +29,9 @@ the render less the photo, k + 1 of them change the squared error by 2 r d + (k 
 MEMORY = 0.9
 """Factor per round on the differences of earlier surveys. Ten rounds, which survey 100 photos, leave a third."""
 
+SURVEYED = 0.1
+"""Least fraction of the training photos in a survey: the rounds of growth then show most of many photos."""
+
 HARM = 1.0
 """Fall of the error, in even shares of it, above which Gaussians are removed while others grow (measured:
 docs/experiments/strategies.md)."""
@@ -37,9 +40,9 @@ TOLL = 1.0
 """Squared error that a Gaussian pays for each pair of it and a pixel, in even shares of the error per pair:
 compositing takes the same time for every pair (measured: docs/experiments/strategies.md)."""
 
-SHARE_MIN = 0.1
-"""Fraction of the training photos that must be surveyed for Gaussians to be removed by price: a Gaussian that few
-photos show seems useless in most surveys (measured: docs/experiments/strategies.md)."""
+PRICED_PHOTOS = 100
+"""Most training photos with which Gaussians are removed by price: of many photos, a Gaussian that few of them show
+seems useless in most surveys (measured: docs/experiments/strategies.md)."""
 
 
 class ErrorGuided(Strategy):
@@ -60,8 +63,10 @@ class ErrorGuided(Strategy):
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         super().__init__(config, extent, n)
-        self.config, self.schedule = config.error, Schedule(config, config.error)
-        self.last = config.iterations - self.schedule.every
+        every = config.error.every or max(1, round(WINDOW * config.iterations))
+        growing = config.error.every or max(1, every // 2)  # a second round in a window where the first one cannot reach the cap
+        self.config, self.schedule = config.error, Schedule(config, config.error, growing, every)
+        self.last = config.iterations - self.schedule.growing
         self.statistics = {"differences": np.zeros(n, np.float32)}
 
     def penalties(self, n: int) -> tuple[float, float]:
@@ -72,14 +77,15 @@ class ErrorGuided(Strategy):
         """See `clsplat.training.densify.Strategy`."""
         # After the last round, too, Gaussians that reach a viewpoint are shrunk. The last time leaves an interval to
         # train what has become smaller.
-        return self.schedule.start <= iteration <= self.last and iteration % self.schedule.every == 0
+        schedule = self.schedule
+        return schedule.start <= iteration <= self.last and (iteration - schedule.full) % schedule.growing == 0
 
     def edit(self, iteration: int, gaussians: Gaussians, cap: int, survey: Survey) -> Edit:
         """See `clsplat.training.densify.Strategy`."""
         n = len(gaussians)
         if not self.schedule.due(iteration):
             return Edit(gaussians, np.arange(n), np.zeros(n, bool))
-        seen = survey(self.config.views)
+        seen = survey(self.config.views, SURVEYED)
         errors = seen.errors
         known = np.maximum(seen.differences, MEMORY * self.statistics["differences"])
         target = self.schedule.count_after(iteration, n, cap)
@@ -110,7 +116,7 @@ class ErrorGuided(Strategy):
         prices, error = seen.prices + OTHERS * known, seen.errors.sum()
         tolls = TOLL * error / max(seen.pairs.sum(), 1) * seen.pairs
         # Gaussians that no photo of the survey shows may be needed by the others.
-        rows = np.flatnonzero((seen.weights > 0) & (seen.share >= SHARE_MIN))
+        rows = np.flatnonzero((seen.weights > 0) & (seen.photos <= PRICED_PHOTOS))
         n = len(prices)
         harmful = (prices[rows] <= (0 if full else -HARM * error / n)).sum()
         count = np.clip(harmful, self.config.replaced * n if full else 0, self.config.replaced_most * n)

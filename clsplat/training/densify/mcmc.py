@@ -11,6 +11,7 @@ from clsplat.randomness import stream
 from clsplat.stages import Stages
 from clsplat.training.densify.schedule import Schedule
 from clsplat.training.densify.strategy import Edit, Strategy, Survey
+from clsplat.training.run_length import FEWEST_ITERATIONS
 
 Array = NDArray[Any]
 
@@ -30,7 +31,8 @@ class Mcmc(Strategy):
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         super().__init__(config, extent, n)
         self.config, self.seed, self.extent = config.mcmc, config.seed, extent
-        self.schedule = Schedule(config, config.mcmc)
+        every = interval(config)
+        self.schedule = Schedule(config, config.mcmc, every, every)
 
     def penalties(self, n: int) -> tuple[float, float]:
         """See `clsplat.training.densify.Strategy`; the configured weights are those of means over Gaussians and
@@ -69,6 +71,12 @@ class Mcmc(Strategy):
         grown = moved.take(all_rows)
         share(grown, np.bincount(all_rows, minlength=n)[all_rows], self.config.opacity_min)
         return Edit(grown, rows[all_rows], np.concatenate([fresh, np.ones(len(added), bool)]))
+
+
+def interval(config: TrainConfig) -> int:
+    """Iterations between two rounds: with ``--size auto`` a short run has as many as one of `FEWEST_ITERATIONS`."""
+    share = min(1.0, config.iterations / FEWEST_ITERATIONS) if config.size == "auto" else 1.0
+    return max(1, round(config.mcmc.every * share))
 
 
 def sample(weights: Array, count: int, generator: np.random.Generator) -> Array:

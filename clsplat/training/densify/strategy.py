@@ -27,7 +27,7 @@ class Contributions(NamedTuple):
     weights (N,): sums of the compositing weights; errors (N,): sums of weight times the pixel's squared error; prices
     (N,): change of the squared error if the Gaussian alone is removed, negative if the error falls; differences (N,):
     squared difference that this makes to the images; pairs (N,): pixels in which the Gaussian is composited. Squares
-    are summed over RGB. share: fraction of the training photos that these are.
+    are summed over RGB. photos: number of the training photos, of which these are some.
     """
 
     weights: Array
@@ -35,11 +35,11 @@ class Contributions(NamedTuple):
     prices: Array
     differences: Array
     pairs: Array
-    share: float = 1.0
+    photos: int = 1
 
 
-Survey = Callable[[int], Contributions]
-"""Return the contributions to a number of training photos, or to all if there are fewer."""
+Survey = Callable[[int, float], Contributions]
+"""Return the contributions to a number of training photos, or to a fraction of them if this is more."""
 
 
 class Edit(NamedTuple):
