@@ -8,6 +8,7 @@ from small_run import with_strategy
 
 from clsplat import reference
 from clsplat.camera import Camera
+from clsplat.config import ErrorConfig
 from clsplat.constants import ALPHA_MIN
 from clsplat.dataset.near_planes import with_near_planes
 from clsplat.device import Device
@@ -86,7 +87,7 @@ def test_viewpoints_are_between_neighbours_in_free_space() -> None:
 @pytest.mark.parametrize("strategy", ["error", "adc"])
 def test_training_leaves_room(strategy: str, scene: Scene, device: Device) -> None:
     """In each round and after the last one; the paper's strategy does not."""
-    config = with_strategy(strategy)
+    config = replace(with_strategy(strategy), error=ErrorConfig(every=5))
     training = Training(with_near_planes(scene), config, device, initial_state(scene, config))
     cameras = [view.camera for view in training.scene.train]
     room = viewpoints(cameras), steepest_slope(cameras)
