@@ -215,7 +215,8 @@ def test_files_of_settings_are_checked(tmp_path):
 
 
 def test_python_is_checked_before_it_reads(tmp_path):
-    for bad in (TrainConfig(seed=-1), TrainConfig(checkpoint_every=0), changed(TrainConfig(), ("error", "every"), -1)):
+    negative = changed(TrainConfig(), ("error", "every"), -1)
+    for bad in (TrainConfig(seed=-1), TrainConfig(checkpoint_every=0), negative):
         with pytest.raises(InputError, match=r"^--(seed|checkpoint-every|error\.every): expected an integer"):
             prepare(tmp_path / "none", bad)
         with pytest.raises(InputError, match=r"^--(seed|checkpoint-every|error\.every): expected an integer"):
