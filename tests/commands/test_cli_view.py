@@ -78,7 +78,7 @@ def test_train_with_a_viewer_ends_with_the_same_bits_and_stays_open(
     monkeypatch.setattr(Viewer, "follow", lambda self, gaussians, interrupted: sizes.append(len(gaussians)))
     run("train", dataset, "-o", tmp_path / "out", "--viewer", "--port", 18090, *TRAIN)
     ((facts, gaussians),) = held
-    assert sizes == [200] * 20, "every iteration is shown"
+    assert len(sizes) == 20, "every iteration is shown"
     assert "20 of 20" in facts and f"{len(gaussians):,}" in facts and "PSNR" in facts
     assert (tmp_path / "out" / "scene.ply").read_bytes() == (trained / "scene.ply").read_bytes()
 
