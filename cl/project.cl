@@ -489,7 +489,8 @@ static inline void sum_camera(const GaussianGrad *v, __local real *partial, __gl
 #endif
 
 #if LANES == 1
-// Factors of the gradients of a Gaussian's coefficients, in local memory: the basis, then the gradient of the colour. The number of values is odd, so that the rows of neighbouring work-items begin in different banks.
+// Factors of the gradients of a Gaussian's coefficients, in local memory: the basis, then the gradient of the colour.
+// The number of values is odd, so that the rows of neighbouring work-items begin in different banks.
 #define ROW 19
 
 static inline void share_row(const real *basis, reals3 v_color, __local real *rows) {

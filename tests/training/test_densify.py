@@ -250,7 +250,7 @@ def test_the_search_has_as_many_rounds_in_short_runs(size: Literal["auto", "fixe
 
 
 @pytest.mark.parametrize("size", ["auto", "fixed"])
-@pytest.mark.parametrize(("iterations", "growth"), [(1000, 50), (3000, 150), (4337, 217)])
+@pytest.mark.parametrize(("iterations", "growth"), [(1000, 50), (3000, 150), (4337, 217), (4994, 249)])
 def test_error_has_a_round_in_each_twentieth_of_growth_and_each_tenth_afterwards(
     size: Literal["auto", "fixed"], iterations: int, growth: int
 ) -> None:
@@ -258,7 +258,10 @@ def test_error_has_a_round_in_each_twentieth_of_growth_and_each_tenth_afterwards
     times = [i for i in range(1, iterations + 1) if schedule.due(i)]
     full = round(0.4 * iterations)
     assert {*times} >= {full - k * growth for k in range(5)}
-    assert [i for i in times if i > full] == [full + k * round(iterations / 10) for k in (1, 2, 3)]
+    assert [i for i in times if i > full] == [*range(full + 2 * growth, round(0.8 * iterations), 2 * growth)]
+    config = replace(CONFIG, strategy="error", size=size, iterations=iterations, max_gaussians=5000)
+    strategy = STRATEGIES["error"](config, 1.0, N)
+    assert all(map(strategy.due, times)), "training asks for each round"
 
 
 @pytest.mark.parametrize("iterations", [700, 1005, 3000, 4337, 7650])

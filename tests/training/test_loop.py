@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import replace
+from math import ceil
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +23,7 @@ from clsplat.scene import Scene, View
 from clsplat.training.autosize.validation import split
 from clsplat.training.contributions import contributions
 from clsplat.training.densify import Contributions, Edit, Survey
-from clsplat.training.densify.error_guided import ErrorGuided
+from clsplat.training.densify.error_guided import SURVEYED, ErrorGuided
 from clsplat.training.loop import train
 from clsplat.training.session import Training, step, view_at
 from clsplat.training.state import initial_state, start_config
@@ -195,6 +196,9 @@ def test_each_round_surveys_photos_of_its_own(
     assert all(len(set(names)) == 5 for names in rounds)
     assert photos == [len(scene.train)] * 5
     assert len({tuple(sorted(names)) for names in rounds}) > 1
+    rounds.clear()
+    train(scene, replace(config, error=ErrorConfig(every=10, views=1)), tmp_path, device)
+    assert {len(names) for names in rounds} == {ceil(SURVEYED * len(scene.train))} == {2}
     assert set().union(*rounds) <= {view.name for view in scene.train}
 
 

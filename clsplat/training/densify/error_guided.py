@@ -63,9 +63,9 @@ class ErrorGuided(Strategy):
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         super().__init__(config, extent, n)
-        every = config.error.every or max(1, round(WINDOW * config.iterations))
         # The second round in a window is for caps that the first one, which doubles at most, does not reach.
-        growing = config.error.every or max(1, every // 2)
+        growing = config.error.every or max(1, round(WINDOW * config.iterations) // 2)
+        every = config.error.every or 2 * growing  # a multiple, so that `due` knows each round
         self.config, self.schedule = config.error, Schedule(config, config.error, growing, every)
         self.last = config.iterations - self.schedule.growing
         self.statistics = {"differences": np.zeros(n, np.float32)}
