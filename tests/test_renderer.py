@@ -59,8 +59,8 @@ def test_what_is_on_the_device_is_not_uploaded_again(device, monkeypatch):
     placed = renderer.place(gaussians.astype(np.float32))
     assert renderer.place(placed) is placed
     uploads = []
-    upload = device.upload
-    monkeypatch.setattr(device, "upload", lambda what, *a: uploads.append(what) or upload(what, *a))
+    upload = Device.upload
+    monkeypatch.setattr(Device, "upload", lambda self, what, *a: uploads.append(what) or upload(self, what, *a))
     next(renderings(renderer, placed, [camera]))
     assert not set(uploads) & set(Gaussians.__dataclass_fields__)
     for name, array in fetch(placed).arrays().items():
