@@ -157,7 +157,7 @@ class OptimConfig:
     """Term that Adam adds to the root of the mean square."""
     ssim_weight: Fraction = 0.2
     """Weight lambda in the loss (1 - lambda) L1 + lambda (1 - SSIM) (paper, equation 7)."""
-    sh_degree_every: Count = 1000
+    sh_degree_every: Count = 700
     """Iterations after which the degree of the trained spherical harmonics rises by one; fewer in short runs."""
     erank_penalty: NonNegative = 0.0
     """Weight in the loss of the penalty of needles: the mean over Gaussians of max(-ln(effective rank - 1), 0)."""

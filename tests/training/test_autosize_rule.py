@@ -21,6 +21,7 @@ from clsplat.training.autosize.rule import (
     validation_times,
     window_bounds,
 )
+from clsplat.training.optimizer import sh_degree_at
 
 CONFIG = TrainConfig(iterations=3000)
 
@@ -73,12 +74,15 @@ def test_learning_rates_are_low_in_trials_of_pruning() -> None:
 
 
 def test_pruning_is_tried_until_it_fails() -> None:
-    """By at least four held-back photos."""
+    """By at least four held-back photos, and where growth did not pay."""
     failed, went = trial(False, [1.0, 1.0]), trial(False, [-1.0, -1.0])
     search, first = Search(500, grows=False), first_pruning(CONFIG)
     assert prunes(search, first, 4, CONFIG) and not prunes(search, first, 3, CONFIG)
     assert prunes(replace(search, trials=[trial(True, [-1, -1]), went]), first, 4, CONFIG)
     assert not prunes(replace(search, trials=[went, failed]), first, 4, CONFIG)
+    unpaid, paid = trial(True, [0.0, 0.0]), trial(True, [1.0, 1.0])
+    assert prunes(replace(search, trials=[paid, unpaid]), first, 4, CONFIG)
+    assert not prunes(replace(search, trials=[unpaid, paid]), first, 4, CONFIG)
     assert not prunes(search, window_bounds(CONFIG)[-1], 4, CONFIG), "time is over"
 
 
@@ -98,14 +102,21 @@ def test_windows_are_within_the_run() -> None:
         assert found and 1 <= found[0] and found[-1] <= iterations
 
 
+@pytest.mark.parametrize("iterations", [100, 1000, 3000, 4337, 7650, 30_000])
+def test_each_degree_is_trained_before_one_is_chosen(iterations: int) -> None:
+    """The last band for a quarter of the iterations until then."""
+    config = replace(CONFIG, iterations=iterations)
+    chosen = first_pruning(config)
+    assert sh_degree_at(3 * chosen // 4 + 2, config.shortened(config.optim.sh_degree_every), 3) == 3
+
+
 def test_photos_that_return_bring_gaussians_where_growth_paid() -> None:
-    """In proportion to the photos, if the last growth was taken and no pruning was."""
+    """In proportion to the photos, if the last growth was taken."""
     paid, unpaid, halved = trial(True, [1.0, 1.0]), trial(True, [0.0, 0.0]), trial(False, [-1.0, -1.0])
-    kept = trial(False, [1.0, 1.0])
 
     def most(*trials: Trial, config: TrainConfig = CONFIG) -> int:
         return most_with_all(Search(1000, grows=False, trials=list(trials)), 22, 26, config)
 
-    assert most(unpaid, paid) == most(paid, kept) == 1182
-    assert most(paid, unpaid) == most(paid, halved, kept) == most() == 1000
+    assert most(paid) == most(unpaid, paid) == 1182
+    assert most(paid, unpaid) == most(unpaid, halved) == most() == 1000
     assert most(paid, config=replace(CONFIG, max_gaussians=1100)) == 1100

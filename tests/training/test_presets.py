@@ -47,6 +47,7 @@ def test_the_papers_presets_are_its_strategy_and_iterations():
         sh_rest_lr=2.5e-3 / 20,
         rates_final=1.0,
         beta2=0.999,
+        sh_degree_every=1000,
     )
     paper = TrainConfig(strategy="adc", size="fixed", init=InitConfig(triangulate=False, dense=False), optim=rates)
     assert load_preset("paper-7k") == replace(paper, iterations=7000)

@@ -2,9 +2,9 @@
 
 Some training photos are held back. A candidate is a number of Gaussians with its quality on these photos and a price
 per doubling of the number. The scene grows until growth stops paying on the held-back photos, and returns to the last
-candidate that did. Then trials of pruning compare it with a copy without the Gaussians of the lowest price of
-removal, trained for the same iterations. The degree of the spherical harmonics is chosen by the same price per
-doubling of the bytes. After that all photos train.
+candidate that did. Where it did not pay, trials of pruning compare the scene with a copy without the Gaussians of the
+lowest price of removal, trained for the same iterations. The degree of the spherical harmonics is chosen by the same
+price per doubling of the bytes. After that all photos train.
 """
 
 from dataclasses import dataclass, field
@@ -207,6 +207,12 @@ class Search:
             raise ValueError(f"search {saved}")
         return search
 
+    @property
+    def growth_paid(self) -> bool:
+        """Whether the last comparison of growth took the larger number of Gaussians."""
+        grown = [trial for trial in self.trials if trial.grows]
+        return bool(grown) and not grown[-1].takes_smaller
+
     def holds_back(self, iteration: int) -> bool:
         """Whether photos are held back in an iteration: up to the one in which the search settles."""
         return not self.settled or iteration <= self.settled
@@ -294,12 +300,10 @@ def most_grown(search: Search, config: TrainConfig) -> int:
 def most_with_all(search: Search, trained: int, photos: int, config: TrainConfig) -> int:
     """Largest number of Gaussians once all photos train, not only `trained` of them.
 
-    If growth paid until its end, and no pruning did, it is in proportion to the photos: what only those show that
-    were held back has few Gaussians until then.
+    If growth paid until its end, it is in proportion to the photos: what only those show that were held back has few
+    Gaussians until then.
     """
-    grown = [trial for trial in search.trials if trial.grows]
-    pruned = any(not trial.grows and trial.takes_smaller for trial in search.trials)
-    if not grown or grown[-1].takes_smaller or pruned:
+    if not search.growth_paid:
         return search.most
     return min(ceil(search.most * photos / trained), most_allowed(config))
 
@@ -307,7 +311,8 @@ def most_with_all(search: Search, trained: int, photos: int, config: TrainConfig
 def prunes(search: Search, iteration: int, held: int, config: TrainConfig) -> bool:
     """Whether a trial of pruning begins at one of the `window_bounds`: until one is rejected or time is over.
 
-    With fewer than `FEWEST_PRUNING` held-back photos none does.
+    None does where growth paid, or with fewer than `FEWEST_PRUNING` held-back photos.
     """
     rejected = any(not trial.grows and not trial.takes_smaller for trial in search.trials)
-    return held >= FEWEST_PRUNING and not rejected and iteration < window_bounds(config)[-1]
+    decidable = held >= FEWEST_PRUNING and not search.growth_paid
+    return decidable and not rejected and iteration < window_bounds(config)[-1]
