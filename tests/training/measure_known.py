@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from test_autosize import CONFIG, held_out, known_scene
+from test_autosize import GROWING, held_out, known_scene
 
 from clsplat.device import Device
 from clsplat.training.loop import train
@@ -21,5 +21,6 @@ if __name__ == "__main__":
             rows = order[: int(factor * count)]
             fewer = replace(scene, points=scene.points[rows], colors=scene.colors[rows])
             with tempfile.TemporaryDirectory() as folder:
-                gaussians = train(fewer, replace(CONFIG, size="fixed"), Path(folder), device)
+                config = replace(GROWING, size="fixed", max_gaussians=len(rows))
+                gaussians = train(fewer, config, Path(folder), device)
             print(f"{count} known, {len(gaussians)} trained: {held_out(gaussians, scene, device):.2f} dB", flush=True)

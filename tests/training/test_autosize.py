@@ -49,6 +49,8 @@ CONFIG = TrainConfig(
     adc=AdcConfig(stop_fraction=0.0),
     optim=OptimConfig(means_lr=8e-4, means_lr_final=8e-6),
 )
+GROWING = replace(CONFIG, strategy="error")
+"""With a strategy that adds Gaussians. Pruning is tried where more of them were worse."""
 
 
 def known_scene(count: int, device: Device, *, copies: int, views: int = 40) -> Scene:
@@ -172,17 +174,16 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     for name in ("whole", "parts"):
         (tmp_path / name).mkdir()
     # A price at which the start is not the best.
-    config = replace(CONFIG, iterations=200, checkpoint_every=1000, size_price=8.0)
+    config = replace(GROWING, iterations=200, checkpoint_every=1000, size_price=8.0)
     sizes: list[int] = []
     whole = train(scene, config, tmp_path / "whole", device, progress=lambda r: sizes.append(r["num_gaussians"]))
     report = json.loads((tmp_path / "whole" / "size.json").read_text())
     # 8 dB less is an error of 0.16, as of a part of each of log2(N) doublings.
     assert report["least_share"] == pytest.approx(np.log2(10 ** (config.size_price / 10)))
     trials = report["trials"]
-    assert [found["n"] for found in trials] == [[40, 80], [20, 40], [10, 20]]
+    assert [found["n"] for found in trials] == [[80, 320], [40, 80], [20, 40], [10, 20]]
     for found in trials:
-        margin = found["margin"] if found["kind"] == "growth" else -found["margin"]
-        assert (found["taken"] == found["n"][0]) == (found["gain"] <= found["price"] + margin), found
+        assert (found["taken"] == found["n"][0]) == (found["gain"] <= found["price"] + found["margin"]), found
         assert found["price"] == pytest.approx(8 * np.log2(found["n"][1] / found["n"][0]))
     # Each begins with what the one before it came to.
     assert all(a["taken"] in b["n"] for a, b in pairwise(trials))
@@ -226,7 +227,7 @@ def test_trials_of_pruning_train_with_low_rates(
         return adam_settings(iteration, *args)
 
     monkeypatch.setattr("clsplat.training.session.adam_settings", spied)
-    config = replace(CONFIG, iterations=200, size_price=8.0)
+    config = replace(GROWING, iterations=200, size_price=8.0)
     train(known_scene(20, device, copies=4, views=36), config, tmp_path, device)
     first = first_pruning(config)
     assert [factors[iteration] for iteration in (first - 1, first, 200)] == [{1.0}, {TRIAL_RATES}, {1.0}]
@@ -287,20 +288,19 @@ def test_too_few_photos_to_validate(device: Device, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "plateau", "best"), [(64, 128, 31.64), (128, 256, 31.12), (256, 512, 30.62)])
+@pytest.mark.parametrize(("count", "plateau", "best"), [(64, 120, 31.44), (128, 177, 30.89), (256, 507, 30.42)])
 def test_it_finds_the_size_of_known_scenes(
     device: Device, tmp_path: Path, count: int, plateau: int, best: float
 ) -> None:
-    """From eight times as many Gaussians as the photos show, at most twice the smallest size that reaches the
-    plateau, at its quality within 0.2 dB. Pruning goes by halvings, and the last one is not accepted: its trial is
-    short.
+    """From eight times as many Gaussians as the photos show, at most three times the smallest size that reaches the
+    plateau, at its quality within 0.2 dB. Pruning goes by halvings.
 
     `plateau`, `best`: of fixed sizes, factors of sqrt(2) apart, the smallest within 0.2 dB of the best and that one's
     quality (tests/training/measure_known.py).
     """
     scene = known_scene(count, device, copies=8)
-    gaussians = train(scene, CONFIG, tmp_path, device)
-    assert plateau / 1.5 <= len(gaussians) <= 2 * plateau
+    gaussians = train(scene, GROWING, tmp_path, device)
+    assert plateau / 1.5 <= len(gaussians) <= 3 * plateau
     assert held_out(gaussians, scene, device) > best - 0.2
 
 

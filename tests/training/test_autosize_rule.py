@@ -7,7 +7,6 @@ import pytest
 
 from clsplat.config import TrainConfig
 from clsplat.training.autosize.rule import (
-    LATER_GAIN,
     TRIAL_RATES,
     Search,
     SmallSide,
@@ -35,19 +34,18 @@ def trial(grows: bool, gains: list[float], price: float = 0.1) -> Trial:
 
 
 def test_a_change_is_earned_beyond_chance() -> None:
-    """Growth must gain more than its price by the standard error; what pruning loses until the end of the run must be
-    below it by as much."""
+    """The larger side must gain more than its price by the standard error, whether it has grown or was not pruned. It
+    loses if it gains less by as much."""
     found = trial(True, [0.1, 0.3])
     assert (found.gain, found.margin, found.price) == pytest.approx((0.2, 0.1, 0.1))
     assert trial(True, [-9.0, 0.1, 0.3, 0.4]).margin == pytest.approx(1.4826 * 0.15 / 2), (
         "one photo is far from all others"
     )
-    assert not trial(True, [0.11, 0.4]).takes_smaller and trial(True, [0.09, 0.4]).takes_smaller
-    least = 0.1 - LATER_GAIN
-    assert trial(False, [-0.3, least - 0.01]).takes_smaller and not trial(False, [-0.3, least + 0.01]).takes_smaller
-    assert trial(False, [-0.3, 0.09], price=0.1 + LATER_GAIN).takes_smaller
-    assert trial(True, [0.09, 0.09]).takes_smaller and not trial(True, [0.11, 0.11]).takes_smaller
-    assert not trial(True, [-3.7, 0.72, 0.74, 0.87]).takes_smaller, "one photo does not decide"
+    for grows in (True, False):
+        assert not trial(grows, [0.11, 0.4]).takes_smaller and trial(grows, [0.09, 0.4]).takes_smaller
+        assert trial(grows, [0.09, 0.09]).takes_smaller and not trial(grows, [0.11, 0.11]).takes_smaller
+        assert not trial(grows, [-3.7, 0.72, 0.74, 0.87]).takes_smaller, "one photo does not decide"
+    assert trial(True, [-0.3, 0.09]).larger_loses and not trial(True, [-0.3, 0.11]).larger_loses
 
 
 def side(n: int, quality: float = 30.0) -> SmallSide:
@@ -74,15 +72,15 @@ def test_learning_rates_are_low_in_trials_of_pruning() -> None:
 
 
 def test_pruning_is_tried_until_it_fails() -> None:
-    """By at least four held-back photos, and where growth did not pay."""
+    """By at least four held-back photos, and where growth lost."""
     failed, went = trial(False, [1.0, 1.0]), trial(False, [-1.0, -1.0])
-    search, first = Search(500, grows=False), first_pruning(CONFIG)
+    lost, paid, unclear = trial(True, [-0.1, 0.0]), trial(True, [1.0, 1.0]), trial(True, [-1.0, 1.0])
+    search, first = Search(500, grows=False, trials=[paid, lost]), first_pruning(CONFIG)
     assert prunes(search, first, 4, CONFIG) and not prunes(search, first, 3, CONFIG)
-    assert prunes(replace(search, trials=[trial(True, [-1, -1]), went]), first, 4, CONFIG)
-    assert not prunes(replace(search, trials=[went, failed]), first, 4, CONFIG)
-    unpaid, paid = trial(True, [0.0, 0.0]), trial(True, [1.0, 1.0])
-    assert prunes(replace(search, trials=[paid, unpaid]), first, 4, CONFIG)
-    assert not prunes(replace(search, trials=[unpaid, paid]), first, 4, CONFIG)
+    for trials, tries in (([lost, went], True), ([lost, went, failed], False), ([], False)):
+        assert prunes(replace(search, trials=trials), first, 4, CONFIG) == tries
+    for last in (paid, unclear):
+        assert not prunes(replace(search, trials=[lost, last]), first, 4, CONFIG)
     assert not prunes(search, window_bounds(CONFIG)[-1], 4, CONFIG), "time is over"
 
 

@@ -2,9 +2,9 @@
 
 Some training photos are held back. A candidate is a number of Gaussians with its quality on these photos and a price
 per doubling of the number. The scene grows until growth stops paying on the held-back photos, and returns to the last
-candidate that did. Where it did not pay, trials of pruning compare the scene with a copy without the Gaussians of the
-lowest price of removal, trained for the same iterations. The degree of the spherical harmonics is chosen by the same
-price per doubling of the bytes. After that all photos train.
+candidate that did. Where more Gaussians were worse, trials of pruning compare the scene with a copy without those of
+the lowest price of removal, trained for the same iterations. The degree of the spherical harmonics is chosen by the
+same price per doubling of the bytes. After that all photos train.
 """
 
 from dataclasses import dataclass, field
@@ -41,9 +41,9 @@ GROWTH_START = 500
 """Iterations before the first validation in a run of full length, as before the strategies' first rounds."""
 
 SURE = 1.0
-"""Standard errors by which the gain of the larger of two candidates must exceed its price (the one-standard-error
-rule of Breiman et al. 1984, "Classification and Regression Trees", section 3.4.3), and by which the loss by
-pruning must be below its price."""
+"""Standard errors by which the gain of the larger of two candidates must exceed its price: of those that cannot be
+told apart, the smaller one is taken (the one-standard-error rule of Breiman et al. 1984, "Classification and
+Regression Trees", section 3.4.3)."""
 
 NORMAL_DEVIATIONS = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -69,10 +69,6 @@ FEWEST_PRUNING = 4
 
 HALVING = 0.5
 """Fraction of the Gaussians that a trial of pruning leaves."""
-
-LATER_GAIN = 0.12
-"""Gain, dB, that twice the Gaussians still make between a trial of pruning and the end of the run: few Gaussians
-learn faster. The least of three captures (docs/experiments/size.md)."""
 
 RANDOM_START = 10_000
 """Gaussians of a random start. Few are enough, since they only have to fill the scene before growth adds detail."""
@@ -147,14 +143,13 @@ class Trial(NamedTuple):
 
     @property
     def takes_smaller(self) -> bool:
-        """Whether the smaller candidate continues.
+        """Whether the smaller candidate continues: unless the larger one gains more than its price, beyond chance."""
+        return self.gain <= self.price + self.margin
 
-        A change must be earned: growth has to gain more than its price beyond chance, and what pruning loses until
-        the end of the run must be below the price beyond chance.
-        """
-        if self.grows:
-            return self.gain <= self.price + self.margin
-        return self.gain + LATER_GAIN <= self.price - self.margin
+    @property
+    def larger_loses(self) -> bool:
+        """Whether the larger candidate gains less than its price, beyond chance."""
+        return self.gain <= self.price - self.margin
 
 
 class SmallSide(NamedTuple):
@@ -208,10 +203,9 @@ class Search:
         return search
 
     @property
-    def growth_paid(self) -> bool:
-        """Whether the last comparison of growth took the larger number of Gaussians."""
-        grown = [trial for trial in self.trials if trial.grows]
-        return bool(grown) and not grown[-1].takes_smaller
+    def growth(self) -> Trial | None:
+        """The last comparison of growth."""
+        return next((trial for trial in reversed(self.trials) if trial.grows), None)
 
     def holds_back(self, iteration: int) -> bool:
         """Whether photos are held back in an iteration: up to the one in which the search settles."""
@@ -303,7 +297,7 @@ def most_with_all(search: Search, trained: int, photos: int, config: TrainConfig
     If growth paid until its end, it is in proportion to the photos: what only those show that were held back has few
     Gaussians until then.
     """
-    if not search.growth_paid:
+    if search.growth is None or search.growth.takes_smaller:
         return search.most
     return min(ceil(search.most * photos / trained), most_allowed(config))
 
@@ -311,8 +305,9 @@ def most_with_all(search: Search, trained: int, photos: int, config: TrainConfig
 def prunes(search: Search, iteration: int, held: int, config: TrainConfig) -> bool:
     """Whether a trial of pruning begins at one of the `window_bounds`: until one is rejected or time is over.
 
-    None does where growth paid, or with fewer than `FEWEST_PRUNING` held-back photos.
+    Only where growth lost beyond chance, and with at least `FEWEST_PRUNING` held-back photos: in the middle of a run,
+    few Gaussians seem as good as the many that are better at its end (measured: docs/experiments/size.md).
     """
     rejected = any(not trial.grows and not trial.takes_smaller for trial in search.trials)
-    decidable = held >= FEWEST_PRUNING and not search.growth_paid
-    return decidable and not rejected and iteration < window_bounds(config)[-1]
+    tries = held >= FEWEST_PRUNING and search.growth is not None and search.growth.larger_loses
+    return tries and not rejected and iteration < window_bounds(config)[-1]
