@@ -19,8 +19,8 @@ def write_report(path: Path, search: Search, config: TrainConfig, held: list[str
     chosen = max(search.degrees, key=lambda p: p.worth)
     content = {
         "rule": "growth whose gain, the median over the held-back photos, is more than its price by the margin of "
-        f"{SURE:g} standard error; pruning that loses less than its price by as much; then the degree with the "
-        "largest worth = quality - price log2(bytes)",
+        f"{SURE:g} standard error; where it is less by as much, pruning until one loses more than its price by as "
+        "much; then the degree with the largest worth = quality - price log2(bytes)",
         "quality": "mean of PSNR and of SSIM in decibels on the held-back photos",
         "held_back": held,
         "price": config.size_price,
