@@ -279,8 +279,8 @@ class FewViewsConfig:
     dropout: PartialFraction = 0.2
     """Fraction of the splats left out of each image at the end of the training (DropGaussian)."""
     growth: Positive = 8.0
-    """Largest number of Gaussians, as a multiple of the number of the scene's points. If a photo has fewer pixels
-    than this number, the bound is the number of pixels, or half the multiple if this is more."""
+    """Largest number of Gaussians, as a multiple of the number of the scene's points. Photos of fewer pixels than
+    this lower it to their number, at most by half; photos of more than 90 000 pixels may raise it."""
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,17 @@ from dataclasses import replace
 
 from clsplat.config import TrainConfig
 from clsplat.scene import Scene
-from clsplat.training.autosize.rule import PER_PIXEL, RANDOM_START
+from clsplat.training.autosize.rule import PER_PIXEL, RANDOM_START, reach
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
-from clsplat.training.run_length import largest_photo
+from clsplat.training.run_length import SMALL_PHOTO, largest_photo
 
 
 def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Adapt a configuration to the number of training photos.
 
     With fewer than `config.few.below` dropout is on, and the number of Gaussians is not searched but bounded by a
-    multiple of the points; for small photos by half of it, or one per pixel. Otherwise the configuration is returned
-    as it is.
+    multiple of the points; for small photos by half of it, or one per pixel, and for large ones by what a search may
+    reach if this is more (measured: docs/experiments/strategies.md). Otherwise the configuration is returned as it is.
     """
     few = config.few
     if len(scene.train) >= few.below:
@@ -32,8 +32,10 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
             init = replace(init, random_points=first)
     cap = config.max_gaussians
     if first:
-        pixels = PER_PIXEL * largest_photo(scene)
-        grown = few.growth * first
-        most = max(1, min(round(min(grown, max(grown / 2, pixels))), MOST_GAUSSIANS))
+        pixels, grown = largest_photo(scene), few.growth * first
+        most = min(grown, max(grown / 2, PER_PIXEL * pixels))
+        if pixels > SMALL_PHOTO:
+            most = max(most, reach(scene))
+        most = max(1, min(round(most), MOST_GAUSSIANS))
         cap = most if cap is None else min(cap, most)
     return replace(config, init=init, max_gaussians=cap, dropout=max(config.dropout, few.dropout))

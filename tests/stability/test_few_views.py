@@ -46,6 +46,8 @@ def test_settings_for_few_photos(scene):
     for times, most in ((2, SIZE[0] * SIZE[1]), (3, 12 * points)):  # 2400 and 3600 are more than the pixels
         more = replace(scene, points=np.tile(scene.points, (times, 1)))
         assert few_views.adapted(config, more).max_gaussians == most
+    large = with_train(scene, lambda view, rng: replace(view, camera=view.camera.resized(600, 600)))
+    assert few_views.adapted(config, large).max_gaussians == round(90_000 * 2**0.5)
     assert few_views.adapted(few, scene) == few, "a resumed run, and one from its config.json, continue"
     assert few_views.adapted(replace(config, max_gaussians=7), scene).max_gaussians == 7
     assert few_views.adapted(replace(config, size="auto"), scene) == few, "too few photos to search for the size"

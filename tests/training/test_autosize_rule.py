@@ -11,6 +11,7 @@ from clsplat.training.autosize.rule import (
     Search,
     SmallSide,
     Trial,
+    best_degree,
     candidate,
     first_pruning,
     growth_ends,
@@ -90,6 +91,20 @@ def test_worth_counts_doublings_of_bytes() -> None:
     assert one.worth - two.worth == pytest.approx(0.25)
     plain, rich = (candidate(1, 100, degree, [[30.0]], config) for degree in (0, 3))
     assert plain.worth - rich.worth == pytest.approx(0.25 * np.log2(sh_bytes(3) / sh_bytes(0)))
+
+
+def test_the_degree_is_lowered_where_the_highest_one_loses() -> None:
+    """Beyond chance: of degrees that cannot be told apart the highest one stays, even with the lowest worth."""
+
+    def chosen(*views: list[float]) -> int:
+        return best_degree([candidate(1, 100, degree, [v], CONFIG) for degree, v in enumerate(views)]).sh_degree
+
+    same, better, unclear = [30.0, 30.0], [31.0, 31.0], [29.7, 30.2]
+    assert chosen(same, same) == 0
+    assert chosen(same, better) == 1
+    assert chosen(same, unclear) == 1
+    assert chosen(same, better, same) == 1
+    assert chosen(better, same, unclear) == 0
 
 
 def test_windows_are_within_the_run() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from clsplat.atomic import replacing
 from clsplat.config import TrainConfig
-from clsplat.training.autosize.rule import SURE, Search, sh_bytes
+from clsplat.training.autosize.rule import SURE, Search, best_degree, sh_bytes
 
 
 def write_report(path: Path, search: Search, config: TrainConfig, held: list[str]) -> None:
@@ -16,11 +16,12 @@ def write_report(path: Path, search: Search, config: TrainConfig, held: list[str
     error by the fraction p ln(10)/10 and is ln(2) on the natural scale of N. The last Gaussian must therefore lower
     the error by the fraction p ln(10)/(10 ln(2)) of a Gaussian's even share.
     """
-    chosen = max(search.degrees, key=lambda p: p.worth)
+    chosen = best_degree(search.degrees)
     content = {
         "rule": "growth whose gain, the median over the held-back photos, is more than its price by the margin of "
         f"{SURE:g} standard error; where it is less by as much, pruning until one loses more than its price by as "
-        "much; then the degree with the largest worth = quality - price log2(bytes)",
+        "much; a lower degree where the highest one gains less than its price by as much, and of these the one of the "
+        "largest worth = quality - price log2(bytes)",
         "quality": "mean of PSNR and of SSIM in decibels on the held-back photos",
         "held_back": held,
         "price": config.size_price,
@@ -80,7 +81,7 @@ def size_chart(report: Path, path: Path) -> None:
         name = f"price: {content['price']:g} dB per doubling"
         by_n.plot(trial["n"], price, "--", color=orange, linewidth=1, label=None if name in labelled else name)
         labelled.add(name)
-    best = max(degrees, key=lambda p: p["worth"])
+    best = next(p for p in degrees if p["sh_degree"] == chosen["sh_degree"])
     by_n.axvline(chosen["n"], color=orange, linewidth=0.8, label=f"chosen: {chosen['n']:,}")
     by_n.set_xlabel("Gaussians; two sides of a comparison joined, the full one goes on")
     by_n.set_ylabel("quality on the held-back photos, dB")

@@ -3,8 +3,8 @@
 Some training photos are held back. A candidate is a number of Gaussians with its quality on these photos and a price
 per doubling of the number. The scene grows until growth stops paying on the held-back photos, and returns to the last
 candidate that did. Where more Gaussians were worse, trials of pruning compare the scene with a copy without those of
-the lowest price of removal, trained for the same iterations. The degree of the spherical harmonics is chosen by the
-same price per doubling of the bytes. After that all photos train.
+the lowest price of removal, trained for the same iterations. The degree of the spherical harmonics is lowered where its
+bands lose by the same price per doubling of the bytes. After that all photos train.
 """
 
 from dataclasses import dataclass, field
@@ -273,6 +273,18 @@ def candidate(iteration: int, n: int, sh_degree: int, validated: list[list[float
     views = [float(view) for view in np.mean(validated, axis=0)]
     cost = config.size_price * log2(n * sh_bytes(sh_degree))
     return Candidate(iteration, n, sh_degree, float(np.mean(views)), views, cost)
+
+
+def best_degree(degrees: list[Candidate]) -> Candidate:
+    """The degree of the spherical harmonics to continue with: the one of the largest worth, of those to which the
+    highest one loses beyond chance; the highest one if there is none.
+
+    Bands that have trained for a short time seem to be worth less than at the end of a run (measured:
+    docs/experiments/size.md).
+    """
+    highest = degrees[-1]
+    better = [lower for lower in degrees[:-1] if Trial(False, lower, highest).larger_loses]
+    return max(better, key=lambda c: c.worth, default=highest)
 
 
 def growth_ends(search: Search, n: int, iteration: int, config: TrainConfig) -> bool:

@@ -14,6 +14,7 @@ from clsplat.training.autosize.rule import (
     Search,
     SmallSide,
     Trial,
+    best_degree,
     candidate,
     first_pruning,
     growth_ends,
@@ -116,7 +117,7 @@ def _pruned(training: Training, search: Search, iteration: int, after_fork: Afte
         here.state.search = replace(search, small_side=_train_pruned(here, iteration, after_fork))
         return here.state
     degrees = _degrees(here, iteration)
-    best = max(degrees, key=lambda c: c.worth).sh_degree
+    best = best_degree(degrees).sh_degree
     if best < len(degrees) - 1:
         here.state.rows = here.state.rows.with_degree(best)
     photos = len(training.scene.train)
