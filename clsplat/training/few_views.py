@@ -19,7 +19,8 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
 
     With fewer than `config.few.below` dropout is on, and the number of Gaussians is not searched but bounded by a
     multiple of the points; for small photos by half of it, or one per pixel, and for large ones by what a search may
-    reach if this is more (measured: docs/experiments/strategies.md). Otherwise the configuration is returned as it is.
+    reach if this is more (measured: docs/experiments/strategies.md). Otherwise the configuration is returned as it
+    is.
     """
     few = config.few
     if len(scene.train) >= few.below:

@@ -20,8 +20,8 @@ def write_report(path: Path, search: Search, config: TrainConfig, held: list[str
     content = {
         "rule": "growth whose gain, the median over the held-back photos, is more than its price by the margin of "
         f"{SURE:g} standard error; where it is less by as much, pruning until one loses more than its price by as "
-        "much; a lower degree where the highest one gains less than its price by as much, and of these the one of the "
-        "largest worth = quality - price log2(bytes)",
+        "much; a lower degree where the highest one gains less than its price by as much, and of these the one of "
+        "the largest worth = quality - price log2(bytes)",
         "quality": "mean of PSNR and of SSIM in decibels on the held-back photos",
         "held_back": held,
         "price": config.size_price,

@@ -3,8 +3,8 @@
 Some training photos are held back. A candidate is a number of Gaussians with its quality on these photos and a price
 per doubling of the number. The scene grows until growth stops paying on the held-back photos, and returns to the last
 candidate that did. Where more Gaussians were worse, trials of pruning compare the scene with a copy without those of
-the lowest price of removal, trained for the same iterations. The degree of the spherical harmonics is lowered where its
-bands lose by the same price per doubling of the bytes. After that all photos train.
+the lowest price of removal, trained for the same iterations. The degree of the spherical harmonics is lowered where
+its bands lose by the same price per doubling of the bytes. After that all photos train.
 """
 
 from dataclasses import dataclass, field
