@@ -1,29 +1,34 @@
 """Adaptation of a configuration to few photos, which many arrangements of Gaussians fit equally well.
 
 With few photos none is held back to choose the number of Gaussians by: each shows what no other does, and two or
-three do not decide. Splats are left out at random, so that none is indispensable, which generalises better to other
-viewpoints (Park et al. 2025, "DropGaussian").
+three do not decide. With fewer still, splats are left out at random, so that none is indispensable, which generalises
+better to other viewpoints (Park et al. 2025, "DropGaussian").
 """
 
 from dataclasses import replace
 
 from clsplat.config import TrainConfig
 from clsplat.scene import Scene
-from clsplat.training.autosize.rule import PER_PIXEL, RANDOM_START, reach
+from clsplat.training.autosize.rule import PACE, PER_PIXEL, RANDOM_START, reach
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.run_length import SMALL_PHOTO, largest_photo
+
+FEWEST_SEARCHED = 24
+"""Fewest training photos with which the number of Gaussians is searched. Of fewer, three at most would be held back;
+training without these costs more than the search gains (measured: docs/experiments/size.md)."""
 
 
 def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Adapt a configuration to the number of training photos.
 
-    With fewer than `config.few.below` dropout is on, and the number of Gaussians is not searched but bounded by a
-    multiple of the points; for small photos by half of it, or one per pixel, and for large ones by what a search may
-    reach if this is more (measured: docs/experiments/strategies.md). Otherwise the configuration is returned as it
-    is.
+    With fewer than `FEWEST_SEARCHED` the number of Gaussians is not searched, but grows as far as a search would let
+    it. With fewer than `config.few.below` dropout is on, and the number is bounded by a multiple of the points; for
+    small photos by half of it, or one per pixel, and for large ones by what a search may reach if this is more
+    (measured: docs/experiments/strategies.md). Otherwise the configuration is returned as it is.
     """
-    few = config.few
-    if len(scene.train) >= few.below:
+    few, photos = config.few, len(scene.train)
+    fewest = photos < few.below
+    if not fewest and (photos >= FEWEST_SEARCHED or not few.below or config.size == "fixed"):
         return config
     init, first = config.init, len(scene.points)
     if config.size == "auto":
@@ -33,10 +38,14 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
             init = replace(init, random_points=first)
     cap = config.max_gaussians
     if first:
-        pixels, grown = largest_photo(scene), few.growth * first
-        most = min(grown, max(grown / 2, PER_PIXEL * pixels))
-        if pixels > SMALL_PHOTO:
-            most = max(most, reach(scene))
-        most = max(1, min(round(most), MOST_GAUSSIANS))
+        wanted = _most_of_few(few.growth * first, scene) if fewest else max(PACE * first, reach(scene))
+        most = max(1, min(round(wanted), MOST_GAUSSIANS))
         cap = most if cap is None else min(cap, most)
-    return replace(config, init=init, max_gaussians=cap, dropout=max(config.dropout, few.dropout))
+    return replace(config, init=init, max_gaussians=cap, dropout=max(config.dropout, few.dropout * fewest))
+
+
+def _most_of_few(grown: float, scene: Scene) -> float:
+    """Largest number of Gaussians for the fewest photos, from a multiple of the points."""
+    pixels = largest_photo(scene)
+    most = min(grown, max(grown / 2, PER_PIXEL * pixels))
+    return max(most, reach(scene)) if pixels > SMALL_PHOTO else most

@@ -90,9 +90,10 @@ def prepare(
     config = with_length(config, scene)
     few = adapted(config, scene)
     if few != config:
+        left_out = ", and some Gaussians are left out of each image" if few.dropout > config.dropout else ""
         tell(
-            f"few photos: with fewer than {config.few.below} none is held back to choose the number of Gaussians, "
-            "and some Gaussians are left out of each image (--few.below 0 trains as with many)"
+            f"few photos: none is held back to choose the number of Gaussians{left_out} "
+            "(--few.below 0 trains as with many)"
         )
     check_memory(scene, few, device or open_device(config), tell)
     return scene, few

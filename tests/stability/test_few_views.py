@@ -61,6 +61,20 @@ def test_settings_for_few_photos(scene):
     assert few_views.adapted(config, replace(scene, train=scene.train * 6)) == config, "18 photos"
 
 
+def test_the_size_is_searched_from_24_photos_on(scene):
+    """With 17 to 23 the number grows as far as a search would let it."""
+    config, points = replace(CONFIG, size="auto", max_gaussians=None), len(scene.points)
+    some, many = (replace(scene, train=scene.train * times) for times in (7, 8))
+    fixed = few_views.adapted(config, some)
+    assert fixed == replace(config, size="fixed", max_gaussians=max(3 * points, SIZE[0] * SIZE[1]))
+    assert few_views.adapted(config, replace(some, points=np.zeros((1000, 3)))).max_gaussians == 3000
+    assert few_views.adapted(replace(config, max_gaussians=7), some).max_gaussians == 7
+    assert few_views.adapted(fixed, some) == fixed, "a resumed run continues"
+    assert few_views.adapted(config, many) == config
+    as_many = replace(config, few=replace(config.few, below=0))
+    assert few_views.adapted(as_many, some) == as_many
+
+
 def test_dropout_is_part_of_the_training_and_rises(scene, device, tmp_path, monkeypatch):
     rates, forward = [], Renderer.forward
 
