@@ -41,7 +41,8 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
         wanted = _most_of_few(few.growth * first, scene) if fewest else max(PACE * first, reach(scene))
         most = max(1, min(round(wanted), MOST_GAUSSIANS))
         cap = most if cap is None else min(cap, most)
-    return replace(config, init=init, max_gaussians=cap, dropout=max(config.dropout, few.dropout * fewest))
+    dropout = max(config.dropout, few.dropout) if fewest else config.dropout
+    return replace(config, init=init, max_gaussians=cap, dropout=dropout)
 
 
 def _most_of_few(grown: float, scene: Scene) -> float:
