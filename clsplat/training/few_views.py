@@ -9,7 +9,8 @@ from dataclasses import replace
 
 from clsplat.config import TrainConfig
 from clsplat.scene import Scene
-from clsplat.training.autosize.rule import PACE, PER_PIXEL, RANDOM_START, reach
+from clsplat.training.autosize.rule import PER_PIXEL, RANDOM_START, full_size, reach
+from clsplat.training.autosize.validation import FEWEST_PHOTOS
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.run_length import SMALL_PHOTO, largest_photo
 
@@ -18,27 +19,40 @@ FEWEST_SEARCHED = 24
 training without these costs more than the search gains (measured: docs/experiments/size.md)."""
 
 
+def applies(config: TrainConfig, scene: Scene) -> bool:
+    """Whether `adapted` changes a configuration, for which it needs the scene's points."""
+    return _fewest(config, scene) or (config.size == "auto" and not _searched(config, scene))
+
+
+def _fewest(config: TrainConfig, scene: Scene) -> bool:
+    return len(scene.train) < config.few.below
+
+
+def _searched(config: TrainConfig, scene: Scene) -> bool:
+    return len(scene.train) >= (FEWEST_SEARCHED if config.few.below else FEWEST_PHOTOS)
+
+
 def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Adapt a configuration to the number of training photos.
 
     With fewer than `FEWEST_SEARCHED` the number of Gaussians is not searched, but grows as far as a search would let
-    it. With fewer than `config.few.below` dropout is on, and the number is bounded by a multiple of the points; for
-    small photos by half of it, or one per pixel, and for large ones by what a search may reach if this is more
-    (measured: docs/experiments/strategies.md). Otherwise the configuration is returned as it is.
+    it; if `config.few.below` is 0, only where no search is possible. With fewer than `config.few.below` dropout is on,
+    and the number is bounded by a multiple of the points; for small photos by half of it, or one per pixel, and for
+    large ones by what a search may reach if this is more (measured: docs/experiments/strategies.md). A fixed number
+    that the configuration names is kept. Otherwise the configuration is returned as it is.
     """
-    few, photos = config.few, len(scene.train)
-    fewest = photos < few.below
-    if not fewest and (photos >= FEWEST_SEARCHED or not few.below or config.size == "fixed"):
+    if not applies(config, scene):
         return config
-    init, first = config.init, len(scene.points)
+    few, init, first, fewest = config.few, config.init, len(scene.points), _fewest(config, scene)
+    named = config.size == "fixed" and config.max_gaussians is not None
     if config.size == "auto":
         config = replace(config, size="fixed")
         if not first:
             first = init.random_points or RANDOM_START
             init = replace(init, random_points=first)
     cap = config.max_gaussians
-    if first:
-        wanted = _most_of_few(few.growth * first, scene) if fewest else max(PACE * first, reach(scene))
+    if first and not named:
+        wanted = _most_of_few(few.growth * first, scene) if fewest else full_size(scene, first)
         most = max(1, min(round(wanted), MOST_GAUSSIANS))
         cap = most if cap is None else min(cap, most)
     dropout = max(config.dropout, few.dropout) if fewest else config.dropout

@@ -14,7 +14,7 @@ from clsplat.ranges import check, parse_bytes
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
 from clsplat.training.densify import STRATEGIES
-from clsplat.training.few_views import adapted
+from clsplat.training.few_views import adapted, applies
 from clsplat.training.initialize import start_count
 from clsplat.training.memory import Footprint
 from clsplat.training.run_length import with_length
@@ -80,7 +80,7 @@ def prepare(
     scene = with_near_planes(scene)
     tell(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
     # The points of few photos limit the number of Gaussians, and depth maps are scaled to points.
-    always = len(scene.train) < config.few.below or config.data.depth is not None
+    always = applies(config, scene) or config.data.depth is not None
     if config.init.triangulate and not len(scene.points) and (always or not resume):
         scene = with_points(scene, path, config.data, verbose)
         found = f"{len(scene.points)} points, from photos and poses" if len(scene.points) else "random"

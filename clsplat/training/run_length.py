@@ -13,8 +13,8 @@ FEWEST_ITERATIONS = 3000
 """Fewest iterations with photos of at most `SMALL_PHOTO` pixels: few photos, too, need time for growth."""
 
 FEW_LENGTH = 1 / 2
-"""Factor on the fewest iterations if the photos are too few to search the size (`FewViewsConfig`). Each photo trains
-often enough, and more iterations fit these photos only (measured: docs/experiments/schedules.md)."""
+"""Factor on the fewest iterations with fewer photos than `FewViewsConfig.below`. Each photo trains often enough, and
+more iterations fit these photos only (measured: docs/experiments/schedules.md)."""
 
 SMALL_PHOTO = 90_000
 """Pixels up to which photos count as small. With larger ones the fewest iterations, and the number of Gaussians that

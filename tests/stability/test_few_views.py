@@ -11,6 +11,7 @@ from clsplat.renderer import Renderer
 from clsplat.training import few_views
 from clsplat.training.initialize import start_count
 from clsplat.training.loop import train
+from clsplat.training.presets import PRESETS, load_preset
 
 
 def noisy(view, rng):
@@ -49,7 +50,10 @@ def test_settings_for_few_photos(scene):
     large = with_train(scene, lambda view, rng: replace(view, camera=view.camera.resized(600, 600)))
     assert few_views.adapted(config, large).max_gaussians == round(90_000 * 2**0.5)
     assert few_views.adapted(few, scene) == few, "a resumed run, and one from its config.json, continue"
-    assert few_views.adapted(replace(config, max_gaussians=7), scene).max_gaussians == 7
+    for named in (7, 10**6):
+        assert few_views.adapted(replace(config, max_gaussians=named), scene).max_gaussians == named
+    assert few_views.adapted(replace(config, size="auto", max_gaussians=7), scene).max_gaussians == 7
+    assert few_views.adapted(replace(config, size="auto", max_gaussians=10**6), scene) == few
     assert few_views.adapted(replace(config, size="auto"), scene) == few, "too few photos to search for the size"
     pointless = replace(scene, points=scene.points[:0])
     assert few_views.adapted(config, pointless).max_gaussians is None, "a random start has the configuration's cap"
@@ -73,6 +77,13 @@ def test_the_size_is_searched_from_24_photos_on(scene):
     assert few_views.adapted(config, many) == config
     as_many = replace(config, few=replace(config.few, below=0))
     assert few_views.adapted(as_many, some) == as_many
+    assert few_views.adapted(as_many, scene) == replace(fixed, few=as_many.few), "no search is possible"
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_the_same_with_few_photos(name, scene):
+    """They are named after papers, which have no such settings."""
+    assert few_views.adapted(load_preset(name), scene) == load_preset(name)
 
 
 def test_dropout_is_part_of_the_training_and_rises(scene, device, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from cli_runs import run, write_dataset
 from test_triangulation import POINTS_TARGET, posed, write_transforms  # noqa: F401  (a fixture)
 
 from clsplat import TrainConfig, prepare, save_gaussians, train
-from clsplat.config import DataConfig, InitConfig
+from clsplat.config import DataConfig, FewViewsConfig, InitConfig
 from clsplat.errors import InputError
 from clsplat.scene import View
 from clsplat.training.preparation import open_device
@@ -52,11 +52,20 @@ def test_poses_without_points(posed: list[View], tmp_path: Path) -> None:
 
 def test_a_resumed_run_of_many_photos_needs_no_points(posed: list[View], tmp_path: Path) -> None:
     config = TrainConfig(data=DataConfig(test_every=0))
-    many = replace(config, few=replace(config.few, below=0))
+    many = replace(config, few=replace(config.few, below=0), size="fixed", max_gaussians=300)
     path = write_transforms(tmp_path, posed)
     assert not len(prepare(path, many, resume=True)[0].points)
+
+
+@pytest.mark.parametrize("below", [17, 3])
+def test_the_points_of_few_photos_limit_the_gaussians_of_a_resumed_run(
+    below: int, posed: list[View], tmp_path: Path
+) -> None:
+    """The size is not searched with as few photos, whether or not the settings for fewer still apply."""
+    config = TrainConfig(data=DataConfig(test_every=0), few=FewViewsConfig(below=below))
+    path = write_transforms(tmp_path, posed)
     few, again = (prepare(path, config, resume=resume)[1] for resume in (False, True))
-    assert few == again and few.max_gaussians is not None, "the points of few photos limit the Gaussians"
+    assert few == again and few.size == "fixed" and few.max_gaussians is not None
 
 
 def test_masks_are_found_in_the_dataset_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.config import AdcConfig, DataConfig, InitConfig, OptimConfig, SfmConfig, TrainConfig
+from clsplat.config import AdcConfig, DataConfig, FewViewsConfig, InitConfig, OptimConfig, SfmConfig, TrainConfig
 from clsplat.errors import InputError
 from clsplat.training.densify import STRATEGIES
 from clsplat.training.presets import FOLDER, PRESETS, load_config, load_preset, read_settings, with_settings
@@ -49,7 +49,8 @@ def test_the_papers_presets_are_its_strategy_and_iterations():
         beta2=0.999,
         sh_degree_every=1000,
     )
-    paper = TrainConfig(strategy="adc", size="fixed", init=InitConfig(triangulate=False, dense=False), optim=rates)
+    start, few = InitConfig(triangulate=False, dense=False), FewViewsConfig(below=0)
+    paper = TrainConfig(strategy="adc", size="fixed", init=start, few=few, optim=rates)
     assert load_preset("paper-7k") == replace(paper, iterations=7000)
     assert load_preset("paper-30k") == replace(paper, iterations=30_000)
 

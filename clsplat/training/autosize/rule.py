@@ -248,7 +248,12 @@ def start(scene: Scene, n: int, config: TrainConfig) -> "Search":
     """The search before the first iteration, with n Gaussians."""
     growing = max(1, len(growth_bounds(config)) - 1)  # the first window has the first Gaussians
     sparse = min(n, len(scene.points) or n)  # dense points fill what growth may reach, and do not extend it
-    return Search(n, max(PACE * sparse / n, reach(scene) / n, 1.0) ** (1 / growing))
+    return Search(n, max(full_size(scene, sparse) / n, 1.0) ** (1 / growing))
+
+
+def full_size(scene: Scene, sparse: int) -> float:
+    """Number of Gaussians that growth may reach by its end, by the sparse points and the photos."""
+    return max(PACE * sparse, reach(scene))
 
 
 def reach(scene: Scene) -> float:
