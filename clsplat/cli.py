@@ -20,13 +20,14 @@ from clsplat.commands import console
 from clsplat.commands.arguments import parsed, unknown
 from clsplat.commands.blockwise import Block
 from clsplat.commands.compact import Compact
-from clsplat.commands.console import warn
+from clsplat.commands.console import Terminated, warn
+from clsplat.commands.demo import Demo
 from clsplat.commands.files import Export, Frames, Sfm
 from clsplat.commands.info import Info
 from clsplat.commands.listing import Devices
 from clsplat.commands.meshes import Mesh
 from clsplat.commands.rendering import Eval, Render
-from clsplat.commands.train import Demo, Train
+from clsplat.commands.train import Train
 from clsplat.commands.viewing import View
 from clsplat.errors import ClsplatError, InputError, driver_errors
 from clsplat.ranges import check
@@ -107,6 +108,8 @@ def main(arguments: list[str] | None = None) -> None:
         # ever, and the release of an array as well: the error, whose traceback refers to arrays, is kept.
         atexit.register(end, error)
         sys.exit(2)
+    except Terminated:
+        terminate()
     except KeyboardInterrupt:
         warn("clsplat: interrupted")
         sys.exit(130)
@@ -126,7 +129,7 @@ def reader_left() -> bool:
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
-def terminate(*_: object) -> None:
+def terminate(*_: object) -> NoReturn:
     """End the program after its clean-up, as Ctrl-C does; its status is that of a process that SIGTERM ended."""
     warn("clsplat: terminated")
     sys.exit(128 + signal.SIGTERM)

@@ -16,6 +16,10 @@ PROBE = 2**22
 an empty database of COLMAP has."""
 
 
+NAMED = 3
+"""Number of names that a message lists; further ones are counted."""
+
+
 class ClsplatError(Exception):
     """Base class of all errors that the command line prints as one sentence, without a traceback."""
 
@@ -30,6 +34,12 @@ class DeviceError(ClsplatError, RuntimeError):
 
 class BuildError(DeviceError):
     """The kernels cannot be built."""
+
+
+def named(names: list[str], most: int = NAMED) -> str:
+    """The first names of a list, and how many more there are."""
+    left_out = len(names) - most
+    return ", ".join(names[:most]) + (f" and {left_out} more" if left_out > 0 else "")
 
 
 def unwritable(folder: Path) -> str | None:

@@ -5,6 +5,7 @@ A field's annotation holds its range, ``Annotated[float, within(least=0, below=1
 """
 
 import re
+import shlex
 from ctypes import c_float
 from dataclasses import dataclass, fields, is_dataclass
 from decimal import Decimal
@@ -157,6 +158,21 @@ def check(settings: Any, group: str = "") -> None:
             check(value, group if is_unnamed(hint) else f"{group}{field.name}.")
         elif value is not field.default:
             checked(value, hint, f"--{group}{field.name}".replace("_", "-"))
+
+
+def flags_of(settings: Any, usual: Any, group: str = "") -> list[str]:
+    """Settings that differ from the usual ones, as flags of the command line."""
+    hints = get_type_hints(type(settings), include_extras=True)
+    flags: list[str] = []
+    for field in fields(settings):
+        value, other = getattr(settings, field.name), getattr(usual, field.name)
+        name = field.name.replace("_", "-")
+        if is_dataclass(value):
+            flags += flags_of(value, other, group if is_unnamed(hints[field.name]) else f"{group}{name}.")
+        elif value != other:
+            flag = f"--{group}{name}" if value is not False else f"--{group}no-{name}"
+            flags.append(flag if isinstance(value, bool) else shlex.join([flag, str(value)]))
+    return flags
 
 
 def is_unnamed(hint: Any) -> bool:

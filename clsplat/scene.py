@@ -128,6 +128,11 @@ class View:
         return change(self)
 
     @property
+    def counts(self) -> NDArray[np.bool_]:
+        """(H, W), whether a pixel counts."""
+        return np.ones((self.camera.height, self.camera.width), bool) if self.mask is None else self.mask
+
+    @property
     def is_used(self) -> bool:
         """Whether any pixel counts."""
         return self.mask is None or bool(self.mask.any())

@@ -13,10 +13,10 @@ from clsplat.blocks.partition import EVERYWHERE, Box
 from clsplat.blocks.plan import Block
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
-from clsplat.errors import InputError
+from clsplat.errors import InputError, named
 from clsplat.scene import DIGEST_BYTES, DepthMap, View, digest
-from clsplat.training.checkpoint import FREE
-from clsplat.training.inputs import Photo, named
+from clsplat.training.checkpoint import without_free
+from clsplat.training.inputs import Photo
 from clsplat.training.presets import with_settings
 
 BOXES = ("near", "box", "wide")
@@ -56,10 +56,8 @@ class Job:
     @property
     def digest(self) -> str:
         """Digest of what the result depends on: all but the dataset's place and settings that change no bit."""
-        content = self.content()
+        content = self.content() | {"config": asdict(without_free(self.config))}
         del content["data"]
-        for name in FREE:
-            del content["config"][name]
         return digest_of(json.dumps(content, sort_keys=True).encode())
 
     def content(self) -> dict[str, Any]:

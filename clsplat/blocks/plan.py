@@ -136,6 +136,11 @@ def check_blocks(config: TrainConfig) -> None:
                 f"--{name}: expected a training without --blocks, found both: each block would learn its own values "
                 "for the same photo; leave out one of them"
             )
+    if config.filter_3d:
+        raise InputError(
+            "--filter-3d: expected a training without --blocks, found both: a block trains several times, and each "
+            "training would widen its Gaussians again; leave out one of them"
+        )
 
 
 def one_fits(scene: Scene, config: TrainConfig, device: "Device") -> bool:

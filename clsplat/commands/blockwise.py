@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +14,6 @@ from clsplat.commands.console import say
 from clsplat.commands.options import ClusterOptions
 from clsplat.commands.progress import Progress
 from clsplat.commands.run_folders import SCENE
-from clsplat.errors import InputError
 
 if TYPE_CHECKING:
     from clsplat.blocks.stored import StoredScene
@@ -93,19 +92,6 @@ def began(out: Path) -> bool:
     from clsplat.training.checkpoint import CHECKPOINT
 
     return (out / CHECKPOINT).is_file() or (out / BLOCKS).is_dir()
-
-
-def check_same(file: Path, config: "TrainConfig") -> None:
-    """Raise an InputError if a run in blocks would continue with another configuration than it began with."""
-    from clsplat.training.checkpoint import FREE
-    from clsplat.training.presets import load_config
-
-    free = {name: getattr(config, name) for name in FREE}
-    if replace(load_config(file), **free) != config:
-        raise InputError(
-            f"{file}: expected the configuration that the run began with, found another one; leave out other flags, "
-            "or start a new run in another folder"
-        )
 
 
 @dataclass(frozen=True)

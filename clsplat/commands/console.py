@@ -39,6 +39,10 @@ Dataset = Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[D
 """Type of the argument that names a dataset, which a run folder knows."""
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM ended a training as Ctrl-C does, with a checkpoint."""
+
+
 def say(text: str) -> None:
     """Print a message for the user, unless -q was given."""
     if loudness != "quiet":
@@ -55,11 +59,11 @@ def warn(text: str) -> None:
     tqdm.write(text, sys.stderr)
 
 
-def open_device(name: str | None, memory_limit: int | None = None) -> "Device":
+def open_device(name: str | None) -> "Device":
     """Open the requested device and print its name."""
     from clsplat.device import Device, select_device
 
-    device = Device(select_device(name), memory_limit=memory_limit)
+    device = Device(select_device(name))
     say(f"device: {device.label}")
     return device
 

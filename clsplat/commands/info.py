@@ -1,11 +1,10 @@
 """The command `info`: describe a file of Gaussians, a run or a dataset."""
 
-import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
@@ -13,7 +12,7 @@ import tyro
 from clsplat.commands.run_folders import SCENE, Run, is_run, read_run
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
-from clsplat.ranges import is_unnamed
+from clsplat.ranges import flags_of
 from clsplat.training.presets import read_settings
 
 if TYPE_CHECKING:
@@ -92,7 +91,7 @@ def run_lines(folder: Path) -> list[str]:
     rows["iterations"] = f"{last['iteration']:,}{total}"
     rows["time"] = f"{last['seconds']:.0f} s"
     rows |= _scores(folder, last)
-    if changed := _changed(run.config, TrainConfig(iterations=run.config.iterations)):
+    if changed := flags_of(run.config, TrainConfig(iterations=run.config.iterations)):
         rows["settings"] = " ".join(changed)
     scene = folder / SCENE
     if not scene.is_file():
@@ -118,21 +117,6 @@ def _scores(folder: Path, last: Mapping[str, Any]) -> dict[str, str]:
         for name, value in numbers.items()
         if isinstance(value, float)
     }
-
-
-def _changed(settings: Any, usual: Any, within: str = "") -> list[str]:
-    """Settings that differ from the usual ones, as flags."""
-    hints = get_type_hints(type(settings), include_extras=True)
-    flags: list[str] = []
-    for field in fields(settings):
-        value, other = getattr(settings, field.name), getattr(usual, field.name)
-        name = field.name.replace("_", "-")
-        if is_dataclass(value):
-            flags += _changed(value, other, within if is_unnamed(hints[field.name]) else f"{within}{name}.")
-        elif value != other:
-            flag = f"--{within}{name}" if value is not False else f"--{within}no-{name}"
-            flags.append(flag if isinstance(value, bool) else shlex.join([flag, str(value)]))
-    return flags
 
 
 def dataset_lines(path: Path) -> list[str]:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clsplat.commands.console import STARTED, say, warn
+from clsplat.commands.console import STARTED, Terminated, say, warn
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -29,7 +29,7 @@ paused, or kernels were compiled for the first frame."""
 
 
 class Progress:
-    """The bar, the viewer's panel and Ctrl-C of one training.
+    """The bar, the viewer's panel, and Ctrl-C and SIGTERM of one training.
 
     Parameters
     ----------
@@ -58,27 +58,37 @@ class Progress:
         self._begun = threading.Event()
         self._waits = threading.Thread(target=self._wait, daemon=True)
         self._interrupted = threading.Event()
+        self._terminated = False
         self._facts: dict[str, str] = {}  # lines of the viewer's panel
         self._psnr: float | None = None
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Show in the block what the training waits for and then its progress; Ctrl-C ends it after an iteration."""
+        """Show in the block what the training waits for and then its progress.
+
+        Ctrl-C and SIGTERM, which batch systems send, end it after an iteration.
+        """
         if self._viewer:
             self._viewer.wait(WAITING)
         self._waits.start()
-        before = signal.signal(signal.SIGINT, self._interrupt)
+        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+        def interrupt(number: int, _: object) -> None:
+            self._terminated |= number == signal.SIGTERM
+            self._interrupted.set()
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # a second signal does not wait
+            signal.signal(signal.SIGTERM, before[signal.SIGTERM])
+
+        for number in before:
+            signal.signal(number, interrupt)
         try:
             yield
         finally:
-            signal.signal(signal.SIGINT, before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
             self._end_wait()
             if self._bar is not None:
                 self._bar.close()
-
-    def _interrupt(self, *_: object) -> None:
-        self._interrupted.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # the second Ctrl-C does not wait
 
     def _end_wait(self) -> None:
         """Remove the line about what the training waits for."""
@@ -115,7 +125,7 @@ class Progress:
                 self._bar.unpause()
         if self._interrupted.is_set():
             warn(f"{self._out}: stopped after iteration {record['iteration']}")
-            raise KeyboardInterrupt
+            raise Terminated if self._terminated else KeyboardInterrupt
 
     def _start(self, record: dict[str, Any]) -> None:
         """Replace what the training waited for by a bar, whose estimate does not contain the wait."""

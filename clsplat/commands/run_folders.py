@@ -5,13 +5,15 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from clsplat.commands.console import warn
-from clsplat.config import TrainConfig
+from clsplat.commands.options import CameraOptions, PhotoOptions
+from clsplat.config import DataConfig, RenderConfig, TrainConfig
 from clsplat.errors import InputError
 
 CONFIG, SCENE, FRAMES = "config.json", "scene.ply", "frames"
 """Files of a run: its settings and its scene; and the folder of a video's photos."""
 
 Command = TypeVar("Command")
+Part = TypeVar("Part", bound=DataConfig | RenderConfig)
 
 
 class Run(NamedTuple):
@@ -73,7 +75,7 @@ def with_run(command: Command, dataset: str = "data") -> Command | None:
     if not is_run(given.scene):
         return None
     run = read_run(given.scene)
-    changes: dict[str, Any] = {"data_config": _with(given.data_config, run.config.data)}
+    changes: dict[str, Any] = {"data_config": _photos(given.data_config, run.config.data)}
     if hasattr(given, "render"):
         changes["render"] = _with(given.render, run.config.render)
     if getattr(given, dataset) is None and run.data is not None:
@@ -85,7 +87,13 @@ def with_run(command: Command, dataset: str = "data") -> Command | None:
     return result
 
 
-def _with(part: Any, settings: Any) -> Any:
+def _photos(part: PhotoOptions, settings: DataConfig) -> PhotoOptions:
+    """The photos' settings of a run, without the folders of files that the command does not read."""
+    masks = None if isinstance(part, CameraOptions) else settings.masks
+    return replace(_with(part, settings), masks=masks, depth=None)
+
+
+def _with(part: Part, settings: Any) -> Part:
     """A part of a configuration with the values of the whole one."""
     return replace(part, **{f.name: getattr(settings, f.name) for f in fields(settings)})
 

@@ -1,8 +1,7 @@
-"""The commands `train` and `demo`."""
+"""The command `train`."""
 
 import shlex
 import sys
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -12,11 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from clsplat.commands import console
-from clsplat.commands.blockwise import JobsPrinted, began, check_same, train_in_blocks
+from clsplat.commands.blockwise import JobsPrinted, began, train_in_blocks
 from clsplat.commands.console import (
-    DeviceName,
     Out,
-    new_folder,
     picture_cameras,
     say,
     say_cameras,
@@ -29,9 +26,9 @@ from clsplat.commands.options import ClusterOptions, ServerOptions
 from clsplat.commands.progress import train_with_progress
 from clsplat.commands.run_folders import CONFIG, FRAMES, SCENE
 from clsplat.commands.viewing import open_viewer
-from clsplat.config import BACKGROUNDS, UINT32_MAX, TrainConfig
+from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
-from clsplat.ranges import name_in, within
+from clsplat.ranges import name_in
 from clsplat.training.presets import DATA_PATH, PRESETS, load_config, load_preset
 
 if TYPE_CHECKING:
@@ -91,6 +88,7 @@ class Train:
         if self.method != "gaussians":
             train_method(self, out, suffix)
             return
+        self._check()
         with held(out):
             try:
                 gaussians, viewer = self.trained(out, suffix)
@@ -102,6 +100,19 @@ class Train:
             with suppress(KeyboardInterrupt):
                 viewer.hold(gaussians)
             viewer.close()
+
+    def _check(self) -> None:
+        """Refuse settings that exclude each other before anything takes time."""
+        from clsplat.blocks.plan import check_blocks
+        from clsplat.training.preparation import check_settings
+
+        check_settings(self.settings)
+        if self.settings.blocks == 1 and self.cluster != ClusterOptions():
+            raise InputError("--scheduler, --print-jobs: expected with --blocks, found --blocks 1; add --blocks auto")
+        if self.settings.blocks != 1:
+            check_blocks(self.settings)
+            if self.viewer or self.server.open:
+                raise InputError("--viewer: expected a training without --blocks, found both; leave out one of them")
 
     def trained(self, out: Path, suffix: str) -> "tuple[Gaussians | None, Viewer | None]":
         """Train in a folder that is held; if `suffix` is not empty, also write a file of Gaussians."""
@@ -134,11 +145,7 @@ class Train:
         from clsplat.renderer import Renderer
         from clsplat.training.checkpoint import CHECKPOINT
 
-        if config.blocks == 1 and self.cluster != ClusterOptions():
-            raise InputError("--scheduler, --print-jobs: expected with --blocks, found --blocks 1; add --blocks auto")
         if config.blocks != 1:
-            if viewer:
-                raise InputError("--viewer: expected a training without --blocks, found both; leave out one of them")
             renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
             if stored := train_in_blocks(scene, config, renderer, self._photos(out), out, self.cluster):
                 self._began(out)()
@@ -169,6 +176,7 @@ class Train:
         `train` compares them.
         """
         from clsplat.dataset.video import extract_frames
+        from clsplat.training.checkpoint import demand_same
         from clsplat.training.loop import check
         from clsplat.training.preparation import prepare
 
@@ -192,7 +200,7 @@ class Train:
         )
         check(scene, config)
         if self.resume and config.blocks != 1:
-            check_same(out / CONFIG, config)
+            demand_same(load_config(out / CONFIG), config, out / CONFIG)
         if not self.resume:
             write_json(out / CONFIG, {DATA_PATH: str(self.data.resolve()), **asdict(config)})
             say_cameras(data)
@@ -302,44 +310,3 @@ def evaluate_held_out(
         report = evaluate(gaussians, posed, out / "eval_aligned", renderer)
         say_scores(report, out / "eval_aligned")
     say(f"generalisation: {generalisation(gaussians, scene, report, renderer)}")
-
-
-@dataclass(frozen=True)
-class Demo:
-    """Make photos of a still life, recover their cameras, train, evaluate: the whole path in minutes."""
-
-    out: Out = Path("clsplat-demo")
-    """Folder for everything that is made."""
-    iterations: Annotated[int, within(least=1, most=UINT32_MAX)] = 1500
-    """Optimisation steps."""
-    device: DeviceName = None
-    """Part of the platform's or device's name."""
-
-    def run(self) -> None:
-        """Run the command."""
-        from clsplat.demo import make_photos
-        from clsplat.render import render_views
-        from clsplat.show.comparisons import side_by_side
-        from clsplat.training.preparation import prepare
-
-        if self.out.exists() and any(self.out.iterdir()):
-            raise InputError(f"{self.out}: expected an empty or new folder for the demo; choose another with -o")
-        started = time.perf_counter()
-        config = TrainConfig(iterations=self.iterations, eval_every=max(1, self.iterations // 7), device=self.device)
-        device = open_and_name(config)
-        photos = self.out / "photos"
-        new_folder(photos)
-        say("photos: ray tracing a still life")
-        make_photos(photos)
-        say("cameras: structure from motion on the photos alone")
-        scene, config = prepare(photos, config, device, tell=say)
-        write_json(self.out / CONFIG, {DATA_PATH: photos.name, **asdict(config)})
-        gaussians = train_and_report(scene, config, device, self.out, resume=False)
-        renderings = render_views(gaussians, [view.camera for view in scene.test], config.render, device)
-        pairs = [(view.image, rendering.rgb) for view, rendering in zip(scene.test, renderings, strict=True)]
-        side_by_side(self.out / "side_by_side.png", pairs)
-        say(
-            f"done in {time.perf_counter() - started:.0f} s. Look at {self.out / 'side_by_side.png'} (photo and "
-            f"render), {self.out / 'training_curve.png'} and {self.out / 'eval' / 'index.html'}; "
-            f"{self.out / 'scene.ply'} has the format that splat viewers read."
-        )

@@ -119,7 +119,7 @@ def find_mask(folder: Path, name: str) -> Path:
     raise InputError(f"cannot find the mask of photo {name}: neither {candidates[0]} nor {candidates[1].name} exists")
 
 
-def mask_folder(root: Path, masks: str, setting: str = "masks") -> Path:
+def mask_folder(root: Path, masks: str, setting: str = "--masks") -> Path:
     """Locate the folder of masks: `masks` inside the dataset `root`, or relative to the working directory.
 
     Folders of other files by photo are found in the same way; `setting` names theirs in the message.

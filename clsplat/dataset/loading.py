@@ -19,7 +19,7 @@ from clsplat.dataset.near_planes import with_near_planes
 from clsplat.dataset.photos import list_photos
 from clsplat.dataset.sfm import reconstruction as sfm
 from clsplat.dataset.sfm.triangulation import filled, triangulate
-from clsplat.errors import InputError
+from clsplat.errors import InputError, named
 from clsplat.ranges import FLOAT32_MAX, check
 from clsplat.scene import Scene, View
 
@@ -65,7 +65,7 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
     Warns
     -----
     UserWarning
-        If some photos with a camera have no file, or only some exist in the requested size.
+        If some photos with a camera have no file, only some exist in the requested size, or masks are black.
     """
     check(config)
     path = Path(path)
@@ -83,9 +83,19 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
         dataset = replace(dataset, photos=by_faces(dataset.photos))
     views = sorted(load_views(dataset, config, memory), key=lambda view: view.name)
     train, test = _split(views, dataset, config.test_every)
+    hidden = [view.name for view in views if not view.is_used]
+    if hidden:
+        warnings.warn(
+            f"{path}: {len(hidden)} of {len(views)} photos are left out, because their masks are black "
+            f"({named(hidden)})",
+            stacklevel=2,
+        )
+        train, test = ([view for view in part if view.is_used] for part in (train, test))
     if not train:
         raise InputError(
-            f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
+            f"{path}: expected photos to train on, found only held-out ones ({len(test)})"
+            + (f" and black masks ({len(hidden)})" if hidden else "")
+            + "; see test_every"
         )
     for part in (train, test):
         for before, view in pairwise(part):  # sorted by name

@@ -43,8 +43,7 @@ class Pixels:
         self.transparent = any(view.clear is not None for view in views)
         if self.transparent:
             self._clear = np.concatenate([_clear(view).ravel() for view in views])
-        masks = [np.ones(v.image.shape[:2], bool) if v.mask is None else v.mask for v in views]
-        used = np.concatenate([mask.ravel() for mask in masks])
+        used = np.concatenate([view.counts.ravel() for view in views])
         self._used = None if used.all() else np.flatnonzero(used)
 
     def draw(self, rng: np.random.Generator, count: int) -> Batch:

@@ -158,7 +158,7 @@ def _shares(before: Gaussians, after: Gaussians, count: int, views: list[View], 
         old = np.clip(download(renderer.forward(before, view.camera, gradients=False).image.rgb), 0, 1)
         run = renderer.forward(after, view.camera)
         change = ((np.clip(download(run.image.rgb), 0, 1) - old) ** 2).sum(axis=2)
-        counts = np.ones(change.shape, bool) if view.mask is None else view.mask
+        counts = view.counts
         residuals = np.repeat(change[:, :, None], 3, axis=2)
         pulls = renderer.stages.removal(run.drawn, run.bins, background, residuals, view.mask).pulls
         shares += pulls[:count, 0] / max(1, counts.sum())

@@ -6,7 +6,7 @@ import math
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from clsplat.atomic import replacing
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.ranges import flags_of
 from clsplat.renderer import download, fetch
 from clsplat.scene import Scene
 from clsplat.training import photo_exposures, photo_poses
@@ -27,6 +28,7 @@ from clsplat.training.inputs import Inputs
 from clsplat.training.optimizer import Moments
 from clsplat.training.photo_parameters import PerPhoto
 from clsplat.training.photo_poses import refined
+from clsplat.training.presets import with_settings
 from clsplat.training.rows import Rows
 from clsplat.training.smoothing_filter import SmoothingFilter
 from clsplat.training.state import State
@@ -138,13 +140,10 @@ def load_state(path: Path, extent: float, config: TrainConfig, inputs: Inputs | 
     if inputs is not None:
         made_from = made_from.continued(inputs, path)
     with _damage_named(path):
-        saved, asked = json.loads(str(arrays["config"])), json.loads(json.dumps(asdict(config)))
-        for free in FREE:
-            saved.pop(free, None), asked.pop(free, None)
-        changed = sorted(k for k in asked if asked[k] != saved.get(k))
-        state = None if saved != asked else _to_state(arrays, extent, config)
-    if state is None:
-        raise InputError(f"{path}: expected the configuration it was made with, found other {', '.join(changed)}")
+        saved = json.loads(str(arrays["config"]))
+    demand_same(with_settings(TrainConfig(), saved, str(path)), config, path)
+    with _damage_named(path):
+        state = _to_state(arrays, extent, config)
     for learned in (state.exposures, state.poses):
         if learned and made_from.train and sorted(learned.names) != sorted(made_from.train):
             raise InputError(
@@ -152,6 +151,27 @@ def load_state(path: Path, extent: float, config: TrainConfig, inputs: Inputs | 
             )
     state.inputs = made_from
     return state
+
+
+def demand_same(saved: TrainConfig, asked: TrainConfig, source: Path) -> None:
+    """Raise an InputError with their flags if settings differ on which the result depends."""
+    saved, asked = without_free(saved), without_free(asked)
+    if saved != asked:
+        expected, found = flags_of(saved, asked), flags_of(asked, saved)
+        raise InputError(
+            f"{source}: expected the configuration it was made with, {' '.join(expected)}, found {' '.join(found)}; "
+            "repeat its flags, or start a new run in another folder"
+        )
+
+
+def without_free(config: TrainConfig) -> TrainConfig:
+    """A configuration with the defaults of all settings that may differ when a run resumes.
+
+    Masks and depth maps are compared by their content (`clsplat.training.inputs`), so that they may have moved.
+    """
+    default = TrainConfig()
+    data = replace(config.data, masks=None, depth=None)
+    return replace(config, data=data, **{name: getattr(default, name) for name in FREE})
 
 
 @contextmanager

@@ -36,10 +36,10 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Adapt a configuration to the number of training photos.
 
     With fewer than `FEWEST_SEARCHED` the number of Gaussians is not searched, but grows as far as a search would let
-    it; if `config.few.below` is 0, only where no search is possible. With fewer than `config.few.below` dropout is on,
-    and the number is bounded by a multiple of the points; for small photos by half of it, or one per pixel, and for
-    large ones by what a search may reach if this is more (measured: docs/experiments/strategies.md). A fixed number
-    that the configuration names is kept. Otherwise the configuration is returned as it is.
+    it; if `config.few.below` is 0, only with fewer than `FEWEST_PHOTOS`. With fewer than `config.few.below` photos
+    dropout is on, and the number is bounded by a multiple of the points; for small photos by half of it, or one per
+    pixel, and for large ones by what a search may reach if this is more (measured: docs/experiments/strategies.md). A
+    fixed number that the configuration names is kept. Otherwise the configuration is returned as it is.
     """
     if not applies(config, scene):
         return config

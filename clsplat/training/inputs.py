@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import CameraModel
-from clsplat.errors import InputError
+from clsplat.errors import InputError, named
 from clsplat.scene import Scene, View, digest
 
 if TYPE_CHECKING:
@@ -22,9 +22,6 @@ to another machine."""
 
 POSE = 15
 """Length of a pose in the numbers of a camera: three rows of a rotation, a translation, the scene's offset."""
-
-NAMED = 3
-"""Number of photos that a message names."""
 
 
 class Photo(NamedTuple):
@@ -176,9 +173,3 @@ def _same_camera(a: list[float], b: list[float]) -> bool:
     return np.allclose(intrinsics_a, intrinsics_b, rtol=CAMERA_TOLERANCE, atol=0) and all(
         np.abs(x - y).max() <= CAMERA_TOLERANCE * np.linalg.norm(x) for x, y in zip(pose_a, pose_b, strict=True)
     )
-
-
-def named(names: list[str]) -> str:
-    """The first names of a list, and how many more there are."""
-    left_out = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {left_out} more" if left_out > 0 else "")

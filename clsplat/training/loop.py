@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clsplat import ranges
 from clsplat.config import TrainConfig
 from clsplat.dataset.near_planes import with_near_planes
 from clsplat.errors import BuildError, DeviceError, InputError, driver_errors
@@ -23,7 +22,7 @@ from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
 from clsplat.training.dense_start import first_points
 from clsplat.training.initialize import initialize
 from clsplat.training.inputs import Inputs
-from clsplat.training.preparation import open_device
+from clsplat.training.preparation import check_settings, open_device
 from clsplat.training.recorder import Recorder
 from clsplat.training.run_folder import held
 from clsplat.training.run_length import with_length
@@ -151,7 +150,7 @@ def _run(training: Training, recorder: Recorder, out: Path) -> None:
 
 def check(scene: Scene, config: TrainConfig) -> None:
     """Raise an InputError if the configuration cannot train the scene."""
-    ranges.check(config)
+    check_settings(config)
     if not scene.train:
         raise InputError("scene: expected at least one photo to train on, found none; lower --test-every")
 

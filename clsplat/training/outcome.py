@@ -50,7 +50,7 @@ def failure(gaussians: Gaussians | Stored, views: list[View], renderer: Renderer
     errors, variances = [], []
     pairs = zip(in_turn(chosen), renderings(renderer, gaussians, [v.camera for v in chosen]), strict=True)
     for view, rendering in pairs:
-        counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+        counts = view.counts
         photo = view.image[counts] / 255
         if _varies(photo):
             errors.append(np.mean((np.clip(rendering.rgb[counts], 0, 1) - photo) ** 2))
@@ -71,6 +71,6 @@ def _varies(pixels: NDArray[np.float64]) -> bool:
 
 def _shows_something(view: View) -> bool:
     """Whether a photo has more than one colour, or a transparency with a shape."""
-    counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+    counts = view.counts
     layers = [view.image] if view.clear is None else [view.image, view.clear[..., None]]
     return any(_varies(layer[counts] / 255) for layer in layers)

@@ -10,6 +10,7 @@ from clsplat.config import CoarseConfig, TrainConfig
 from clsplat.dataset import load_scene, with_depth_maps, with_points
 from clsplat.dataset.finding import mask_folder
 from clsplat.dataset.near_planes import with_near_planes
+from clsplat.errors import InputError
 from clsplat.ranges import check, parse_bytes
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
@@ -68,12 +69,12 @@ def prepare(
         If a setting is out of range, the dataset cannot be read (the message has the file's name), or the first
         Gaussians do not fit the device's memory.
     """
-    check(config)
+    check_settings(config)
     if config.data.masks is not None:
-        masks = str(mask_folder(Path(path), config.data.masks).resolve())
+        masks = _place(Path(path), mask_folder(Path(path), config.data.masks))
         config = replace(config, data=replace(config.data, masks=masks))
     if config.data.depth is not None:
-        maps = str(mask_folder(Path(path), config.data.depth, "--depth").resolve())
+        maps = _place(Path(path), mask_folder(Path(path), config.data.depth, "--depth"))
         config = replace(config, data=replace(config.data, depth=maps))
     if scene is None:
         scene = load_scene(path, config.data, verbose, photo_memory(config))
@@ -97,6 +98,19 @@ def prepare(
         )
     check_memory(scene, few, device or open_device(config), tell)
     return scene, few
+
+
+def check_settings(config: TrainConfig) -> None:
+    """Raise an InputError if a setting is out of range, or has no effect without another one."""
+    check(config)
+    if config.response and not config.exposure:
+        raise InputError("--response: expected with --exposure, whose maps it extends, found alone; add --exposure")
+
+
+def _place(dataset: Path, folder: Path) -> str:
+    """A folder as a setting: relative to the dataset if it is inside, so that both can move, otherwise absolute."""
+    dataset, folder = dataset.resolve(), folder.resolve()
+    return folder.relative_to(dataset).as_posix() if folder.is_relative_to(dataset) else str(folder)
 
 
 def photo_memory(config: TrainConfig) -> int | None:

@@ -51,7 +51,7 @@ def test_a_run_is_like_any_other_and_printed_jobs_make_the_same(
     assert len(load_gaussians(tmp_path / "here.spz")[0]) == last["num_gaussians"]
     assert "block 1" not in capsys.readouterr().err and (out / "scene.ply").read_bytes() == before
     text = fails(capsys, "train", dataset, "-o", out, *TRAIN, "--blocks", 2, "--resume", "--seed", 1)
-    assert "expected the configuration that the run began with" in text
+    assert "expected the configuration it was made with, --seed 0, found --seed 1" in text
     assert "holds a run already" in fails(capsys, "train", dataset, "-o", out, *TRAIN, "--blocks", 2)
 
 

@@ -145,9 +145,9 @@ def test_too_many_blocks() -> None:
         make_plan(synthetic_scene(40)[0], scene, replace(CONFIG, blocks=3), Renderer())
 
 
-@pytest.mark.parametrize("name", ["poses", "exposure"])
-def test_what_photos_learn_is_not_trained_in_blocks(name: str) -> None:
-    with pytest.raises(InputError, match=f"^--{name}: expected a training without --blocks"):
+@pytest.mark.parametrize("name", ["poses", "exposure", "filter_3d"])
+def test_what_blocks_cannot_train_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match=f"^--{name.replace('_', '-')}: expected a training without --blocks"):
         check_blocks(replace(TrainConfig(), **{name: True}))
 
 

@@ -144,7 +144,11 @@ def test_flags_count_more_than_a_preset(
     assert not (tmp_path / "b").exists()
 
 
-def test_control_c_saves_and_says_how_to_go_on(dataset: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_training_saves_and_says_how_to_go_on(
+    number: signal.Signals, status: int, dataset: Path, tmp_path: Path
+) -> None:
+    """By Ctrl-C, or by SIGTERM, which batch systems and containers send."""
     command = [sys.executable, "-m", "clsplat", "train", str(dataset), "-o", str(tmp_path), "--iterations", "100000"]
     command += ["--init.random-points", "200"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
@@ -153,9 +157,9 @@ def test_control_c_saves_and_says_how_to_go_on(dataset: Path, tmp_path: Path) ->
     while not ((tmp_path / "log.jsonl").exists() and (tmp_path / "log.jsonl").stat().st_size):
         assert process.poll() is None
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     error = process.communicate(timeout=120)[1]
-    assert process.returncode == 130
+    assert process.returncode == status
     assert re.search(r"stopped after iteration \d+$", error, flags=re.M)
     assert f"to continue: clsplat {shlex.join(command[3:])} --resume\n" in error
     assert "Traceback" not in error

@@ -166,3 +166,21 @@ def test_a_full_disk_leaves_nothing_half_written(
     monkeypatch.undo()
     assert target.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["copy.ply"]
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("--response",),
+        ("--print-jobs",),
+        ("--blocks", 2, "--exposure"),
+        ("--blocks", 2, "--filter-3d"),
+        ("--blocks", 2, "--viewer"),
+    ],
+)
+def test_flags_that_exclude_each_other_are_refused_at_once(
+    flags: tuple[object, ...], dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert "expected " in fails(capsys, "train", dataset, "-o", out, *TRAIN, *flags)
+    assert not out.exists()

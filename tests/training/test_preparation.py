@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_runs import run, write_dataset
+from PIL import Image
 from test_triangulation import POINTS_TARGET, posed, write_transforms  # noqa: F401  (a fixture)
 
 from clsplat import TrainConfig, prepare, save_gaussians, train
@@ -75,6 +76,44 @@ def test_masks_are_found_in_the_dataset_first(tmp_path: Path, monkeypatch: pytes
     config = TrainConfig(data=DataConfig(masks="masks"), init=InitConfig(triangulate=False))
     with pytest.raises(InputError, match=r"cannot find the mask of photo 0\.png: neither .*data/masks/0\.png"):
         prepare("data", config)
+
+
+def masked(folder: Path) -> Path:
+    """A dataset with masks inside, two of which are black."""
+    write_dataset(folder, 9)
+    (folder / "masks").mkdir()
+    for i in range(9):
+        Image.new("L", (40, 32), 0 if i in (0, 4) else 255).save(folder / "masks" / f"{i}.png")
+    return folder
+
+
+def test_photos_with_black_masks_are_left_out(tmp_path: Path) -> None:
+    """Metrics and the search for the size have no meaning for them."""
+    config = TrainConfig(data=DataConfig(masks="masks"), init=InitConfig(triangulate=False))
+    with pytest.warns(UserWarning, match=r"2 of 9 photos are left out, .* black \(0.png, 4.png\)"):
+        scene, _ = prepare(masked(tmp_path / "data"), config)
+    assert [view.name for view in scene.test] == ["8.png"]
+    assert [view.name for view in scene.train] == [f"{i}.png" for i in (1, 2, 3, 5, 6, 7)]
+    for file in (tmp_path / "data" / "masks").iterdir():
+        Image.new("L", (40, 32)).save(file)
+    with (
+        pytest.warns(UserWarning, match="9 of 9 photos"),
+        pytest.raises(InputError, match=r"found only held-out ones \(0\) and black masks \(9\)"),
+    ):
+        prepare(tmp_path / "data", config)
+
+
+@pytest.mark.filterwarnings("ignore:.*their masks are black")
+def test_a_run_continues_where_dataset_and_masks_have_moved(tmp_path: Path) -> None:
+    options = ("-o", tmp_path / "run", "--iterations", 3, "--masks", "masks", "--init.random-points", 50)
+    run("train", masked(tmp_path / "data"), *options)
+    moved = (tmp_path / "data").rename(tmp_path / "moved")
+    run("train", moved, *options, "--resume")
+    elsewhere = (moved / "masks").rename(tmp_path / "elsewhere")
+    again = (*options[:-3], elsewhere, *options[-2:])
+    run("train", moved, *again, "--resume")
+    run("render", tmp_path / "run", moved)
+    assert (tmp_path / "run" / "render" / "8.png").is_file()
 
 
 def test_a_start_that_does_not_fit_is_refused(tmp_path: Path) -> None:

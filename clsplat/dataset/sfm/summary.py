@@ -13,7 +13,7 @@ from clsplat.atomic import replacing
 from clsplat.dataset import colmap
 from clsplat.dataset.photos import list_photos, photo_folder, photo_sharpness
 from clsplat.dataset.sfm.reconstruction import read_record
-from clsplat.errors import InputError
+from clsplat.errors import InputError, named
 
 ERROR_MAX = 1.5
 """Mean reprojection error above which a warning is given, px. Values of real scenes: docs/howto/photos.md."""
@@ -30,7 +30,7 @@ BLUR_MAX = 0.3
 """Sharpness, as a fraction of the median of all photos, below which a photo is reported as blurred. Values of real
 scenes: docs/howto/photos.md."""
 
-NAMED = 10
+LISTED = 10
 """Largest number of photos that a warning names; further ones are counted."""
 
 PICTURE_POINTS = 20_000
@@ -166,9 +166,7 @@ class Preview:
         return found
 
     def _share(self, names: list[str]) -> str:
-        more = len(names) - NAMED
-        listed = ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
-        return f"{len(names)} of {len(self.photos)} photos: {listed}"
+        return f"{len(names)} of {len(self.photos)} photos: {named(names, LISTED)}"
 
 
 def preview(dataset: Path) -> Preview | None:

@@ -215,11 +215,10 @@ def _write_photos(views: Iterable[View], work: Path) -> dict[str, Camera]:
             raise InputError(f"{view.name}: expected a pinhole or fisheye camera, found {camera.model}")
         if is_sliver(camera.width, camera.height, EDGE_MAX):
             continue
-        counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
         try:
             # Temporary files: fast rather than small. COLMAP skips photos without a mask.
             Image.fromarray(view.image).save(work / name, compress_level=1)
-            Image.fromarray(counts).save(work / "masks" / f"{name}.png")
+            Image.fromarray(view.counts).save(work / "masks" / f"{name}.png")
         except OSError as error:
             raise InputError(
                 f"cannot triangulate points: cannot write to {work.parent}: {error.strerror or error}"

@@ -82,7 +82,7 @@ def validate(
 
 def _quality(image: Any, view: View, renderer: Renderer, fitted: bool) -> float:
     """Quality of an image that lies where the stages run."""
-    counts = np.ones(image.shape[:2], bool) if view.mask is None else view.mask
+    counts = view.counts
     if fitted:
         shown = np.clip(download(image), 0, 1)
         image = renderer.upload("image", np.clip(colors_fitted(shown, view.image / 255, counts), 0, 1))
