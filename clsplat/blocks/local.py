@@ -31,11 +31,12 @@ train_on(sys.argv[2], int(sys.argv[3]))
 
 
 class _Running(NamedTuple):
-    """A process that trains a block, and what it writes to its standard error."""
+    """A process that trains a block, what it writes to its standard error, and what ends it and closes its files."""
 
     job: Path
     process: subprocess.Popen[bytes]
     errors: IO[bytes]
+    end: ExitStack
 
 
 def devices_like(device: "Device") -> list[int]:
@@ -74,20 +75,22 @@ def run_on_devices(jobs: list[Path], devices: list[int], tell: Callable[[str], N
             time.sleep(POLL)
             ended = [number for number, each in running.items() if each.process.poll() is not None]
             for number in ended:
-                job, process, errors = running.pop(number)
-                if process.returncode != 0:
-                    raise ClsplatError(f"block {job.stem}: {_reason(process.returncode, errors)}")
+                job, process, errors, end = running.pop(number)
+                with end:
+                    if process.returncode != 0:
+                        raise ClsplatError(f"block {job.stem}: {_reason(process.returncode, errors)}")
                 done += 1
                 tell(f"blocks: {done} of {total} done, the last by device {number + 1} of {len(devices)}")
 
 
 def _started(job: Path, device: int, stack: ExitStack) -> _Running:
-    errors = stack.enter_context(TemporaryFile())
+    end = stack.enter_context(ExitStack())
+    errors = end.enter_context(TemporaryFile())
     program = EXIT_WITH_PARENT + TRAIN_ON
     command = [sys.executable, "-I", "-c", program, json.dumps(sys.path), str(job.resolve()), str(device)]
-    process = stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stderr=errors))
-    stack.callback(_ended, process)
-    return _Running(job, process, errors)
+    process = end.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stderr=errors))
+    end.callback(_ended, process)
+    return _Running(job, process, errors, end)
 
 
 def _ended(process: subprocess.Popen[bytes]) -> None:

@@ -56,9 +56,7 @@ class Recorder:
             self._line(state.shown(training.renderer) if state.iteration in self._evaluate_after else None)
         if state.iteration % config.checkpoint_every == 0 or state.iteration == config.iterations:
             self._save()
-        left = time.perf_counter()
         self._tell(training, loss)
-        self._started += time.perf_counter() - left
 
     def end(self, gaussians: Gaussians) -> None:
         """Log the end of a run, whose scene has been finished. A run that is resumed after its end logs it again."""
@@ -87,11 +85,13 @@ class Recorder:
         state = self._training.state
         about = {"iteration": state.iteration, "loss": loss, "num_gaussians": len(shown.state.gaussians)}
         gaussians = shown.state.shown(shown.renderer) if shown.state.filter else shown.state.gaussians
+        left = time.perf_counter()
         try:
             self._progress(about | {"gaussians": gaussians})
         except KeyboardInterrupt:
             self._save()
             raise
+        self._started += time.perf_counter() - left
 
     def _save(self) -> None:
         training = self._training

@@ -122,6 +122,7 @@ class Training:
     def refresh_filter(self) -> None:
         """Measure the pixel sizes of the 3D filter, if there is one and its rows have changed."""
         if self.state.filter and self.state.filter.pixels is None:
+            self._choose_views(self.state.iteration + 1)
             self._measure_filter()
 
     def _measure_filter(self) -> None:

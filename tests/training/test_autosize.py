@@ -17,7 +17,7 @@ from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, ssim, to_uint8
 from clsplat.render import render
-from clsplat.renderer import Renderer
+from clsplat.renderer import Renderer, download
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
 from clsplat.training.autosize.explanation import size_chart
@@ -275,6 +275,28 @@ def test_flat_walls_need_little(device: Device, tmp_path: Path) -> None:
     assert len(gaussians) < 768 and held_out(gaussians, scene, device) > 48
     trials = json.loads((tmp_path / "size.json").read_text())["trials"]
     assert max(max(trial["quality"]) for trial in trials) <= 20 * np.log10(255)
+
+
+@pytest.mark.parametrize("iterations", [1, 4, 5, 6, 14])
+@pytest.mark.parametrize("filtered", [False, True])
+def test_the_shortest_runs_search_too(iterations: int, filtered: bool, device: Device, tmp_path: Path) -> None:
+    """The first validation comes before the first iteration then."""
+    config = replace(GROWING, iterations=iterations, coarse=CoarseConfig(factor=4), filter_3d=filtered)
+    assert len(train(known_scene(20, device, copies=1, views=30), config, tmp_path, device))
+
+
+def test_a_filter_is_measured_by_the_photos_that_train(device: Device) -> None:
+    """Also by a training that has just resumed, and by the next iteration's photos."""
+    scene = known_scene(20, device, copies=1, views=30)
+    config = replace(CONFIG, filter_3d=True)
+    training = Training(scene, config, device, initial_state(scene, config))
+    training.refresh_filter()
+    assert training.state.filter is not None
+    measured = download(training.state.filter.pixels)
+    training.state.filter.measure(
+        training.renderer.stages, training.renderer.place(training.state.gaussians), split(scene.train)[0]
+    )
+    np.testing.assert_array_equal(measured, download(training.state.filter.pixels))
 
 
 def test_too_few_photos_to_validate(device: Device, tmp_path: Path) -> None:

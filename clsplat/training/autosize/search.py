@@ -96,7 +96,8 @@ def _compared(training: Training, search: Search, iteration: int) -> Search:
 
 def _same_photos(first: Candidate, second: Candidate, config: TrainConfig) -> bool:
     """Whether two candidates were last trained on photos of the same size."""
-    return factor_at(first.iteration - 1, config) == factor_at(second.iteration - 1, config)
+    before, after = (factor_at(max(1, each.iteration - 1), config) for each in (first, second))
+    return before == after
 
 
 def _pruned(training: Training, search: Search, iteration: int, after_fork: After) -> State:
@@ -159,6 +160,7 @@ def _validate(training: Training, sh_degree: int | None = None) -> list[float]:
     if sh_degree is None:
         sh_degree = _trained_degree(training)
     held = split(training.scene.train)[1]
+    training.refresh_filter()
     return validate(state.shown(renderer), held, renderer, sh_degree, fitted=state.exposures is not None)
 
 
