@@ -91,11 +91,11 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
             stacklevel=2,
         )
         train, test = ([view for view in part if view.is_used] for part in (train, test))
+        if not train:
+            raise InputError(f"{path}: expected masks with white pixels, found black ones of all photos to train on")
     if not train:
         raise InputError(
-            f"{path}: expected photos to train on, found only held-out ones ({len(test)})"
-            + (f" and black masks ({len(hidden)})" if hidden else "")
-            + "; see test_every"
+            f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
         )
     for part in (train, test):
         for before, view in pairwise(part):  # sorted by name
