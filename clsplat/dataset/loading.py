@@ -83,25 +83,32 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
         dataset = replace(dataset, photos=by_faces(dataset.photos))
     views = sorted(load_views(dataset, config, memory), key=lambda view: view.name)
     train, test = _split(views, dataset, config.test_every)
-    hidden = [view.name for view in views if not view.is_used]
-    if hidden:
-        warnings.warn(
-            f"{path}: {len(hidden)} of {len(views)} photos are left out, because their masks are black "
-            f"({named(hidden)})",
-            stacklevel=2,
-        )
-        train, test = ([view for view in part if view.is_used] for part in (train, test))
-        if not train:
-            raise InputError(f"{path}: expected masks with white pixels, found black ones of all photos to train on")
     if not train:
         raise InputError(
             f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
         )
+    train, test = _without_hidden(train, test, path)
     for part in (train, test):
         for before, view in pairwise(part):  # sorted by name
             if before.name == view.name:
                 raise InputError(f"{path}: expected a camera for each photo, found several for {view.name}")
     return with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
+
+
+def _without_hidden(train: list[View], test: list[View], path: Path) -> tuple[list[View], list[View]]:
+    """Leave out photos with black masks: they teach nothing, and have no metrics."""
+    hidden = [view.name for view in train + test if not view.is_used]
+    if not hidden:
+        return train, test
+    warnings.warn(
+        f"{path}: {len(hidden)} of {len(train + test)} photos are left out, because their masks are black "
+        f"({named(hidden)})",
+        stacklevel=3,
+    )
+    train, test = ([view for view in part if view.is_used] for part in (train, test))
+    if not train:
+        raise InputError(f"{path}: expected masks with white pixels, found black ones of all photos to train on")
+    return train, test
 
 
 def _split(views: list[View], dataset: Dataset, test_every: int) -> tuple[list[View], list[View]]:
