@@ -78,7 +78,6 @@ class Photos:
         self._centres = np.array([view.camera.position for view in views])
         self._distance = max(float(np.linalg.norm(self._centres - focus, axis=1).mean()), 1e-9)
         self._index = {view.name: i for i, view in enumerate(views)}
-        self._drawn: dict[int, dict[int, tuple[bool, int, Color]]] = {}
         self._list = panel.dropdown("Photo", [view.name for view in views], self._chosen)
         panel.button("Previous", lambda event: self._step(event, -1))
         panel.button("Next", lambda event: self._step(event, 1))
