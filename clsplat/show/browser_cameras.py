@@ -1,7 +1,7 @@
 """Conversions between cameras and the viewer's browser windows."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.reference.project import rotations
+from clsplat.show.camera_paths import Viewpoint
+
+Array = NDArray[np.float64]
 
 LARGEST_EDGE = 16384
 """Largest edge of a window, px: the limit of most graphics cards for the canvas that shows the scene."""
@@ -56,7 +59,7 @@ def client_camera(wxyz: Any, position: Any, fov: float, width: int, height: int)
     return camera if scale >= 1 else camera.resized(*(max(1, int(scale * edge)) for edge in (width, height)))
 
 
-def wxyz_of(camera: Camera) -> NDArray[np.float64]:
+def wxyz_of(camera: Camera) -> Array:
     """Orientation of a camera as viser expects it: a quaternion (4,), camera to world."""
     from scipy.spatial.transform import Rotation
 
@@ -69,3 +72,27 @@ def whole_view(camera: Camera, aspect: float) -> float:
     `aspect` is the window's width over its height.
     """
     return 2 * math.atan(max(camera.height / camera.fy, camera.width / camera.fx / aspect) / 2)
+
+
+def target_of(camera: Camera, focus: Array) -> Array:
+    """Point of a camera's axis nearest to the focus, mirrored to the front if it is behind the camera, (3,)."""
+    axis = camera.viewmat[2, :3]
+    return np.asarray(camera.position + max(abs(float((focus - camera.position) @ axis)), 1e-3) * axis)
+
+
+class Pose(NamedTuple):
+    """View of a browser: position, target around which the mouse turns it and up vector, (3,); vertical field of
+    view, radians."""
+
+    position: Array
+    target: Array
+    up: Array
+    fov: float
+
+
+def first_pose(start: Viewpoint) -> Pose:
+    """View of a browser that shows the whole image of a viewpoint's camera."""
+    camera, right = start.camera, start.camera.viewmat[0, :3]
+    # Without its component to the right, the up vector reproduces the photo and tilts the mouse's axis least.
+    up = start.up - (start.up @ right) * right
+    return Pose(camera.position, target_of(camera, start.focus), up, whole_view(camera, camera.width / camera.height))

@@ -21,7 +21,7 @@ from clsplat.camera import Camera, default_near
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer, download
-from clsplat.show.browser_cameras import client_camera, whole_view
+from clsplat.show.browser_cameras import client_camera, first_pose
 from clsplat.show.camera_paths import Viewpoint
 from clsplat.show.frames import Look, picture, splash
 from clsplat.show.pacing import STILL_AFTER, VISER_RACE, Client, Shown
@@ -130,22 +130,15 @@ class Viewer:
                 self._photos = Photos(self._panel, views, start.focus, *own)
         with tabs.add_tab("Record"):
             self._recording = Recording(self._panel, start, self._pose_of, self._later, self._frame_of)
-        first, initial = start.camera, self._server.initial_camera
-        # Without its component to the right, the up vector reproduces the photo and tilts the mouse's axis least.
-        right = first.viewmat[0, :3]
-        up = start.up - (start.up @ right) * right
-        target = first.position + first.viewmat[2, :3] * max(
-            abs(float((start.focus - first.position) @ first.viewmat[2, :3])), 1e-3
-        )
+        pose, initial = first_pose(start), self._server.initial_camera
         self._server.scene.set_up_direction(tuple(start.up))
-        initial.position, initial.look_at, initial.up = tuple(first.position), tuple(target), tuple(up)
-        initial.fov = whole_view(first, first.width / first.height)
-        self._look.tell_field(initial.fov)
+        initial.position, initial.look_at, initial.up, initial.fov = pose
+        self._look.tell_field(pose.fov)
         self._renderer = renderer
         for client in list(self._clients.values()):
             with client.handle.atomic():
-                client.handle.camera.position, client.handle.camera.look_at = initial.position, initial.look_at
-                client.handle.camera.up_direction, client.handle.camera.fov = initial.up, initial.fov
+                camera = client.handle.camera
+                camera.position, camera.look_at, camera.up_direction, camera.fov = pose
             if self._photos:
                 client.outlines = self._photos.outlines(client.handle)
         self._asked.set()

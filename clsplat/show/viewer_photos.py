@@ -10,7 +10,7 @@ from PIL import Image
 
 from clsplat.camera import Camera
 from clsplat.scene import Color
-from clsplat.show.browser_cameras import whole_view, wxyz_of
+from clsplat.show.browser_cameras import target_of, whole_view, wxyz_of
 from clsplat.show.viewer_panel import Panel
 from clsplat.show.viewer_tasks import Task
 from clsplat.show.viewer_thumbnails import Thumbnails, scaled
@@ -154,12 +154,9 @@ class Photos:
 
     def jump(self, handle: Any, camera: Camera) -> None:
         """Move a browser's view to a camera."""
-        axis = camera.viewmat[2, :3]
-        # The target is the point of the axis nearest to the focus, mirrored to the front if it is behind the camera.
-        distance = abs(float((self._focus - camera.position) @ axis))
         with handle.atomic():
             handle.camera.position = camera.position
-            handle.camera.look_at = np.asarray(camera.position + max(distance, 1e-3) * axis)
+            handle.camera.look_at = target_of(camera, self._focus)
             handle.camera.wxyz = wxyz_of(camera)
             handle.camera.fov = field = whole_view(camera, handle.camera.aspect)
         self._zoomed(field)

@@ -21,6 +21,7 @@ from clsplat.config import BACKGROUNDS, Background, Mode
 from clsplat.formats.axes import rotated
 from clsplat.formats.sog import save_sog
 from clsplat.gaussians import Gaussians
+from clsplat.show.browser_cameras import target_of
 from clsplat.show.camera_paths import Viewpoint
 
 Array = NDArray[Any]
@@ -95,8 +96,7 @@ def viewer_settings(start: Viewpoint, turn: Array, background: Background) -> di
         Rotation of the scene that makes the viewpoint upright.
     background : {"black", "white"}
     """
-    camera, axis = start.camera, start.camera.viewmat[2, :3]
-    target = camera.position + max(abs(float((start.focus - camera.position) @ axis)), 1e-3) * axis
+    camera, target = start.camera, target_of(start.camera, start.focus)
     # Contrary to the viewer's documentation, this is the field of view across the window's longer edge.
     fov = math.degrees(2 * math.atan(max(camera.width / camera.fx, camera.height / camera.fy) / 2))
     pose = {"position": _viewer_axes(turn @ camera.position), "target": _viewer_axes(turn @ target), "fov": fov}
