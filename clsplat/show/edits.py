@@ -73,8 +73,11 @@ class Edits:
         """Number of deletions that can be undone."""
         return len(self._history)
 
+    def _inside(self, mask: Mask) -> Mask:
+        return mask if self.region is None else mask & self.region.holds(self._all.means)
+
     def _visible(self) -> Mask:
-        return self.kept if self.region is None else self.kept & self.region.holds(self._all.means)
+        return self._inside(self.kept)
 
     def select_rectangle(self, camera: Camera, low: tuple[float, float], high: tuple[float, float]) -> None:
         """Select the visible Gaussians whose centres a pinhole camera sees in a rectangle, besides those selected.
@@ -106,7 +109,13 @@ class Edits:
         self.selected[:] = False
 
     def delete(self) -> int:
-        """Delete what is selected, and return its number. The last Gaussian is kept."""
+        """Delete what is selected, and return its number.
+
+        Raises
+        ------
+        InputError
+            If none that is shown would remain; nothing is deleted then.
+        """
         return self._keep(self.kept & ~self.selected)
 
     def crop(self) -> int:
@@ -114,8 +123,9 @@ class Edits:
         return self._keep(self._visible())
 
     def _keep(self, kept: Mask) -> int:
-        if not kept.any():
-            raise InputError("expected at least one Gaussian to remain, found none")
+        if not self._inside(kept).any():
+            where, remedy = ("", "") if self.region is None else (" in the crop region", ", or turn the crop off")
+            raise InputError(f"expected at least one Gaussian to remain{where}, found none; select fewer{remedy}")
         count = int(self.kept.sum() - kept.sum())
         if count:
             self._history = [*self._history, np.packbits(self.kept)][-HISTORY:]

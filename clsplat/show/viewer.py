@@ -219,16 +219,19 @@ class Viewer:
             gaussians = self._renderer.place(gaussians) if due or self._tasks.busy else gaussians
             for client, share in due:
                 self._frame(client, share, gaussians)
-            try:
+            with self._noted():
                 self._tasks.run(gaussians)
-            except Exception as error:  # such as a full disk; the user reads it and tries again
-                self._note(_reason(error))
             self._write()
         return bool(due) or self._tasks.busy
 
-    def _note(self, text: str) -> None:
-        for client in list(self._clients.values()):
-            client.handle.add_notification("clsplat", text, auto_close_seconds=8)
+    @contextmanager
+    def _noted(self) -> Iterator[None]:
+        """Show browsers an error in the block, such as a full disk: the user reads it and tries again."""
+        try:
+            yield
+        except Exception as error:
+            for client in list(self._clients.values()):
+                client.handle.add_notification("clsplat", _reason(error), auto_close_seconds=8)
 
     @contextmanager
     def _harmless(self) -> Iterator[None]:
@@ -290,10 +293,11 @@ class Viewer:
         self._version += 1
         while not until():
             self._asked.clear()
-            if self._editing is not None and (edited := self._editing.changed()) is not None:
-                gaussians = self._renderer.place(edited)
-                self._version += 1
-                self._touch()
+            with self._harmless(), self._noted():
+                if self._editing is not None and (edited := self._editing.changed()) is not None:
+                    gaussians = self._renderer.place(edited)
+                    self._version += 1
+                    self._touch()
             if not self.draw(gaussians):
                 self._asked.wait(STILL_AFTER / 2)
 

@@ -84,6 +84,18 @@ def test_all_cannot_be_deleted():
     assert len(edits) == 64 and edits.steps == 0
 
 
+def test_all_in_the_region_cannot_be_deleted():
+    """Nothing would be left to show, and the viewer needs at least one Gaussian."""
+    edits = Edits(grid())
+    edits.region = Region("box", (0, 0, 0), (1, 2, 3))
+    edits.select_rectangle(CAMERA, (-9.0, -9.0), (9.0, 9.0))
+    with pytest.raises(InputError, match="to remain in the crop region, found none"):
+        edits.delete()
+    assert len(edits) == edits.selected.sum() == 24 and edits.steps == 0
+    edits.region = None
+    assert edits.delete() == 24 and len(edits) == 64 - 24
+
+
 @pytest.mark.parametrize(
     ("region", "count"),
     [(Region("box", (0, 0, 0), (1, 2, 3)), 2 * 3 * 4), (Region("sphere", (0, 0, 0), (1, 9, 9)), 4)],

@@ -51,6 +51,11 @@ class TestPanel:
         while viewer.draw(gaussians):
             pass
 
+    def held(self, viewer, gaussians):
+        """Let `hold` take a few turns."""
+        turns = iter(range(3))
+        viewer.hold(gaussians, lambda: next(turns, None) is None)
+
     def test_background_harmonics_and_field_of_view(self, viewer, look, client, clock):
         gaussians = cameras()[0]
         clock.now += STILL_AFTER
@@ -135,27 +140,21 @@ class TestPanel:
         gaussians, cams = cameras()
         saved = []
         viewer.edit(gaussians, lambda rest: saved.append(len(rest)) or f"saved {len(rest)}")
-        held = {"left": 3}
-
-        def hold():
-            held["left"] = 3
-            viewer.hold(gaussians, lambda: (held.update(left=held["left"] - 1), held["left"] < 0)[1])
-
-        hold()
+        self.held(viewer, gaussians)
         whole = client.frames[-1]
         viewer._editing.select(cams[2], (0.0, 0.0), (1.0, 1.0))
-        hold()
+        self.held(viewer, gaussians)
         assert "300 of 300 Gaussians, 289 selected" in viewer._editing._text.content
         assert client.frames[-1].mean() != whole.mean(), "what is selected is orange"
         viewer._editing.select(cams[2], (-9.0, -9.0), (9.0, 9.0))
         look("Delete selected")
-        hold()
-        assert client.notes == ["expected at least one Gaussian to remain, found none"]
+        self.held(viewer, gaussians)
+        assert client.notes == ["expected at least one Gaussian to remain, found none; select fewer"]
         look("Select none")
         viewer._editing.select(cams[2], (0.0, 0.0), (0.5, 1.0))
         look("Delete selected")
         look("Save")
-        hold()
+        self.held(viewer, gaussians)
         assert 0 < saved[0] < 300 and f"saved {saved[0]}" in viewer._editing._text.content
         look("Undo")
         look("Select none")
@@ -164,13 +163,43 @@ class TestPanel:
         look("Save")
         look("Delete outside")
         look("Save")
-        hold()
+        self.held(viewer, gaussians)
         assert saved[1] == saved[2] < 300
         look("Crop", "off")
         look("Undo")
         look("Save")
-        hold()
+        self.held(viewer, gaussians)
         assert saved[-1] == 300
+
+    def test_all_that_a_crop_shows_cannot_be_deleted(self, viewer, look, client):
+        gaussians, cams = cameras()
+        saved = []
+        viewer.edit(gaussians, lambda rest: saved.append(len(rest)) or "saved")
+        look("Half size", (0.5, 0.5, 0.5))
+        look("Crop", "box")
+        viewer._editing.select(cams[2], (-9.0, -9.0), (9.0, 9.0))
+        look("Delete selected")
+        look("Save")
+        self.held(viewer, gaussians)
+        (note,) = client.notes
+        assert "in the crop region, found none; select fewer, or turn the crop off" in note
+        look("Crop", "off")
+        look("Delete selected")
+        look("Save")
+        self.held(viewer, gaussians)
+        assert len(client.notes) == 1 and 0 < saved[0] < 300 and saved[1] == 300 - saved[0]
+
+    def test_an_error_of_edits_is_shown_and_does_not_end_the_viewer(self, viewer, look, client, monkeypatch):
+        gaussians = cameras()[0]
+        viewer.edit(gaussians, lambda rest: "saved")
+
+        def fails():
+            raise MemoryError("no room")
+
+        monkeypatch.setattr(viewer._editing._edits, "shown", fails)
+        look("Select none")
+        self.held(viewer, gaussians)
+        assert client.notes == ["MemoryError: no room"]
 
     def test_screenshot_and_videos(self, viewer, look, client, device):
         gaussians, cams = cameras()
