@@ -89,24 +89,21 @@ class Editing:
         return self._edits.shown()
 
     def _region(self) -> None:
-        if self._outline is not None:
-            self._outline.remove()
-            self._outline = None
         before, shape = self._edits.region, self._crop.value
-        if shape == "off":
-            self._edits.region = None
-            return
         centre, reach = tuple(self._centre.value), tuple(max(abs(v), 1e-9) for v in self._reach.value)
-        self._edits.region = Region(shape, centre, reach)
+        self._edits.region = None if shape == "off" else Region(shape, centre, reach)
         try:
             self._edits.result()
         except Exception:
             self._edits.region = before
             raise
+        if self._outline is not None:
+            self._outline.remove()
+            self._outline = None
         wireframe = {"wireframe": True, "color": (255, 255, 255), "position": centre}
         if shape == "box":
             self._outline = self._scene.add_box("/crop", dimensions=tuple(2 * half for half in reach), **wireframe)
-        else:
+        elif shape == "sphere":
             self._outline = self._scene.add_icosphere("/crop", radius=reach[0], subdivisions=2, **wireframe)
 
     def _saved(self) -> str:

@@ -189,6 +189,22 @@ class TestPanel:
         self.held(viewer, gaussians)
         assert len(client.notes) == 1 and 0 < saved[0] < 300 and saved[1] == 300 - saved[0]
 
+    def test_a_refused_region_leaves_the_one_before_and_its_outline(self, viewer, look, client):
+        gaussians = cameras()[0]
+        viewer.edit(gaussians, lambda rest: "saved")
+        look("Half size", (0.5, 0.5, 0.5))
+        look("Crop", "box")
+        self.held(viewer, gaussians)
+        region, outline = viewer._editing._edits.region, viewer._editing._outline
+        look("Centre", (50.0, 50.0, 50.0))
+        self.held(viewer, gaussians)
+        assert client.notes == ["the region holds no Gaussian"]
+        assert viewer._editing._edits.region == region
+        assert viewer._editing._outline is outline and not outline._impl.removed
+        look("Crop", "off")
+        self.held(viewer, gaussians)
+        assert viewer._editing._edits.region is viewer._editing._outline is None and outline._impl.removed
+
     def test_an_error_of_edits_is_shown_and_does_not_end_the_viewer(self, viewer, look, client, monkeypatch):
         gaussians = cameras()[0]
         viewer.edit(gaussians, lambda rest: "saved")
