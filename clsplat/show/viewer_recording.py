@@ -2,7 +2,8 @@
 
 import io
 from collections.abc import Callable, Iterator
-from typing import Any
+from contextlib import contextmanager
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,13 +89,13 @@ class Recording:
         count = round(self._seconds.value * FRAMES_PER_SECOND)
 
         def task(gaussians: Gaussians) -> Iterator[None]:
-            frames = []
-            cameras = self._cameras(window, count)
-            for number, camera in enumerate(cameras, start=1):
-                frames.append(self._frame_of(camera, gaussians)[0])
-                self._text.content = f"frame {number} of {count}"
-                yield
-            event.client.send_file_download("clsplat.mp4", video(frames), save_immediately=True)
+            file, cameras = io.BytesIO(), self._cameras(window, count)
+            with encoder(file, cameras[0].width, cameras[0].height) as encode:
+                for number, camera in enumerate(cameras, start=1):
+                    encode(self._frame_of(camera, gaussians)[0])
+                    self._text.content = f"frame {number} of {count}"
+                    yield
+            event.client.send_file_download("clsplat.mp4", file.getvalue(), save_immediately=True)
             self._text.content = f"{count} frames recorded"
 
         self._later(task)
@@ -109,8 +110,11 @@ class Recording:
         return around(window.resized(width, height), self._start.focus, self._start.up, count)
 
 
-def video(frames: list[NDArray[np.uint8]]) -> bytes:
-    """Encode frames (H, W, 3) uint8 with even edges as MP4, H.264.
+@contextmanager
+def encoder(file: BinaryIO, width: int, height: int) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+    """Write a video of `width` x `height` px, both even, as MP4, H.264: the block calls what it gets with each frame.
+
+    Frames, (height, width, 3) uint8, are encoded one by one: those of a minute would take gigabytes.
 
     Raises
     ------
@@ -121,12 +125,12 @@ def video(frames: list[NDArray[np.uint8]]) -> bytes:
         import av
     except ImportError as error:
         raise InputError("cannot write a video: the package av is missing; pip install 'clsplat[video]'") from error
-    file = io.BytesIO()
     with av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("h264", rate=FRAMES_PER_SECOND, options={"crf": "18"})
-        stream.height, stream.width = frames[0].shape[:2]
-        stream.pix_fmt = "yuv420p"
-        for frame in frames:
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+
+        def encode(frame: NDArray[np.uint8]) -> None:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+
+        yield encode
         container.mux(stream.encode())
-    return file.getvalue()

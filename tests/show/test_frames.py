@@ -15,7 +15,7 @@ from clsplat.render import render
 from clsplat.renderer import Renderer
 from clsplat.show.frames import MODES, Look, normals, picture, splash
 from clsplat.show.viewer_photos import blended
-from clsplat.show.viewer_recording import video
+from clsplat.show.viewer_recording import encoder
 
 
 def plane(camera, normal, distance):
@@ -94,7 +94,11 @@ def test_a_page_that_waits_shows_a_sentence():
 def test_a_video_has_its_frames():
     av = pytest.importorskip("av", reason="PyAV, the extra `video`, is missing")
     frames = [np.full((32, 48, 3), 60 * k, np.uint8) for k in range(4)]
-    with av.open(io.BytesIO(video(frames))) as container:
+    file = io.BytesIO()
+    with encoder(file, 48, 32) as encode:
+        for frame in frames:
+            encode(frame)
+    with av.open(io.BytesIO(file.getvalue())) as container:
         found = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert [f.shape for f in found] == [(32, 48, 3)] * 4
     np.testing.assert_allclose([f.mean() for f in found], [0, 60, 120, 180], atol=4)
@@ -102,8 +106,8 @@ def test_a_video_has_its_frames():
 
 def test_without_av_a_video_is_a_sentence(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
-    with pytest.raises(InputError, match=r"pip install 'clsplat\[video\]'"):
-        video([np.zeros((2, 2, 3), np.uint8)])
+    with pytest.raises(InputError, match=r"pip install 'clsplat\[video\]'"), encoder(io.BytesIO(), 2, 2):
+        pass
 
 
 class TestPicture:

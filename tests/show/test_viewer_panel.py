@@ -3,6 +3,7 @@
 import contextlib
 import io
 import math
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
@@ -238,6 +239,24 @@ class TestPanel:
             assert len(frames) == 30 and frames[0].shape == (240, 320, 3)
         first, last = (to_uint8(render(gaussians, c, device=device).rgb) for c in cams[:2])
         assert psnr(frames[0], first) > 25 and psnr(frames[-1], last) > 25
+
+    def test_frames_of_a_video_do_not_pile_up(self, viewer, look, client, monkeypatch):
+        pytest.importorskip("av", reason="PyAV, the extra `video`, is missing")
+        frames, most = [], 0
+
+        def rendered(renderer, gaussians, camera, *_):
+            nonlocal most
+            most = max(most, sum(frame() is not None for frame in frames))
+            frame = np.zeros((camera.height, camera.width, 3), np.uint8)
+            frames.append(weakref.ref(frame))
+            return frame, ""
+
+        monkeypatch.setattr("clsplat.show.viewer.picture", rendered)
+        client.state.handle.scene.set_background_image = lambda *_, **__: None
+        look("Seconds", 1)
+        look("Record video")
+        self.settled(viewer, cameras()[0])
+        assert "clsplat.mp4" in client.files and len(frames) > 30 and most <= 2
 
     def test_tasks_do_not_pile_up(self, viewer, look, client):
         for _ in range(3 * TASKS_MAX):
