@@ -78,6 +78,7 @@ class Viewer:
             ) from error
         self._renderer: Renderer | None = None
         self._clients: dict[int, Client] = {}
+        self._joining = threading.Lock()  # a browser joins before `show` serves those that have joined, or after
         self._asked = threading.Event()
         self._tasks = Tasks()
         self._settings, self._version, self._paused = 0, 0, False
@@ -124,23 +125,25 @@ class Viewer:
         tabs = self._tabs = self._server.gui.add_tab_group()
         with tabs.add_tab("View"):
             self._look = LookInputs(self._panel, renderer.background, self._touch)
+        photos = None
         if views:
             with tabs.add_tab("Photos"):
                 own = self._look.background, self._touch, self._later, self._look.tell_field
-                self._photos = Photos(self._panel, views, start.focus, *own)
+                photos = Photos(self._panel, views, start.focus, *own)
         with tabs.add_tab("Record"):
             self._recording = Recording(self._panel, start, self._pose_of, self._later, self._frame_of)
         pose, initial = first_pose(start), self._server.initial_camera
         self._server.scene.set_up_direction(tuple(start.up))
         initial.position, initial.look_at, initial.up, initial.fov = pose
         self._look.tell_field(pose.fov)
-        self._renderer = renderer
-        for client in list(self._clients.values()):
-            with client.handle.atomic():
-                camera = client.handle.camera
-                camera.position, camera.look_at, camera.up_direction, camera.fov = pose
-            if self._photos:
-                client.outlines = self._photos.outlines(client.handle)
+        with self._joining:
+            self._renderer, self._photos = renderer, photos
+            for client in list(self._clients.values()):
+                with client.handle.atomic():
+                    camera = client.handle.camera
+                    camera.position, camera.look_at, camera.up_direction, camera.fov = pose
+                if photos:
+                    client.outlines = photos.outlines(client.handle)
         self._asked.set()
 
     def edit(self, gaussians: Gaussians, save: Save) -> None:
@@ -185,10 +188,11 @@ class Viewer:
             self._asked.set()
 
         handle.camera.on_update(update)
-        if self._photos:
-            client.outlines = self._photos.outlines(handle)
         await update(handle.camera)
-        self._clients[handle.client_id] = client  # complete, for the thread that draws
+        with self._joining:
+            if self._photos:
+                client.outlines = self._photos.outlines(handle)
+            self._clients[handle.client_id] = client  # complete, for the thread that draws
 
     async def _disconnect(self, handle: Any) -> None:
         self._clients.pop(handle.client_id, None)

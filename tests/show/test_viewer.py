@@ -1,5 +1,7 @@
 """The viewer: conversion of cameras, frames, trainings with a viewer, and a browser that shows the frames."""
 
+import asyncio
+import contextlib
 import os
 import subprocess
 import sys
@@ -7,17 +9,20 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from browser import wait_for
 from fake_browsers import FakeClient
-from small_scenes import SIZE, cameras, small_training
+from small_scenes import SIZE, cameras, small_training, views_of
 
 from clsplat.errors import DeviceError, InputError
 from clsplat.metrics import to_uint8
 from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.show.browser_cameras import client_camera, whole_view, wxyz_of
+from clsplat.show.camera_paths import first_photo
 from clsplat.show.frames import MODES
 from clsplat.show.pacing import FRAME_TIME, STILL_AFTER, VISER_RACE
 from clsplat.show.viewer import Viewer
@@ -187,3 +192,46 @@ def test_a_pause_holds_the_training_until_it_is_resumed_or_interrupted(viewer, d
     assert len(reached) == 12
     viewer._toggle(None)
     viewer.follow(cameras()[0], lambda: True)  # without the interruption it would wait forever
+
+
+class Joining(dict):
+    """Clients of a viewer, to whose scene `show` wants to add while a browser joins."""
+
+    def __init__(self, show):
+        super().__init__()
+        self.owner = threading.Thread(target=show)
+
+    def __setitem__(self, key, value):
+        self.owner.start()
+        self.owner.join(1)  # without a lock, the time suffices
+        super().__setitem__(key, value)
+
+
+def test_a_browser_that_joins_while_a_scene_is_added_gets_its_view_and_outlines(device):
+    pytest.importorskip("viser", reason="viser, the extra `viewer`, is missing")
+    cams, renderer, added = cameras()[1], Renderer(device), []
+    viewer = Viewer(port=18080)
+
+    def outline(name, **_):
+        added.append(name)
+        return SimpleNamespace(on_click=lambda callback: None)
+
+    camera = SimpleNamespace(
+        wxyz=(1, 0, 0, 0),
+        position=(3, 3, 3),
+        fov=1,
+        image_width=320,
+        image_height=240,
+        on_update=lambda callback: None,
+    )
+    scene = SimpleNamespace(add_camera_frustum=outline, set_background_image=lambda *_, **__: None)
+    handle = SimpleNamespace(client_id=0, camera=camera, scene=scene, atomic=contextlib.nullcontext)
+    try:
+        viewer._clients = Joining(lambda: viewer.show(renderer, first_photo(cams), views_of(cams)))
+        asyncio.run(viewer._connect(handle))
+        viewer._clients.owner.join()
+        np.testing.assert_allclose(camera.position, cams[0].position)
+        assert added == [f"/cameras/{i}.png" for i in range(5)]
+        assert list(viewer._clients[0].outlines) == list(range(5))
+    finally:
+        viewer.close()
