@@ -3,6 +3,7 @@
 import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -104,10 +105,16 @@ class Recording:
         """The path, at a size with even edges, which H.264 needs."""
         scale = min(1.0, VIDEO_EDGE / max(window.width, window.height))
         width, height = (max(2, 2 * round(scale * edge / 2)) for edge in (window.width, window.height))
-        path = [camera.resized(width, height) for camera in self._path]
-        if len(path) > 1:
-            return through(path, count, closed=self._closed.value)
-        return around(window.resized(width, height), self._start.focus, self._start.up, count)
+        first = window.resized(width, height)
+        if len(self._path) > 1:
+            return through([_in_window(camera, first) for camera in self._path], count, closed=self._closed.value)
+        return around(first, self._start.focus, self._start.up, count)
+
+
+def _in_window(camera: Camera, window: Camera) -> Camera:
+    """What a window of another size shows of a browser's view: the vertical field of view stays."""
+    zoom = camera.fy / camera.height * window.height / window.fy
+    return replace(window, viewmat=camera.viewmat, fx=zoom * window.fx, fy=zoom * window.fy)
 
 
 @contextmanager

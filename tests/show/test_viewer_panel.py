@@ -14,7 +14,7 @@ from small_scenes import cameras
 
 from clsplat.metrics import psnr, to_uint8
 from clsplat.render import render
-from clsplat.show.browser_cameras import whole_view
+from clsplat.show.browser_cameras import client_camera, whole_view, wxyz_of
 from clsplat.show.pacing import STILL_AFTER
 from clsplat.show.viewer_statistics import POINTS_MAX
 from clsplat.show.viewer_tasks import TASKS_MAX
@@ -239,6 +239,18 @@ class TestPanel:
             assert len(frames) == 30 and frames[0].shape == (240, 320, 3)
         first, last = (to_uint8(render(gaussians, c, device=device).rgb) for c in cams[:2])
         assert psnr(frames[0], first) > 25 and psnr(frames[-1], last) > 25
+
+    def test_a_path_is_not_squeezed_into_a_window_of_another_shape(self, viewer, look, client):
+        cams = cameras()[1]
+        for camera in cams[:2]:
+            client.state.camera = camera
+            look("Add view to path")
+        window = client_camera(wxyz_of(cams[2]), cams[2].position, 1.0, 480, 480)
+        found = viewer._recording._cameras(window, 7)
+        for camera, expected in zip((found[0], found[-1]), cams, strict=False):
+            np.testing.assert_allclose(camera.viewmat, expected.viewmat, atol=1e-12)
+            np.testing.assert_allclose((camera.fx, camera.fy), 480 / 240 * expected.fy)
+        assert {(c.width, c.height, c.cx, c.cy) for c in found} == {(480, 480, 240, 240)}
 
     def test_frames_of_a_video_do_not_pile_up(self, viewer, look, client, monkeypatch):
         pytest.importorskip("av", reason="PyAV, the extra `video`, is missing")
