@@ -30,9 +30,12 @@ class Tasks:
             self._waiting.append(task)
 
     def run(self, gaussians: Gaussians) -> None:
-        """Run the waiting tasks up to one with steps, and one step of it. After an error, its task is over."""
+        """Run the next task, or its next step. After an error, its task is over.
+
+        Only one, because the task after an edit needs the scene that the edit has changed.
+        """
         try:
-            while self._waiting and self._steps is None:
+            if self._waiting and self._steps is None:
                 self._steps = self._waiting.popleft()(gaussians)
             if self._steps is not None and next(self._steps, self) is self:
                 self._steps = None

@@ -53,8 +53,8 @@ class TestPanel:
             pass
 
     def held(self, viewer, gaussians):
-        """Let `hold` take a few turns."""
-        turns = iter(range(3))
+        """Let `hold` do what is asked, and show the result."""
+        turns = iter(range(10))
         viewer.hold(gaussians, lambda: next(turns, None) is None)
 
     def test_background_harmonics_and_field_of_view(self, viewer, look, client, clock):
@@ -239,6 +239,19 @@ class TestPanel:
             assert len(frames) == 30 and frames[0].shape == (240, 320, 3)
         first, last = (to_uint8(render(gaussians, c, device=device).rgb) for c in cams[:2])
         assert psnr(frames[0], first) > 25 and psnr(frames[-1], last) > 25
+
+    def test_a_screenshot_right_after_a_deletion_shows_what_is_left(self, viewer, look, client, device):
+        gaussians, cams = cameras()
+        viewer.edit(gaussians, lambda rest: "saved")
+        viewer._editing.select(cams[2], (0.0, 0.0), (0.5, 1.0))
+        look("Delete selected")
+        look("Screenshot")
+        self.held(viewer, gaussians)
+        rest = viewer._editing._edits.result()
+        assert 0 < len(rest) < 300
+        with Image.open(io.BytesIO(client.files["clsplat.png"])) as image:
+            expected = to_uint8(render(rest, cams[2], device=device).rgb)
+            assert psnr(np.asarray(image), expected) > 40
 
     def test_a_path_is_not_squeezed_into_a_window_of_another_shape(self, viewer, look, client):
         cams = cameras()[1]
