@@ -37,7 +37,7 @@ from clsplat.renderer import Renderer
 from clsplat.run_log import LOG
 from clsplat.scene import Scene, in_turn
 from clsplat.show.training_curve import read_log
-from clsplat.training.checkpoint import CHECKPOINT, FREE
+from clsplat.training.checkpoint import CHECKPOINT, without_free
 from clsplat.training.inputs import Photo, photos_of
 from clsplat.training.loop import train
 
@@ -182,8 +182,8 @@ def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, w
     """
     photos = json.dumps(photos_of(scene.train, scene.offset))
     settings = coarse_config(config, scene, device)
-    bound = {name: value for name, value in asdict(settings).items() if name not in FREE}
-    digest = digest_of(json.dumps(bound, sort_keys=True).encode(), photos.encode(), scene.points.tobytes())
+    bound = json.dumps(asdict(without_free(settings)), sort_keys=True)
+    digest = digest_of(bound.encode(), photos.encode(), scene.points.tobytes())
     done, work = folder / f"coarse-{digest}.json", folder / f"coarse-{digest}"
     if not done.exists():
         with watch("coarse run", settings) as progress:

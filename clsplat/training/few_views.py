@@ -9,10 +9,11 @@ from dataclasses import replace
 
 from clsplat.config import TrainConfig
 from clsplat.scene import Scene
-from clsplat.training.autosize.rule import PER_PIXEL, RANDOM_START, full_size, reach
+from clsplat.training.autosize.rule import PER_PIXEL, full_size, reach
 from clsplat.training.autosize.validation import FEWEST_PHOTOS
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.run_length import SMALL_PHOTO, largest_photo
+from clsplat.training.state import start_config
 
 FEWEST_SEARCHED = 24
 """Fewest training photos with which the number of Gaussians is searched. Of fewer, three at most would be held back;
@@ -46,10 +47,10 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     few, init, first, fewest = config.few, config.init, len(scene.points), _fewest(config, scene)
     named = config.size == "fixed" and config.max_gaussians is not None
     if config.size == "auto":
-        config = replace(config, size="fixed")
         if not first:
-            first = init.random_points or RANDOM_START
-            init = replace(init, random_points=first)
+            init = replace(init, random_points=start_config(config).random_points)
+            first = init.random_points or 0
+        config = replace(config, size="fixed")
     cap = config.max_gaussians
     if first and not named:
         wanted = _most_of_few(few.growth * first, scene) if fewest else full_size(scene, first)

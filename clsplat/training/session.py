@@ -132,8 +132,8 @@ class Training:
     def _cap(self) -> int:
         """Largest number of Gaussians after the next edit.
 
-        It is the user's limit, or what fits the device, or what the search allows; with too few photos for a search,
-        the present number.
+        It is the user's limit, or what fits the device, or what the search allows; with too few photos for a search
+        (`clsplat.training.few_views` sets a limit for them, where it is used) the present number.
         """
         fitting = self.need.most_gaussians(self.device.memory_limit, self.state.intersections)
         cap, n = min(self.config.max_gaussians or fitting, fitting), len(self.state.gaussians)

@@ -22,7 +22,8 @@ FEWEST_HELD = 2
 """Fewest photos that validate: the error of a mean cannot be estimated from one."""
 
 FEWEST_PHOTOS = 8
-"""Fewest training photos with which the number of Gaussians is searched: fewer photos are all needed for training."""
+"""Fewest training photos with which the number of Gaussians can be searched, with two that are held back. From which
+number on it is searched by default is decided by `clsplat.training.few_views`."""
 
 PERFECT = 20 * log10(255)
 """Largest PSNR that counts, dB: that of an error of one level of 255. More Gaussians for smaller errors, which nobody

@@ -11,6 +11,7 @@ from clsplat.config import UINT32_MAX, TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import download
 from clsplat.stages import Stages
+from clsplat.training.initialize import OPACITY
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -71,8 +72,8 @@ class Strategy:
         Number of Gaussians.
     """
 
-    start_opacity = 0.1
-    """Opacity of the first Gaussians, where the user gives none (original code of Kerbl et al. 2023)."""
+    start_opacity = OPACITY
+    """Opacity of the first Gaussians, where the user gives none."""
 
     leaves_room = False
     """Whether Gaussians that reach a viewpoint are shrunk (`clsplat.training.camera_room`), and those that no photo
