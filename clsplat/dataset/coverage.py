@@ -78,8 +78,8 @@ def _unprojected(
     _, nearest = cKDTree(places[inside]).query(pixels, NEIGHBOURS)
     depth = np.quantile(depths[inside][nearest], QUANTILE, axis=1)
     rays = camera.rays(*pixels.T)
-    # The depth of a fisheye's point is its distance, that of other cameras its z.
-    along = rays if camera.model == "fisheye" else rays / rays[:, 2:]
+    # The depth of a point is its distance where a camera may see behind itself, and otherwise its z.
+    along = rays if camera.model in ("fisheye", "equirectangular") else rays / rays[:, 2:]
     return (along * depth[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
 
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from walls import HEIGHT, WALL, WIDTH, scene_of, view, wall
 
-from clsplat.dataset.coverage import rare_pixels
+from clsplat.camera import Camera
+from clsplat.dataset.coverage import projected, rare_pixels
 
 
 def test_pixels_that_two_photos_show_are_rare():
@@ -57,6 +58,22 @@ def test_a_fisheye_has_no_rare_pixels_outside_its_circle():
     (mask,) = rare_pixels(scene_of([turned] * 3, [fisheye]), shell)
     assert mask[HEIGHT // 2, WIDTH // 2], "only what lies ahead"
     assert np.isfinite(fisheye.camera.rays(0.5, 0.5)).all() or not mask[0, 0]
+
+
+def test_a_panorama_also_shows_what_is_behind_it():
+    """Three photos look back at a shell around the panorama; the one ahead shows too little."""
+    panorama = replace(view("p"), camera=Camera.panorama(np.eye(4), 64))
+    back = np.diag([-1.0, 1.0, -1.0, 1.0])
+    train = [replace(v, camera=replace(v.camera, viewmat=back @ v.camera.viewmat)) for v in (
+        view("0", x=-0.5), view("1"), view("2", x=0.5))]  # fmt: skip
+    u, v = np.meshgrid(np.arange(64) + 0.5, np.arange(32) + 0.5)
+    on_shell = 3 * panorama.camera.rays(u, v).reshape(-1, 3)
+    common = np.all([projected(other.camera, on_shell)[2] for other in train], axis=0).reshape(32, 64)
+    assert common.any() and not common[:, 16:48].any(), "the middle of a panorama is ahead"
+    shell = np.random.default_rng(0).normal(size=(4000, 3))
+    shell *= 3 / np.linalg.norm(shell, axis=1, keepdims=True)
+    (mask,) = rare_pixels(scene_of([*train, view("ahead")], [panorama]), shell)
+    np.testing.assert_array_equal(mask, ~common)
 
 
 def test_unknown_without_points():
