@@ -234,8 +234,8 @@ def aligned(scene: Scene, tell: Callable[[str], None] = lambda text: None) -> Sc
     """
     if not len(scene.points):
         raise InputError(
-            "--depth: expected a scene with points, to which depth maps are scaled, found none; leave out --depth "
-            "or --init.no-triangulate"
+            "--depth: expected a scene with points, to which depth maps are scaled, found none; leave out --depth, "
+            "or --init.no-triangulate where it was given"
         )
     samples = {view.name: _samples(view, scene.points) for view in scene.train if view.depth}
     inverse = sum(len(s.values) * _rank_correlation(s) for s in samples.values()) < 0

@@ -12,7 +12,7 @@ import numpy as np
 
 from clsplat.config import DataConfig, SfmConfig
 from clsplat.dataset import colmap, transforms
-from clsplat.dataset.decoding import Dataset, by_faces, load_view, load_views
+from clsplat.dataset.decoding import Dataset, PosedPhoto, by_faces, load_view, load_views
 from clsplat.dataset.depth_maps import aligned, find_depth_map, load_depth_map
 from clsplat.dataset.finding import PhotosMissing, mask_folder
 from clsplat.dataset.near_planes import with_near_planes
@@ -156,9 +156,8 @@ def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: boo
     """
     if len(scene.points):
         return scene
-    cameras = {view.name for view in scene.train}
     dataset = _full_size(Path(path), config)
-    photos = sorted((photo for photo in dataset.photos if photo.name in cameras), key=lambda photo: photo.name)
+    photos = _faces_of({view.name for view in scene.train}, dataset, config)
     views = (load_view(photo, dataset, config) for photo in photos)
     moved = (replace(view, camera=view.camera.translated(scene.offset)) for view in views)
     points, colors = triangulate(moved, verbose)
@@ -227,10 +226,18 @@ def _full_size(path: Path, config: DataConfig) -> Dataset:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # load_scene has warned of missing photos
         try:
-            dataset = _read_dataset(path, replace(config, downscale=1), verbose=False)
+            return _read_dataset(path, replace(config, downscale=1), verbose=False)
         except InputError:
-            dataset = _read_dataset(path, config, verbose=False)
-    return replace(dataset, photos=by_faces(dataset.photos))
+            return _read_dataset(path, config, verbose=False)
+
+
+def _faces_of(names: set[str], dataset: Dataset, config: DataConfig) -> list[PosedPhoto]:
+    """Choose the photos of these names, sorted by name; of panoramas their faces, from which points are made."""
+    if config.panoramas == "faces":
+        chosen = [photo for photo in by_faces(dataset.photos) if photo.name in names]
+    else:
+        chosen = by_faces([photo for photo in dataset.photos if photo.name in names])
+    return sorted(chosen, key=lambda photo: photo.name)
 
 
 def _read_dataset(path: Path, config: DataConfig, verbose: bool) -> Dataset:

@@ -15,6 +15,7 @@ from clsplat.dataset import load_scene, with_points
 from clsplat.dataset.sfm.triangulation import NEIGHBOURS, POINTS_TARGET, TRIANGULATED_MIN, filled, pairs, triangulate
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
+from clsplat.panorama import FACES
 from clsplat.scene import View
 
 PIXEL = 3.2 / 300
@@ -167,6 +168,26 @@ def test_only_photos_that_train_make_points(posed, tmp_path):
     points, _ = triangulate(scene.train)
     assert len(points) >= TRIANGULATED_MIN
     np.testing.assert_array_equal(with_points(scene, path, config).points[: len(points)], points)
+
+
+def test_panoramas_that_train_whole_make_points_by_their_faces(tmp_path, monkeypatch):
+    spheres = [Camera.panorama(camera.viewmat, 512) for camera in cameras()]
+    path = write_transforms(tmp_path, views(take_photos(0, spheres), spheres), camera_model="EQUIRECTANGULAR")
+    used = []
+
+    def noted(views, verbose):
+        views = list(views)
+        used.extend(view.name for view in views)
+        return triangulate(views, verbose)
+
+    monkeypatch.setattr("clsplat.dataset.loading.triangulate", noted)
+    config = DataConfig(test_every=4, panoramas="whole")
+    scene = load_scene(path, config)
+    assert [view.name for view in scene.train] == ["1.png", "2.png", "3.png"]
+    found = with_points(scene, path, config)
+    assert used == sorted(f"{k}_{face}.png" for k in (1, 2, 3) for face in FACES) and found.train == scene.train
+    size_of_a_pixel = 3.2 / spheres[0].fx
+    assert len(found.points) == POINTS_TARGET and np.median(off_the_corner(found.points)) < size_of_a_pixel
 
 
 def test_points_are_filled_up_between_neighbours(posed):

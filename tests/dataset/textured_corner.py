@@ -16,14 +16,14 @@ def cameras():
 
 
 def corner(camera, textures):
-    """Photo of the three planes x = 0, y = 0, z = 0, each with a texture of 160 pixels per unit."""
+    """Photo of the three planes x = 0, y = 0, z = 0, with 160 texture pixels per unit; black beyond."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = camera.rays(x, y) @ camera.viewmat[:3, :3]
     reach = np.where(rays < 0, -camera.position / rays, np.inf)
     plane, hit = reach.argmin(axis=-1), camera.position + rays * reach.min(axis=-1)[..., None]
     photo = np.zeros((*x.shape, 3))
     for axis in range(3):
-        on = plane == axis
+        on = (plane == axis) & np.isfinite(hit).all(axis=-1)
         at = 160 * np.delete(hit[on], axis, axis=1).T
         for channel in range(3):
             photo[on, channel] = map_coordinates(textures[axis][..., channel], at, order=1, mode="grid-wrap")
