@@ -89,7 +89,7 @@ def _run(jobs: list[Path], scene: "Scene", device: "Device", watch: "Watch", whe
 def began(out: Path) -> bool:
     """Whether a folder holds a run that can be resumed."""
     from clsplat.blocks.whole import BLOCKS
-    from clsplat.training.checkpoint import CHECKPOINT
+    from clsplat.resuming import CHECKPOINT
 
     return (out / CHECKPOINT).is_file() or (out / BLOCKS).is_dir()
 

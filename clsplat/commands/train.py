@@ -143,7 +143,7 @@ class Train:
     ) -> "Gaussians | None":
         """Train the whole scene; or return None after training in blocks, if the settings ask for more than one."""
         from clsplat.renderer import Renderer
-        from clsplat.training.checkpoint import CHECKPOINT
+        from clsplat.resuming import CHECKPOINT
 
         if config.blocks != 1:
             renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])

@@ -13,15 +13,13 @@ from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 from clsplat.fields.field import Field
 from clsplat.fields.space import Space
+from clsplat.resuming import FREE
 
 if TYPE_CHECKING:
     from clsplat.device import Device
 
 MODEL = "field.npz"
 """Name of the file of the model in the folder of a run."""
-
-FREE = ("device", "checkpoint_every", "eval_every", "memory_limit")
-"""Settings that may differ when a training resumes: they do not change the result."""
 
 
 def save_field(path: Path, field: Field) -> None:

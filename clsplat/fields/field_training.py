@@ -16,14 +16,12 @@ from clsplat.fields.field_files import MODEL, load_checkpoint, save_checkpoint, 
 from clsplat.fields.pixels import Pixels
 from clsplat.fields.space import Space
 from clsplat.randomness import stream
+from clsplat.resuming import CHECKPOINT
 from clsplat.run_log import LOG, LOG_EVERY, log_file
 from clsplat.scene import Scene
 
 if TYPE_CHECKING:
     from clsplat.device import Device
-
-CHECKPOINT = "checkpoint.npz"
-"""File name of the checkpoint in the folder of a run."""
 
 
 def train_field(

@@ -20,6 +20,8 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.ranges import flags_of
 from clsplat.renderer import download, fetch
+from clsplat.resuming import CHECKPOINT as CHECKPOINT  # those who call load_state need it
+from clsplat.resuming import FREE
 from clsplat.scene import Scene
 from clsplat.training import photo_exposures, photo_poses
 from clsplat.training.autosize.rule import Candidate, Search, SmallSide
@@ -32,13 +34,6 @@ from clsplat.training.presets import with_settings
 from clsplat.training.rows import Rows
 from clsplat.training.smoothing_filter import SmoothingFilter
 from clsplat.training.state import State
-
-CHECKPOINT = "checkpoint.npz"
-"""File name of the checkpoint in the folder of a run."""
-
-FREE = ("device", "checkpoint_every", "eval_every", "memory_limit")
-"""Settings that may differ when a run resumes: they do not change the result, unless a limit of memory is reached,
-and then the user lowers it."""
 
 FORMAT = 2
 """Version of the arrays in a checkpoint. The first had no number; the second adds the inputs and the losses."""

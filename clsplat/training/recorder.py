@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from clsplat.gaussians import Gaussians
+from clsplat.resuming import CHECKPOINT
 from clsplat.run_log import LOG_EVERY, Append
-from clsplat.training.checkpoint import CHECKPOINT, save_state
+from clsplat.training.checkpoint import save_state
 from clsplat.training.divergence import check_loss, check_state
 from clsplat.training.session import Training
 

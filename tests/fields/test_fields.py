@@ -13,12 +13,13 @@ from clsplat.dataset.near_planes import NEAR_SHARE
 from clsplat.errors import InputError
 from clsplat.fields import METHODS, plenoxels
 from clsplat.fields.field_files import MODEL, load_checkpoint, load_field
-from clsplat.fields.field_training import CHECKPOINT, train_field
+from clsplat.fields.field_training import train_field
 from clsplat.fields.occupancy import FULL_UPDATES, SHARE, THRESHOLD, Occupancy
 from clsplat.fields.pixels import Pixels
 from clsplat.fields.space import FAR, Space
 from clsplat.metrics import psnr, to_uint8
 from clsplat.randomness import stream
+from clsplat.resuming import CHECKPOINT, FREE
 
 WHITE = BACKGROUNDS["white"]
 CONFIG = TrainConfig(iterations=250, data=DataConfig(background="white"))
@@ -115,6 +116,9 @@ def test_another_configuration_does_not_resume(device, scene, method, tmp_path):
     train_field(scene, method, config, tmp_path, device)
     with pytest.raises(InputError, match="expected the configuration it was made with"):
         load_checkpoint(tmp_path / CHECKPOINT, method, replace(config, seed=1), device)
+    free = {"device": "a", "checkpoint_every": 7, "eval_every": 8, "memory_limit": "9GB"}
+    assert free.keys() == set(FREE)
+    assert load_checkpoint(tmp_path / CHECKPOINT, method, replace(config, **free), device)[0].iteration == 2
 
 
 def test_rays_without_samples_see_the_background(device, scene, monkeypatch):

@@ -31,8 +31,8 @@ from clsplat.atomic import PART
 from clsplat.commands.console import Out
 from clsplat.dataset.sfm.reconstruction import reconstruct
 from clsplat.renderer import default_device
+from clsplat.resuming import CHECKPOINT
 from clsplat.run_log import LOG
-from clsplat.training.checkpoint import CHECKPOINT
 from clsplat.training.run_folder import LOCK
 
 
