@@ -18,7 +18,7 @@ from clsplat.blocks.sight import Bounds, looking_at, seen
 from clsplat.blocks.survey import seen_by_block
 from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, TrainConfig
-from clsplat.dataset import load_scene, read_depth_maps
+from clsplat.dataset import load_photos, read_depth_maps
 from clsplat.errors import ClsplatError
 from clsplat.formats import save_gaussians
 from clsplat.formats.ply import with_coefficients
@@ -62,6 +62,7 @@ def train_block(
     loaded: list[View] | None = None,
     device: "Device | None" = None,
     progress: Progress = lambda record: None,
+    beside: int = 1,
 ) -> Path:
     """Train a block, unless its result exists; continue where an interrupted run has left a checkpoint.
 
@@ -74,10 +75,12 @@ def train_block(
     job_file : Path or str
         As `clsplat.blocks.jobs.Job.write` wrote it, with the scenes that it names beside it.
     loaded : list of View, optional
-        The photos of the dataset. Default: they are read.
+        Photos of the dataset, those of the block among them. Default: these are read.
     device : Device, optional
         Default: the one that the job's configuration describes.
     progress : callable
+    beside : int
+        Processes that train blocks on this machine, whose memory for photos they share.
 
     Returns
     -------
@@ -99,7 +102,7 @@ def train_block(
     start = _start(job_file, job)
     coefficients = (job.config.init.sh_degree + 1) ** 2
     points = [with_coefficients(read_part(job_file.parent, part), coefficients) for part in points_of(job_file, job)]
-    views = job.views(_loaded(job) if loaded is None else loaded)
+    views = job.views(_loaded(job, beside) if loaded is None else loaded)
     device = device or open_device(job.config)
     with held(work):
         if not result.exists():
@@ -111,12 +114,11 @@ def train_block(
     return result
 
 
-def _loaded(job: Job) -> list[View]:
-    """The training photos of the dataset, and the depth maps of those of the block."""
-    views = load_scene(job.data, job.config.data, memory=photo_memory(job.config)).train
-    if not job.depths:
-        return views
-    return read_depth_maps([view for view in views if view.name in job.photos], job.data, job.config.data)
+def _loaded(job: Job, beside: int) -> list[View]:
+    """The photos of a block, with their depth maps if it has them."""
+    memory = photo_memory(job.config) or photo_budget(None)
+    views = load_photos(job.data, job.config.data, job.photos, None if memory is None else memory // beside)
+    return read_depth_maps(views, job.data, job.config.data) if job.depths else views
 
 
 def needed_parts(job_file: Path, job: Job) -> Iterator[tuple[bool, Part, list[Camera]]]:

@@ -25,7 +25,7 @@ TRAIN_ON = """
 import json
 sys.path[:] = json.loads(sys.argv[1])
 from clsplat.blocks.local import train_on
-train_on(sys.argv[2], int(sys.argv[3]))
+train_on(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
 """
 """Program that runs `train_on` with the module search path of the process that started it."""
 
@@ -71,7 +71,7 @@ def run_on_devices(jobs: list[Path], devices: list[int], tell: Callable[[str], N
         while waiting or running:
             for number, device in enumerate(devices):
                 if waiting and number not in running:
-                    running[number] = _started(waiting.pop(0), device, stack)
+                    running[number] = _started(waiting.pop(0), device, len(devices), stack)
             time.sleep(POLL)
             ended = [number for number, each in running.items() if each.process.poll() is not None]
             for number in ended:
@@ -83,11 +83,12 @@ def run_on_devices(jobs: list[Path], devices: list[int], tell: Callable[[str], N
                 tell(f"blocks: {done} of {total} done, the last by device {number + 1} of {len(devices)}")
 
 
-def _started(job: Path, device: int, stack: ExitStack) -> _Running:
+def _started(job: Path, device: int, beside: int, stack: ExitStack) -> _Running:
     end = stack.enter_context(ExitStack())
     errors = end.enter_context(TemporaryFile())
     program = EXIT_WITH_PARENT + TRAIN_ON
-    command = [sys.executable, "-I", "-c", program, json.dumps(sys.path), str(job.resolve()), str(device)]
+    arguments = [json.dumps(sys.path), str(job.resolve()), str(device), str(beside)]
+    command = [sys.executable, "-I", "-c", program, *arguments]
     process = end.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stderr=errors))
     end.callback(_ended, process)
     return _Running(job, process, errors, end)
@@ -106,10 +107,10 @@ def _reason(status: int, errors: IO[bytes]) -> str:
     return f"its process ended with status {status}{': ' if lines else ''}{''.join(lines[-1:])}"
 
 
-def train_on(job_file: str, number: int) -> None:
-    """Train a block on the OpenCL device of a number; run by each process of `run_on_devices`."""
+def train_on(job_file: str, number: int, beside: int) -> None:
+    """Train a block on the OpenCL device of a number; run by each of the `beside` processes of `run_on_devices`."""
     from clsplat.device import Device, list_devices
     from clsplat.training.preparation import photo_memory
 
     limit = photo_memory(read_job(Path(job_file)).config)
-    train_block(job_file, device=Device(list_devices()[number], memory_limit=limit))
+    train_block(job_file, device=Device(list_devices()[number], memory_limit=limit), beside=beside)

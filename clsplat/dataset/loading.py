@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
@@ -93,6 +93,17 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
             if before.name == view.name:
                 raise InputError(f"{path}: expected a camera for each photo, found several for {view.name}")
     return with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
+
+
+def load_photos(path: str | Path, config: DataConfig, names: Container[str], memory: int | None = None) -> list[View]:
+    """Decode some photos of a dataset, by name, in the dataset's coordinates.
+
+    Parameters and errors are those of `load_scene`. Names that the dataset lacks are left out.
+    """
+    dataset = _read_dataset(Path(path), config, verbose=False)
+    photos = by_faces(dataset.photos) if config.panoramas == "faces" else dataset.photos
+    chosen = [photo for photo in photos if photo.name in names]
+    return load_views(replace(dataset, photos=chosen), config, memory) if chosen else []
 
 
 def _without_hidden(train: list[View], test: list[View], path: Path) -> tuple[list[View], list[View]]:

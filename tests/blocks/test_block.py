@@ -18,11 +18,14 @@ from clsplat.blocks.parts import read_index, read_scene
 from clsplat.blocks.plan import REFINING_LENGTHS
 from clsplat.blocks.survey import seen_by_block
 from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
+from clsplat.config import DataConfig
+from clsplat.dataset import loading
+from clsplat.dataset.decoding import Dataset, load_views
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
 from clsplat.gaussians import Gaussians
-from clsplat.scene import DepthMap
+from clsplat.scene import DepthMap, View
 from clsplat.show.training_curve import read_log
 from clsplat.training.memory import Footprint
 
@@ -150,6 +153,23 @@ def test_other_photos(planned: Planned, device: Device, tmp_path: Path) -> None:
     planned.jobs[0].write_text(json.dumps(content))
     with pytest.raises(InputError, match="expected the photos that the block was planned with, found other pixels"):
         train_block(planned.jobs[0], None, device)
+
+
+def test_only_the_photos_of_a_block_are_decoded(
+    planned: Planned, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a whole town would take memory and time in each process. Processes share the memory for photos."""
+    read: list[tuple[set[str], int]] = []
+
+    def noted(dataset: Dataset, config: DataConfig, memory: int) -> list[View]:
+        read.append(({photo.name for photo in dataset.photos}, memory))
+        return load_views(dataset, config, memory)
+
+    monkeypatch.setattr(loading, "load_views", noted)
+    train_block(planned.jobs[0], device=device)
+    train_block(planned.jobs[1], device=device, beside=4)
+    assert [names for names, _ in read] == [set(read_job(job).photos) for job in planned.jobs]
+    assert read[1][1] == read[0][1] // 4
 
 
 DAMAGE = {
