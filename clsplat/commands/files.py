@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import tyro
 
 from clsplat.commands import console
@@ -19,7 +20,7 @@ from clsplat.commands.console import (
     say,
     say_cameras,
 )
-from clsplat.commands.options import PageOptions
+from clsplat.commands.options import PageOptions, PlaceOptions
 from clsplat.commands.run_folders import is_run, read_run, scene_file, with_run
 from clsplat.config import Mode, SfmConfig, TrainConfig
 from clsplat.errors import InputError
@@ -87,6 +88,7 @@ class Export:
     spz_axes: Axes | None = None
     """Axes of the .spz that is written, or of the one that is read if none is written: right, up, back as specified,
     or right, down, forward as in a PLY, which splat-transform writes. Default: as specified, or as the file says."""
+    place: Annotated[PlaceOptions, tyro.conf.arg(name="")] = field(default_factory=PlaceOptions)
     data: Annotated[Path | None, tyro.conf.arg(metavar="DATASET")] = None
     """For a web page: dataset, as for `train`. Its first photo is the first view, and its cameras determine the
     upward direction. Default: the dataset of the run."""
@@ -111,9 +113,13 @@ class Export:
         if self.spz_axes is not None and not (to_spz or from_spz):
             raise InputError(f"--spz-axes: expected an .spz to read or to write, found {scene} and {out}")
         if levels:
+            if self.place != PlaceOptions():
+                raise InputError(
+                    "--scale, --rotate, --move: expected a file to write, found levels of detail; export a .ply first"
+                )
             self._levels(scene, out)
             return
-        gaussians, mode, offset = self._load(scene, from_spz and not to_spz)
+        gaussians, mode, offset = self._placed(*self._load(scene, from_spz and not to_spz))
         if out.suffix.lower() == ".html":
             self._page(out, gaussians, mode, offset)
         elif to_spz:
@@ -129,6 +135,18 @@ class Export:
         from clsplat.formats.spz import load_spz
 
         return load_spz(scene, self.spz_axes) if turn else load_gaussians(scene)
+
+    def _placed(self, gaussians: "Gaussians", mode: Mode, offset: Any) -> "tuple[Gaussians, Mode, Any]":
+        """The scene in its new place. The offset, from which far coordinates are measured, is scaled and turned."""
+        from scipy.spatial.transform import Rotation
+
+        from clsplat.formats.axes import placed
+
+        if self.place == PlaceOptions():
+            return gaussians, mode, offset
+        turn = Rotation.from_euler("xyz", self.place.rotate, degrees=True).as_matrix()
+        scale = self.place.scale
+        return placed(gaussians, scale, turn, np.array(self.place.move)), mode, scale * turn @ np.asarray(offset)
 
     def _levels(self, file: Path, out: Path) -> None:
         """Write levels of detail; those of a run with its dataset are refined against its photos. A PLY without
@@ -202,7 +220,7 @@ class Export:
         from clsplat.show.web_page import save_page
 
         views = []
-        if self.data is not None:
+        if self.data is not None and self.place == PlaceOptions():  # its cameras are in the scene's first place
             scene = load_scene(self.data, self.data_config)
             gaussians, views = moved(gaussians, offset - scene.offset), scene.train + scene.test
         start = first_photo([view.camera for view in views]) if views else overview(gaussians)

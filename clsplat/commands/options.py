@@ -48,6 +48,18 @@ class DrawOptions(RenderConfig):
 
 
 @dataclass(frozen=True)
+class PlaceOptions:
+    """Another place of a scene that is exported: it is scaled, then turned, then moved."""
+
+    scale: Annotated[float, within(above=0)] = 1.0
+    """Factor on all lengths, for example to metres."""
+    rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Angles about the axes x, y and z, degrees; the scene is turned about x first. 180 0 0 turns it upside down."""
+    move: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Distances along x, y and z, in units of the scaled scene."""
+
+
+@dataclass(frozen=True)
 class ServerOptions:
     """Settings of the viewer's server."""
 

@@ -1,4 +1,4 @@
-"""Rotations of whole scenes: the axes of a format in place of those of a PLY, and poses that a file declares.
+"""Whole scenes in another place: the axes of a format in place of those of a PLY, and poses that a file declares.
 
 The axes of a PLY from photogrammetry are right, down, forward.
 """
@@ -66,4 +66,15 @@ def rotated(gaussians: Gaussians, rotation: Array) -> Gaussians:
         means=(gaussians.means @ rotation.T).astype(dtype),
         quats=np.roll(turn.as_quat(), 1, axis=1).astype(dtype),
         sh=np.einsum("kl,nlc->nkc", matrix, gaussians.sh).astype(dtype),
+    )
+
+
+def placed(gaussians: Gaussians, scale: float, rotation: Array, translation: Array) -> Gaussians:
+    """The Gaussians after x -> scale R x + t, with the rotation R (3, 3) and the translation t (3,)."""
+    result = rotated(gaussians, rotation)
+    dtype = gaussians.means.dtype
+    return replace(
+        result,
+        means=(scale * result.means.astype(np.float64) + translation).astype(dtype),
+        log_scales=(result.log_scales + np.log(scale)).astype(dtype),
     )

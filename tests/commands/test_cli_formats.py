@@ -1,12 +1,17 @@
 """Files of Gaussians on the command line: axes and versions of .spz, formats with one side, folders of scenes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bounds import BOUNDS, matched, random_gaussians
 from foreign_code import SCRIPTS
+from scipy.spatial.transform import Rotation
 
+from clsplat.camera import Camera
 from clsplat.cli import main
 from clsplat.formats import load_gaussians, save_gaussians
+from clsplat.render import render
 
 
 def run(*arguments):
@@ -84,3 +89,34 @@ def test_levels_of_a_run_are_refined_against_its_photos(trained, dataset, tmp_pa
     assert "level 1: " not in said.out + said.err, "a file knows no photos"
     found, merged = (load_gaussians(tmp_path / name)[0] for name in ("levels", "merged"))
     assert len(found) == len(merged), "the finest level is the scene"
+
+
+def test_a_scene_in_another_place_has_the_same_image(scene, tmp_path, capsys):
+    """From a camera that has moved with it; with a shear or an untouched harmonic the images would differ."""
+    run("export", scene, tmp_path / "b.ply", "--scale", 2.5, "--rotate", 20, -30, 50, "--move", 3, -1, 0.5)
+    camera = Camera.look_at([0.3, -0.5, -9], [0, 0, 0], [0, -1, 0], 60, 64, 48)
+    turn = Rotation.from_euler("xyz", (20, -30, 50), degrees=True).as_matrix()
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = turn.T, -turn.T @ [3, -1, 0.5]  # back to the first place, still scaled
+    viewmat = camera.viewmat.copy()
+    viewmat[:3, 3] *= 2.5
+    before, after = (load_gaussians(tmp_path / name)[0] for name in ("scene.ply", "b.ply"))
+    seen = render(before, camera, device="reference").rgb
+    moved = render(after, replace(camera, viewmat=viewmat @ motion), device="reference").rgb
+    assert seen.std() > 0.05
+    np.testing.assert_allclose(moved, seen, atol=2e-4)  # the file's coordinates are in single precision
+
+
+def test_the_offset_of_a_scene_is_turned_and_scaled(tmp_path):
+    gaussians = random_gaussians(50, 1)
+    save_gaussians(tmp_path / "far.ply", gaussians, offset=np.array([1000.0, 0.0, 0.0]))
+    run("export", tmp_path / "far.ply", tmp_path / "b.ply", "--scale", 2, "--rotate", 0, 0, 90)
+    found, _, offset = load_gaussians(tmp_path / "b.ply")
+    np.testing.assert_allclose(offset, [0, 2000, 0], atol=1e-9)
+    np.testing.assert_allclose(found.means, 2 * gaussians.means[:, [1, 0, 2]] * [-1, 1, 1], rtol=1e-6, atol=1e-5)
+
+
+def test_levels_are_not_moved(scene, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        run("export", scene, tmp_path / "levels", "--scale", 2)
+    assert "--scale, --rotate, --move: expected a file to write" in capsys.readouterr().err
