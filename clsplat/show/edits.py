@@ -54,15 +54,13 @@ class Edits:
     ----------
     kept, selected : (N,) bool
         Gaussians that are not deleted, and those of them that are selected.
-    region : Region or None
-        Only what is inside is shown and saved.
     """
 
     def __init__(self, gaussians: Gaussians):
         self._all = gaussians
         self.kept: Mask = np.ones(len(gaussians), bool)
         self.selected: Mask = np.zeros(len(gaussians), bool)
-        self.region: Region | None = None
+        self._region: Region | None = None
         self._history: list[NDArray[np.uint8]] = []
 
     def __len__(self) -> int:
@@ -73,8 +71,18 @@ class Edits:
         """Number of deletions that can be undone."""
         return len(self._history)
 
+    @property
+    def region(self) -> Region | None:
+        """Region outside which nothing is shown, selected or saved; None without one."""
+        return self._region
+
+    @region.setter
+    def region(self, region: Region | None) -> None:
+        self._region = region
+        self.selected = self._inside(self.selected)
+
     def _inside(self, mask: Mask) -> Mask:
-        return mask if self.region is None else mask & self.region.holds(self._all.means)
+        return mask if self._region is None else mask & self._region.holds(self._all.means)
 
     def _visible(self) -> Mask:
         return self._inside(self.kept)
@@ -137,7 +145,7 @@ class Edits:
         """Bring back what was deleted last, selected."""
         if self._history:
             before = np.unpackbits(self._history.pop(), count=len(self._all)).astype(bool)
-            self.selected, self.kept = before & ~self.kept, before
+            self.selected, self.kept = self._inside(before & ~self.kept), before
 
     def result(self) -> Gaussians:
         """The Gaussians that are neither deleted nor outside the region.

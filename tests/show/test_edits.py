@@ -96,6 +96,20 @@ def test_all_in_the_region_cannot_be_deleted():
     assert edits.delete() == 24 and len(edits) == 64 - 24
 
 
+def test_what_a_region_hides_is_not_selected():
+    """Otherwise a deletion would remove what nobody sees."""
+    edits = Edits(grid())
+    edits.select_rectangle(CAMERA, (-9.0, -9.0), (9.0, 9.0))
+    edits.region = Region("box", (0, 0, 0), (0, 2, 3))
+    assert edits.selected.sum() == 3 * 4
+    edits.region = Region("box", (0, 0, 0), (1, 2, 3))
+    assert edits.delete() == 3 * 4 and len(edits) == 3 * 4
+    edits.region = Region("box", (0, 0, 0), (0, 0, 3))
+    edits.region = None
+    edits.undo()
+    assert len(edits) == 64 and edits.selected.sum() == 3 * 4
+
+
 @pytest.mark.parametrize(
     ("region", "count"),
     [(Region("box", (0, 0, 0), (1, 2, 3)), 2 * 3 * 4), (Region("sphere", (0, 0, 0), (1, 9, 9)), 4)],
