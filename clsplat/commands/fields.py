@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.commands.console import say, say_scores, write_json
-from clsplat.commands.run_folders import CONFIG
+from clsplat.commands.run_folders import CONFIG, extracted
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
 from clsplat.training.presets import DATA_PATH
@@ -58,7 +58,7 @@ def train_and_evaluate(
 
     kind = METHODS[method]
     config = replace(config, iterations=config.iterations or kind.iterations)
-    scene = load_scene(data, replace(config.data, random_background=True))
+    scene = load_scene(extracted(data, out), replace(config.data, random_background=True))
     need = sum(3 * view.camera.width * view.camera.height for view in scene.train + scene.test)
     if (budget := photo_budget(None)) is not None and need > budget:
         raise InputError(

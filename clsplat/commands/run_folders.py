@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from clsplat.commands.console import warn
+from clsplat.commands.console import say, warn
 from clsplat.commands.options import CameraOptions, PhotoOptions
 from clsplat.config import DataConfig, RenderConfig, TrainConfig
 from clsplat.errors import InputError
@@ -36,14 +36,30 @@ def read_run(folder: Path) -> Run:
     InputError
         If config.json cannot be read.
     """
-    from clsplat.dataset.video import is_video
     from clsplat.training.presets import DATA_PATH, load_config, read_settings
 
     named = read_settings(folder / CONFIG).get(DATA_PATH)
     if not isinstance(named, str):
         return Run(None, load_config(folder / CONFIG))
     data = folder / named  # a dataset within the folder of the run moves with it
-    return Run(folder / FRAMES if is_video(data) else data, load_config(folder / CONFIG))
+    return Run(photos_of(data, folder), load_config(folder / CONFIG))
+
+
+def photos_of(data: Path, folder: Path) -> Path:
+    """The photos of a run: its dataset, or if that is a video, the folder of the frames extracted from it."""
+    from clsplat.dataset.video import is_video
+
+    return folder / FRAMES if is_video(data) else data
+
+
+def extracted(data: Path, folder: Path) -> Path:
+    """The photos of a run; those of a video are extracted, unless they are there already."""
+    from clsplat.dataset.video import extract_frames
+
+    photos = photos_of(data, folder)
+    if photos != data:
+        say(f"{photos}: {extract_frames(data, photos)} frames of {data.name}")
+    return photos
 
 
 def scene_file(path: Path) -> Path:

@@ -24,7 +24,7 @@ from clsplat.commands.console import (
 )
 from clsplat.commands.options import ClusterOptions, ServerOptions
 from clsplat.commands.progress import train_with_progress
-from clsplat.commands.run_folders import CONFIG, FRAMES, SCENE
+from clsplat.commands.run_folders import CONFIG, SCENE, extracted, photos_of
 from clsplat.commands.viewing import open_viewer
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
@@ -147,7 +147,7 @@ class Train:
 
         if config.blocks != 1:
             renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
-            if stored := train_in_blocks(scene, config, renderer, self._photos(out), out, self.cluster):
+            if stored := train_in_blocks(scene, config, renderer, photos_of(self.data, out), out, self.cluster):
                 self._began(out)()
                 report(stored, scene, config, renderer, out)
                 return None
@@ -160,14 +160,9 @@ class Train:
 
         def draw() -> None:
             if not self.resume:
-                picture_cameras(self._photos(out), out / "cameras.png")
+                picture_cameras(photos_of(self.data, out), out / "cameras.png")
 
         return draw
-
-    def _photos(self, out: Path) -> Path:
-        from clsplat.dataset.video import is_video
-
-        return out / FRAMES if is_video(self.data) else self.data
 
     def prepared(self, out: Path, device: "Device", viewer: "Viewer | None") -> "tuple[Scene, TrainConfig]":
         """Prepare scene and configuration, and check that they fit the device.
@@ -175,7 +170,6 @@ class Train:
         The configuration is written to `out`, unless a run resumes: it keeps the one that it was started with, and
         `train` compares them.
         """
-        from clsplat.dataset.video import extract_frames
         from clsplat.training.checkpoint import demand_same
         from clsplat.training.loop import check
         from clsplat.training.preparation import prepare
@@ -185,11 +179,9 @@ class Train:
             if viewer:
                 viewer.wait(text)
 
-        data = self._photos(out)
         if viewer:
             viewer.wait("reading the photos, and recovering their cameras if they have none")
-        if data != self.data:
-            say(f"{data}: {extract_frames(self.data, data)} frames of {self.data.name}")
+        data = extracted(self.data, out)
         scene, config = prepare(
             data,
             self.settings,

@@ -1,6 +1,7 @@
 """`clsplat train --method` and `clsplat bench quality --methods` with radiance fields, on a tiny dataset."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from small_fields import SmallIngp
 
 from clsplat.bench.measures import sample_iterations
 from clsplat.bench.results import read_records
+from clsplat.commands.run_folders import read_run
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene
 from clsplat.fields import METHODS
@@ -47,6 +49,21 @@ def test_a_run_is_not_overwritten_but_resumes(dataset, tmp_path, capsys):
     assert "holds a run already" in fails(capsys, "train", dataset, "-o", tmp_path, "--method", "ingp-base")
     train(dataset, tmp_path, "--resume")
     assert (tmp_path / "field.npz").read_bytes() == before
+
+
+def test_a_field_trains_on_the_frames_of_a_video(dataset, tmp_path, monkeypatch, capsys):
+    def extract_frames(video, folder):
+        shutil.copytree(dataset, folder, dirs_exist_ok=True)
+        return 9
+
+    monkeypatch.setattr("clsplat.dataset.video.extract_frames", extract_frames)
+    video = tmp_path / "film.mp4"
+    video.touch()
+    train(video, tmp_path / "run")
+    assert f"{tmp_path / 'run' / 'frames'}: 9 frames of film.mp4" in capsys.readouterr().err
+    assert (tmp_path / "run" / "field.npz").is_file()
+    assert read_run(tmp_path / "run").data == tmp_path / "run" / "frames"
+    train(video, tmp_path / "run", "--resume")
 
 
 def test_settings_of_gaussians_are_refused(dataset, tmp_path, capsys):
