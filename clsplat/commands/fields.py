@@ -17,7 +17,7 @@ from clsplat.training.presets import DATA_PATH
 if TYPE_CHECKING:
     from clsplat.device import Device
     from clsplat.fields import Field
-    from clsplat.scene import View
+    from clsplat.scene import Scene, View
 
 COUNTED = ("iterations", "seed", "checkpoint_every", "eval_every", "device", "memory_limit", "data")
 """Settings that count for a field."""
@@ -32,6 +32,27 @@ def check_settings(method: str, config: TrainConfig) -> None:
         raise InputError(
             f"--method {method}: expected no settings of Gaussians, found {', '.join(others)}; leave them out"
         )
+
+
+def check_photos(data: Path, scene: "Scene", config: TrainConfig) -> None:
+    """Raise an InputError if the decoded photos of a scene exceed the memory for them."""
+    from clsplat.streaming import photo_budget
+    from clsplat.training.memory import bytes_text
+    from clsplat.training.preparation import photo_memory
+
+    need = sum(3 * view.camera.width * view.camera.height for view in scene.train + scene.test)
+    budget = photo_budget(photo_memory(config))
+    if budget is None or need <= budget:
+        return
+    if config.memory_limit is not None:
+        raise InputError(
+            f"--memory-limit: expected at least {bytes_text(need)} for the photos, as a field trains on all pixels "
+            f"at once, found {bytes_text(budget)}; raise it or --downscale"
+        )
+    raise InputError(
+        f"{data}: expected photos that fit {bytes_text(budget)}, half of this machine, as a field trains on all "
+        f"pixels at once, found {bytes_text(need)}; use a higher --downscale"
+    )
 
 
 def images_of(field: "Field", views: "list[View]", config: TrainConfig) -> Iterator[NDArray[np.uint8]]:
@@ -53,18 +74,13 @@ def train_and_evaluate(
     from clsplat.fields import METHODS
     from clsplat.fields.field_files import MODEL
     from clsplat.fields.field_training import train_field
-    from clsplat.streaming import photo_budget
-    from clsplat.training.memory import bytes_text
+    from clsplat.training.preparation import photo_memory
 
     kind = METHODS[method]
     config = replace(config, iterations=config.iterations or kind.iterations)
-    scene = load_scene(extracted(data, out), replace(config.data, random_background=True))
-    need = sum(3 * view.camera.width * view.camera.height for view in scene.train + scene.test)
-    if (budget := photo_budget(None)) is not None and need > budget:
-        raise InputError(
-            f"{data}: expected photos that fit {bytes_text(budget)}, half of this machine, as a field trains "
-            f"on all pixels at once, found {bytes_text(need)}; use a higher --downscale"
-        )
+    photos = replace(config.data, random_background=True)
+    scene = load_scene(extracted(data, out), photos, memory=photo_memory(config))
+    check_photos(data, scene, config)
     if not resume:
         write_json(out / CONFIG, {DATA_PATH: str(data.resolve()), **asdict(config)})
     every = config.eval_every or config.iterations

@@ -66,6 +66,17 @@ def test_a_field_trains_on_the_frames_of_a_video(dataset, tmp_path, monkeypatch,
     train(video, tmp_path / "run", "--resume")
 
 
+def test_the_limit_of_memory_holds_for_the_photos(dataset, tmp_path, capsys, monkeypatch):
+    """Nine photos of 40x32; with enough memory for eight of them."""
+    enough = 8 * 3 * 40 * 32
+    flags = ["train", dataset, "-o", tmp_path / "run", "--method", "ingp-base"]
+    assert "clsplat: --memory-limit: expected at least 0.0 MB for the photos, as a field trains on all pixels" in (
+        fails(capsys, *flags, "--memory-limit", f"{enough / 1e6}MB")
+    )
+    monkeypatch.setattr("clsplat.streaming.physical_memory", lambda: 2 * enough)
+    assert f"clsplat: {dataset}: expected photos that fit 0.0 MB, half of this machine" in fails(capsys, *flags)
+
+
 def test_settings_of_gaussians_are_refused(dataset, tmp_path, capsys):
     def message(*flags, out=tmp_path / "run"):
         return fails(capsys, "train", dataset, "-o", out, "--method", "ingp-base", *flags)
