@@ -12,7 +12,7 @@ from clsplat.commands.console import say, say_scores, write_json
 from clsplat.commands.run_folders import CONFIG, extracted
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
-from clsplat.training.presets import DATA_PATH
+from clsplat.training.presets import DATA_PATH, METHOD
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -82,7 +82,7 @@ def train_and_evaluate(
     scene = load_scene(extracted(data, out), photos, memory=photo_memory(config))
     check_photos(data, scene, config)
     if not resume:
-        write_json(out / CONFIG, {DATA_PATH: str(data.resolve()), **asdict(config)})
+        write_json(out / CONFIG, {DATA_PATH: str(data.resolve()), METHOD: method, **asdict(config)})
     every = config.eval_every or config.iterations
 
     def evaluated(field: "Field") -> dict[str, Any]:

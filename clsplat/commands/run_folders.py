@@ -2,25 +2,30 @@
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 from clsplat.commands.console import say, warn
 from clsplat.commands.options import CameraOptions, PhotoOptions
 from clsplat.config import DataConfig, RenderConfig, TrainConfig
 from clsplat.errors import InputError
+from clsplat.ranges import checked, name_in
 
 CONFIG, SCENE, FRAMES = "config.json", "scene.ply", "frames"
 """Files of a run: its settings and its scene; and the folder of a video's photos."""
+
+MethodName = Annotated[str, name_in("clsplat.fields:method_names")]
+"""Type of the flag --method."""
 
 Command = TypeVar("Command")
 Part = TypeVar("Part", bound=DataConfig | RenderConfig)
 
 
 class Run(NamedTuple):
-    """A folder that `train` wrote: dataset, if config.json names it, and settings."""
+    """A folder that `train` wrote: dataset and radiance field, if config.json names them, and settings."""
 
     data: Path | None
     config: TrainConfig
+    method: str | None = None
 
 
 def is_run(path: Path) -> bool:
@@ -36,13 +41,29 @@ def read_run(folder: Path) -> Run:
     InputError
         If config.json cannot be read.
     """
-    from clsplat.training.presets import DATA_PATH, load_config, read_settings
+    return read_config(folder / CONFIG)
 
-    named = read_settings(folder / CONFIG).get(DATA_PATH)
-    if not isinstance(named, str):
-        return Run(None, load_config(folder / CONFIG))
-    data = folder / named  # a dataset within the folder of the run moves with it
-    return Run(photos_of(data, folder), load_config(folder / CONFIG))
+
+def read_config(file: Path) -> Run:
+    """Read the config.json of a run, or a file of settings in the same form; errors as of `load_config`."""
+    from clsplat.training.presets import DATA_PATH, METHOD, config_in, read_settings
+
+    settings = read_settings(file)
+    named, method = settings.get(DATA_PATH), None
+    if METHOD in settings:
+        method = checked(settings[METHOD], MethodName, f"{file}: {METHOD}")
+    # A dataset within the folder of the run moves with it.
+    data = photos_of(file.parent / named, file.parent) if isinstance(named, str) else None
+    return Run(data, config_in(settings, file), method)
+
+
+def check_method(folder: Path, method: str) -> None:
+    """Raise an InputError if the run in a folder, which is to resume, trains something else."""
+    from clsplat.training.presets import METHOD, read_settings
+
+    began = read_settings(folder / CONFIG).get(METHOD, "gaussians") if is_run(folder) else method
+    if method != began:
+        raise InputError(f"--method: expected {began}, with which the run in {folder} began, found {method}")
 
 
 def photos_of(data: Path, folder: Path) -> Path:
@@ -68,11 +89,16 @@ def scene_file(path: Path) -> Path:
     Raises
     ------
     InputError
-        If the run has none yet.
+        If the run has none yet, or is one of a radiance field.
     """
     if not is_run(path):
         return path
     if not (path / SCENE).is_file():
+        if method := read_run(path).method:
+            raise InputError(
+                f"{path}: expected a run of Gaussians, found one of the radiance field {method}, of which only train "
+                "and info know"
+            )
         raise InputError(
             f"{path}: expected a finished run, found no {SCENE} in it; it is in progress, or --resume finishes it"
         )

@@ -24,11 +24,18 @@ from clsplat.commands.console import (
 )
 from clsplat.commands.options import ClusterOptions, ServerOptions
 from clsplat.commands.progress import train_with_progress
-from clsplat.commands.run_folders import CONFIG, SCENE, extracted, photos_of
+from clsplat.commands.run_folders import (
+    CONFIG,
+    SCENE,
+    MethodName,
+    check_method,
+    extracted,
+    photos_of,
+    read_config,
+)
 from clsplat.commands.viewing import open_viewer
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
-from clsplat.ranges import name_in
 from clsplat.training.presets import DATA_PATH, PRESETS, load_config, load_preset
 
 if TYPE_CHECKING:
@@ -50,7 +57,7 @@ class Train:
     out: Out
     """Folder for the scene, its evaluation, checkpoint and log; or a file of Gaussians, such as scene.spz, which is
     written as well; its name without the suffix becomes the folder."""
-    method: Annotated[str, name_in("clsplat.fields:method_names")] = "gaussians"
+    method: MethodName = "gaussians"
     """Gaussians or a radiance field. A field has only these settings: --iterations, --seed, those of the photos, of
     evaluations and of checkpoints, --device and --memory-limit."""
     resume: bool = False
@@ -71,7 +78,10 @@ class Train:
             raise InputError("--preset and --config: expected one of them, found both")
         if self.preset is not None:
             return replace(self, settings=load_preset(self.preset))
-        return None if self.config is None else replace(self, settings=load_config(self.config))
+        if self.config is None:
+            return None
+        given = read_config(self.config)
+        return replace(self, method=given.method or self.method, settings=given.config)
 
     def run(self) -> None:
         """Run the command."""
@@ -85,6 +95,8 @@ class Train:
             check_writable(self.out)
         if self.resume and not began(out):
             raise no_checkpoint(out)
+        if self.resume:
+            check_method(out, self.method)
         if self.method != "gaussians":
             train_method(self, out, suffix)
             return

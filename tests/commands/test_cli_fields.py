@@ -51,6 +51,43 @@ def test_a_run_is_not_overwritten_but_resumes(dataset, tmp_path, capsys):
     assert (tmp_path / "field.npz").read_bytes() == before
 
 
+def test_commands_for_gaussians_say_that_a_run_has_none(dataset, tmp_path, capsys):
+    train(dataset, tmp_path)
+    message = f"clsplat: {tmp_path}: expected a run of Gaussians, found one of the radiance field ingp-base"
+    for command in (["export", tmp_path, tmp_path / "a.spz"], ["eval", tmp_path], ["render", tmp_path]):
+        assert fails(capsys, *command).startswith(message)
+
+
+def test_its_configuration_trains_the_same_field(dataset, tmp_path, capsys):
+    first, again = tmp_path / "first", tmp_path / "again"
+    train(dataset, first, "--seed", 3)
+    run("train", dataset, "-o", again, "--config", first / "config.json")
+    for name in ("config.json", "field.npz"):
+        assert (again / name).read_bytes() == (first / name).read_bytes()
+    # Flags override the file, and Gaussians do not train with the settings of a field unless told to.
+    flags = ["train", dataset, "-o", tmp_path / "other", "--config", first / "config.json"]
+    assert "expected no settings of Gaussians" in fails(capsys, *flags, "--poses")
+    run(*flags, "--method", "gaussians", "--iterations", 1, "--init.random-points", 50, "--eval-every", 0)
+    assert (tmp_path / "other" / "scene.ply").is_file()
+    bench = ["bench", "quality", dataset, "-o", tmp_path / "bench", "--methods", first / "config.json"]
+    assert f"{first / 'config.json'}: method: expected settings of Gaussians" in fails(capsys, *bench)
+    settings = json.loads((first / "config.json").read_text())
+    (tmp_path / "damaged.json").write_text(json.dumps(settings | {"method": "nerd"}))
+    damaged = fails(capsys, "train", dataset, "-o", tmp_path / "new", "--config", tmp_path / "damaged.json")
+    assert f"{tmp_path / 'damaged.json'}: method: expected one of gaussians, nerf" in damaged
+
+
+def test_a_run_resumes_with_its_own_method(dataset, trained, tmp_path, capsys):
+    train(dataset, tmp_path)
+    message = "clsplat: --method: expected {}, with which the run in {} began, found {}"
+    assert fails(capsys, "train", dataset, "-o", tmp_path, "--resume") == (
+        message.format("ingp-base", tmp_path, "gaussians")
+    )
+    assert fails(capsys, "train", dataset, "-o", trained, "--resume", "--method", "nerf") == (
+        message.format("gaussians", trained, "nerf")
+    )
+
+
 def test_a_field_trains_on_the_frames_of_a_video(dataset, tmp_path, monkeypatch, capsys):
     def extract_frames(video, folder):
         shutil.copytree(dataset, folder, dirs_exist_ok=True)

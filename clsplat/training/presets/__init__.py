@@ -26,6 +26,9 @@ YAML = (".yaml", ".yml")
 DATA_PATH = "data_path"
 """Key in config.json for the path of the dataset, which is not a part of the configuration."""
 
+METHOD = "method"
+"""Key in config.json for the name of the radiance field, in the runs of fields; not a part of the configuration."""
+
 Settings = TypeVar("Settings")
 
 
@@ -54,11 +57,22 @@ def load_config(path: Path) -> TrainConfig:
     ------
     InputError
         If the file cannot be read or is not an object of settings, if `TrainConfig` has no such setting, or if a
-        value has another type, is not among its choices or is out of range; the message names file and setting.
+        value has another type, is not among its choices or is out of range; the message names file and setting. If
+        the settings are those of a radiance field.
     """
     settings = read_settings(path)
-    settings.pop(DATA_PATH, None)
-    return with_settings(TrainConfig(), settings, str(path))
+    if METHOD in settings:
+        raise InputError(
+            f"{path}: {METHOD}: expected settings of Gaussians, which have none, found {shown(settings[METHOD])}; "
+            "give the config.json of a run of Gaussians"
+        )
+    return config_in(settings, path)
+
+
+def config_in(settings: dict[str, Any], path: Path) -> TrainConfig:
+    """Make the configuration of the settings in a file; errors as of `load_config`, but a field may have them."""
+    own = {name: value for name, value in settings.items() if name not in (DATA_PATH, METHOD)}
+    return with_settings(TrainConfig(), own, str(path))
 
 
 def read_settings(path: Path) -> dict[str, Any]:
