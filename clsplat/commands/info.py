@@ -30,6 +30,10 @@ LOG_SIZE_MAX = 700.0
 """Largest magnitude of a logarithm that is drawn: exp(700) is a float64, exp(710) is not."""
 
 
+UNFINISHED = "none: the run is in progress or was interrupted; --resume finishes it"
+"""Description of the result of a run that has none yet."""
+
+
 @dataclass(frozen=True)
 class Info:
     """Describe a file of Gaussians, the folder of a run, or a dataset."""
@@ -83,8 +87,8 @@ def run_lines(folder: Path) -> list[str]:
     from clsplat.show.training_curve import read_log
 
     run = read_run(folder) if is_run(folder) else Run(None, TrainConfig())
-    last = read_log(folder / "log.jsonl")[-1]
-    rows = {"what": "a run of clsplat train"}
+    last = read_log(folder / "log.jsonl", ("iteration", "seconds"))[-1]
+    rows = {"what": f"a run of clsplat train --method {run.method}" if run.method else "a run of clsplat train"}
     if run.data is not None:
         rows["dataset"] = f"{run.data}{'' if run.data.exists() else ', missing'}"
     total = f" of {run.config.iterations:,}" if is_run(folder) else ""
@@ -93,12 +97,21 @@ def run_lines(folder: Path) -> list[str]:
     rows |= _scores(folder, last)
     if changed := flags_of(run.config, TrainConfig(iterations=run.config.iterations)):
         rows["settings"] = " ".join(changed)
+    if "num_gaussians" not in last:
+        return [str(folder), *_table(rows | _model(folder))]
     scene = folder / SCENE
     if not scene.is_file():
-        rows["Gaussians"] = f"{last['num_gaussians']:,}"
-        rows[SCENE] = "none: the run is in progress or was interrupted; --resume finishes it"
+        rows |= {"Gaussians": f"{last['num_gaussians']:,}", SCENE: UNFINISHED}
         return [str(folder), *_table(rows)]
     return [str(folder), *_table(rows), "", *scene_lines(scene)]
+
+
+def _model(folder: Path) -> dict[str, str]:
+    """Row of the file of a radiance field."""
+    from clsplat.fields.field_files import MODEL
+
+    file = folder / MODEL
+    return {MODEL: _size(file.stat().st_size) if file.is_file() else UNFINISHED}
 
 
 def _scores(folder: Path, last: Mapping[str, Any]) -> dict[str, str]:

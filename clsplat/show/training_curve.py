@@ -1,5 +1,6 @@
 """The training log as a chart."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,23 @@ KINDS = {"iteration": (int,), "num_gaussians": (int,), "seconds": NUMBER, "loss"
 """Types of the entries of a training log that are used."""
 
 
-def read_log(path: Path) -> list[dict[str, Any]]:
+def read_log(path: Path, needed: Collection[str] = ("iteration", "num_gaussians", "seconds")) -> list[dict[str, Any]]:
     """Read the records of a training log, in the order of the file.
 
     A last line without a line end is still being written and is ignored.
+
+    Parameters
+    ----------
+    path : Path
+    needed : collection of str
+        Entries of every record. The log of a radiance field has no num_gaussians.
 
     Raises
     ------
     InputError
         If the log cannot be read, is empty or has an invalid line.
     """
-    records = read_json_lines(path, "a record of training", KINDS, ("iteration", "num_gaussians", "seconds"))
+    records = read_json_lines(path, "a record of training", KINDS, needed)
     if not records:
         raise InputError(f"{path}: expected the records of a training run, found none")
     return records

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from cli_runs import fails, read_image, run
 from small_fields import SmallIngp
+from test_info import info
 
 from clsplat.bench.measures import sample_iterations
 from clsplat.bench.results import read_records
@@ -49,6 +50,16 @@ def test_a_run_is_not_overwritten_but_resumes(dataset, tmp_path, capsys):
     assert "holds a run already" in fails(capsys, "train", dataset, "-o", tmp_path, "--method", "ingp-base")
     train(dataset, tmp_path, "--resume")
     assert (tmp_path / "field.npz").read_bytes() == before
+
+
+def test_info_tells_the_method_and_what_was_found(dataset, tmp_path, capsys):
+    train(dataset, tmp_path, "--eval-every", 2, "--seed", 3)
+    found, _ = info(tmp_path, capsys)
+    assert found["what"] == "a run of clsplat train --method ingp-base" and found["dataset"] == str(dataset)
+    assert found["iterations"] == "4 of 4" and found["settings"] == "--seed 3 --eval-every 2"
+    assert found["field.npz"].endswith(" kB") and "held-out PSNR" in found and "Gaussians" not in found
+    (tmp_path / "field.npz").unlink()
+    assert "--resume" in info(tmp_path, capsys)[0]["field.npz"]
 
 
 def test_commands_for_gaussians_say_that_a_run_has_none(dataset, tmp_path, capsys):
