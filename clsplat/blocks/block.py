@@ -25,10 +25,11 @@ from clsplat.formats.ply import with_coefficients
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import without_invisible
 from clsplat.renderer import Renderer
+from clsplat.resuming import CHECKPOINT
 from clsplat.run_log import LOG
 from clsplat.scene import Scene, View
 from clsplat.streaming import Files, photo_budget
-from clsplat.training.checkpoint import CHECKPOINT, load_state
+from clsplat.training.checkpoint import load_state
 from clsplat.training.inputs import Inputs
 from clsplat.training.loop import complete
 from clsplat.training.memory import Footprint

@@ -20,7 +20,6 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.ranges import flags_of
 from clsplat.renderer import download, fetch
-from clsplat.resuming import CHECKPOINT as CHECKPOINT  # those who call load_state need it
 from clsplat.resuming import FREE
 from clsplat.scene import Scene
 from clsplat.training import photo_exposures, photo_poses

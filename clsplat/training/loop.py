@@ -12,13 +12,14 @@ from clsplat.errors import BuildError, DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import shown_by_any, without_invisible
 from clsplat.renderer import fetch
+from clsplat.resuming import CHECKPOINT
 from clsplat.run_log import LOG, log_file
 from clsplat.scene import Scene
 from clsplat.training.autosize.explanation import write_report
 from clsplat.training.autosize.reduction import without_useless_bands
 from clsplat.training.autosize.search import search_size
 from clsplat.training.autosize.validation import split
-from clsplat.training.checkpoint import CHECKPOINT, load_state, write_photos
+from clsplat.training.checkpoint import load_state, write_photos
 from clsplat.training.dense_start import first_points
 from clsplat.training.initialize import initialize
 from clsplat.training.inputs import Inputs
