@@ -224,9 +224,15 @@ def train_method(command: Train, out: Path, suffix: str) -> None:
     from clsplat.commands.fields import check_settings, train_and_evaluate
     from clsplat.training.run_folder import held
 
-    if suffix or command.viewer or command.server.open:
-        found = f"-o {command.out}" if suffix else "--viewer or --open"
-        raise InputError(f"--method {command.method}: expected a folder after -o and no viewer, found {found}")
+    refused = {
+        f"-o {command.out}": bool(suffix),
+        "--viewer or --open": command.viewer or command.server.open,
+        "--scheduler or --print-jobs": command.cluster != ClusterOptions(),
+    }
+    if found := [flags for flags, given in refused.items() if given]:
+        raise InputError(
+            f"--method {command.method}: expected a folder after -o, no viewer and no blocks, found {found[0]}"
+        )
     check_settings(command.method, command.settings)
     with held(out):
         check_new(out, command.resume)

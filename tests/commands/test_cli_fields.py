@@ -130,8 +130,10 @@ def test_settings_of_gaussians_are_refused(dataset, tmp_path, capsys):
         return fails(capsys, "train", dataset, "-o", out, "--method", "ingp-base", *flags)
 
     assert "found strategy, optim" in message("--strategy", "mcmc", "--optim.ssim-weight", "0.1")
-    assert "expected a folder after -o and no viewer" in message(out=tmp_path / "run.spz")
-    assert "expected a folder after -o and no viewer" in message("--viewer")
+    expected = "expected a folder after -o, no viewer and no blocks, found "
+    assert f"{expected}-o {tmp_path / 'run.spz'}" in message(out=tmp_path / "run.spz")
+    assert f"{expected}--viewer or --open" in message("--viewer")
+    assert f"{expected}--scheduler or --print-jobs" in message("--print-jobs")
     assert "expected one of gaussians, nerf, nerf-small, plenoxels" in fails(
         capsys, "train", dataset, "-o", tmp_path, "--method", "nerd"
     )
