@@ -112,6 +112,8 @@ class Export:
         to_spz, from_spz = (suffix_of(path) == ".spz" for path in (out, scene))
         if self.spz_axes is not None and not (to_spz or from_spz):
             raise InputError(f"--spz-axes: expected an .spz to read or to write, found {scene} and {out}")
+        if self.spz_version != 3 and not to_spz:
+            raise InputError(f"--spz-version: expected an .spz to write, found {out}")
         if levels:
             if self.place != PlaceOptions():
                 raise InputError(
@@ -137,7 +139,7 @@ class Export:
         return load_spz(scene, self.spz_axes) if turn else load_gaussians(scene)
 
     def _placed(self, gaussians: "Gaussians", mode: Mode, offset: Any) -> "tuple[Gaussians, Mode, Any]":
-        """The scene in its new place. The offset, from which far coordinates are measured, is scaled and turned."""
+        """The scene in its new place."""
         from scipy.spatial.transform import Rotation
 
         from clsplat.formats.axes import placed
@@ -145,8 +147,9 @@ class Export:
         if self.place == PlaceOptions():
             return gaussians, mode, offset
         turn = Rotation.from_euler("xyz", self.place.rotate, degrees=True).as_matrix()
-        scale = self.place.scale
-        return placed(gaussians, scale, turn, np.array(self.place.move)), mode, scale * turn @ np.asarray(offset)
+        move = np.array(self.place.move)
+        gaussians, offset = placed(gaussians, np.asarray(offset, float), self.place.scale, turn, move)
+        return gaussians, mode, offset
 
     def _levels(self, file: Path, out: Path) -> None:
         """Write levels of detail; those of a run with its dataset are refined against its photos. A PLY without

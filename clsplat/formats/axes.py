@@ -25,6 +25,10 @@ DIRECTIONS = 64
 """Number of directions from which the rotation of the spherical harmonics is computed: more than the 16 coefficients,
 so that the system is well conditioned."""
 
+FAR = 1000.0
+"""Distance of a scene from the origin, over its size, from which on it is kept in the offset: single precision
+resolves 6e-5 of the size there."""
+
 
 def turned(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
     """Turn a scene by half a turn about one axis, whose sign in `signs` is positive; twice is the identity, exactly.
@@ -59,22 +63,41 @@ def rotated(gaussians: Gaussians, rotation: Array) -> Gaussians:
     degree, dtype = gaussians.sh_degree, gaussians.means.dtype
     new, old = sh_basis(directions, degree), sh_basis(directions @ rotation, degree)
     matrix = np.linalg.lstsq(new, old, rcond=None)[0]
-    norms = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
-    turn = Rotation.from_matrix(rotation) * Rotation.from_quat(np.roll(gaussians.quats / norms, -1, axis=1))
+    quats = gaussians.quats.copy()
+    oriented = np.flatnonzero(quats.any(axis=1))  # others are not drawn
+    turn = Rotation.from_matrix(rotation) * Rotation.from_quat(np.roll(quats[oriented], -1, axis=1))
+    quats[oriented] = np.roll(turn.as_quat(), 1, axis=1)
     return replace(
         gaussians,
         means=(gaussians.means @ rotation.T).astype(dtype),
-        quats=np.roll(turn.as_quat(), 1, axis=1).astype(dtype),
+        quats=quats,
         sh=np.einsum("kl,nlc->nkc", matrix, gaussians.sh).astype(dtype),
     )
 
 
-def placed(gaussians: Gaussians, scale: float, rotation: Array, translation: Array) -> Gaussians:
-    """The Gaussians after x -> scale R x + t, with the rotation R (3, 3) and the translation t (3,)."""
-    result = rotated(gaussians, rotation)
-    dtype = gaussians.means.dtype
-    return replace(
-        result,
-        means=(scale * result.means.astype(np.float64) + translation).astype(dtype),
-        log_scales=(result.log_scales + np.log(scale)).astype(dtype),
-    )
+def placed(
+    gaussians: Gaussians, offset: Array, scale: float, rotation: Array, translation: Array
+) -> tuple[Gaussians, Array]:
+    """Place a scene elsewhere: x -> scale R x + t for the world coordinates x, which are the means plus the offset.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    offset, translation : (3,) float64
+    scale : float
+    rotation : (3, 3) float64
+
+    Returns
+    -------
+    gaussians : Gaussians
+    offset : (3,) float64
+        With the translation, if there was an offset, or if single precision would blur the scene there.
+    """
+    result, dtype, offset = rotated(gaussians, rotation), gaussians.means.dtype, scale * rotation @ offset
+    means = scale * result.means.astype(np.float64)
+    if offset.any() or np.linalg.norm(translation) > FAR * np.abs(means - means.mean(axis=0)).max():
+        offset = offset + translation
+    else:
+        means = means + translation
+    log_scales = (result.log_scales + np.log(scale)).astype(dtype)
+    return replace(result, means=means.astype(dtype), log_scales=log_scales), offset

@@ -128,6 +128,9 @@ def halved(gaussians: Gaussians) -> Gaussians:
     reduced mass.
     """
     target = -(-len(gaussians) // 2)
+    oriented = gaussians.quats.any(axis=1)
+    if oriented.any():  # others are not drawn, and would be once they are merged
+        gaussians = gaussians.take(np.flatnonzero(oriented))
     while len(gaussians) > target:
         pairs = neighbours(gaussians)
         rank = np.empty(len(pairs), np.intp)

@@ -40,9 +40,10 @@ AREA_POWER = 1.6075
 
 
 def covariances(gaussians: Gaussians) -> Array:
-    """Covariances in world units, (N, 3, 3) float64."""
+    """Covariances in world units, (N, 3, 3) float64; without an orientation, those of unturned Gaussians."""
     quats = gaussians.quats.astype(np.float64)
-    axes = rotations(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    axes = rotations(np.divide(quats, lengths, out=np.tile([1.0, 0, 0, 0], (len(quats), 1)), where=lengths > 0))
     axes = axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
     return np.asarray(axes @ axes.transpose(0, 2, 1))
 

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from clsplat.camera import Camera
 from clsplat.cli import main
 from clsplat.formats import load_gaussians, save_gaussians
+from clsplat.pruning.levels import halved
+from clsplat.pruning.merging import covariances
 from clsplat.render import render
 
 
@@ -114,6 +116,33 @@ def test_the_offset_of_a_scene_is_turned_and_scaled(tmp_path):
     found, _, offset = load_gaussians(tmp_path / "b.ply")
     np.testing.assert_allclose(offset, [0, 2000, 0], atol=1e-9)
     np.testing.assert_allclose(found.means, 2 * gaussians.means[:, [1, 0, 2]] * [-1, 1, 1], rtol=1e-6, atol=1e-5)
+
+
+def test_a_scene_that_moves_far_keeps_its_precision(tmp_path):
+    gaussians = random_gaussians(50, 1)
+    save_gaussians(tmp_path / "near.ply", gaussians)
+    run("export", tmp_path / "near.ply", tmp_path / "far.ply", "--move", 500000, 5400000, 0)
+    found, _, offset = load_gaussians(tmp_path / "far.ply")
+    np.testing.assert_array_equal(offset, [500000, 5400000, 0])
+    np.testing.assert_array_equal(found.means, gaussians.means)
+
+
+def test_gaussians_without_orientation_are_turned_and_merged(tmp_path):
+    """They are read as they are, and not drawn."""
+    gaussians = random_gaussians(200, 1)
+    gaussians.quats[::3] = 0
+    save_gaussians(tmp_path / "scene.ply", gaussians)
+    run("export", tmp_path / "scene.ply", tmp_path / "turned.ply", "--rotate", 0, 0, 90)
+    assert not load_gaussians(tmp_path / "turned.ply")[0].quats[::3].any()
+    halves = halved(load_gaussians(tmp_path / "scene.ply")[0])
+    assert len(halves) == 100 and np.isfinite(covariances(halves)).all() and halves.quats.any(axis=1).all()
+
+
+@pytest.mark.parametrize("flags", [("--spz-version", 4), ("--spz-axes", "rub")])
+def test_options_of_spz_need_one(flags, scene, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        run("export", scene, tmp_path / "out.sog", *flags)
+    assert f"{flags[0]}: expected an .spz to" in capsys.readouterr().err
 
 
 def test_levels_are_not_moved(scene, tmp_path, capsys):
