@@ -11,6 +11,7 @@ from clsplat.atomic import replacing
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.metrics import to_uint8
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
 
@@ -26,6 +27,12 @@ QUANTILE = 0.02
 SLAB = 16
 """Layers of voxels that are projected at once."""
 
+STEP = 1e-5
+"""Largest step of coordinates in a file, over the size of the mesh: a hundredth of one of 1000 voxels."""
+
+NO_SURFACE = "mesh: expected surfaces in the box, found none; see box and resolution"
+"""Message where no triangle can be made."""
+
 
 class Mesh(NamedTuple):
     """A triangle mesh: vertices (V, 3) in world units, faces (F, 3) int, and colors (V, 3) uint8, RGB."""
@@ -36,11 +43,11 @@ class Mesh(NamedTuple):
 
 
 class _View(NamedTuple):
-    """A camera with its image (H, W, 3) and its depths (H, W), 0 where there is no surface."""
+    """A camera with its image (H, W, 3) and its depths (H, W), 0 where there is no surface: seven bytes per pixel."""
 
     camera: Camera
-    rgb: NDArray[np.floating]
-    depth: Array
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
 
 
 def make_mesh(
@@ -83,11 +90,11 @@ def make_mesh(
         if camera.model != "pinhole":
             raise InputError(f"mesh: expected pinhole cameras, found one of model {camera.model}")
         rendering = next(renderings(renderer, gaussians, [camera], gradients=True))
-        views.append(_View(camera, rendering.rgb, rendering.surface().depth))
+        views.append(_View(camera, to_uint8(rendering.rgb), rendering.surface().depth.astype(np.float32)))
     low, high = box if box is not None else _box(views)
     corner, size = np.asarray(low, np.float64), np.asarray(high, np.float64) - np.asarray(low, np.float64)
     voxel = float(size.max()) / resolution
-    if not voxel > 0:
+    if not (size > 0).all():
         raise InputError(f"box: expected a box with a positive size, found {low} to {high}")
     shape = tuple(int(n) for n in np.maximum(np.ceil(size / voxel), 1) + 1)
     distances, colors = _fused(views, corner, voxel, (shape[0], shape[1], shape[2]))
@@ -120,7 +127,8 @@ def _fused(
     for first in range(0, shape[0], SLAB):
         x = corner[0] + voxel * np.arange(first, min(first + SLAB, shape[0]))
         points = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
-        total, weights, color = np.zeros(len(points)), np.zeros(len(points)), np.zeros((len(points), 3))
+        total, weights = np.zeros(len(points)), np.zeros(len(points))
+        color, coloured = np.zeros((len(points), 3)), np.zeros(len(points))
         for camera, rgb, depth in views:
             p = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
             front = p[:, 2] > camera.near_depth
@@ -137,11 +145,13 @@ def _fused(
             which, ahead = which[counts], np.minimum(ahead[counts], TRUNCATION)
             total[which] += ahead
             weights[which] += 1
-            color[which] += rgb[rows[counts], columns[counts]] * (np.abs(ahead) < TRUNCATION)[:, None]
+            shown = np.abs(ahead) < TRUNCATION
+            color[which] += rgb[rows[counts], columns[counts]] * shown[:, None]
+            coloured[which] += shown
         near = slice(first, first + len(x))
         with np.errstate(invalid="ignore"):
             distances[near] = (total / weights).reshape(-1, *shape[1:])
-        colors[near] = (color / np.maximum(weights, 1)[:, None]).reshape(-1, *shape[1:], 3)
+        colors[near] = (color / np.maximum(coloured, 1)[:, None]).reshape(-1, *shape[1:], 3)
     return distances, colors
 
 
@@ -154,19 +164,27 @@ def _zeros(distances: NDArray[np.float32], colors: NDArray[np.float32], corner: 
     # No triangle lies between what is seen and what is not.
     inside = binary_erosion(known, np.ones((3, 3, 3)), border_value=1)
     if not ((distances[inside] > 0).any() and (distances[inside] < 0).any()):
-        raise InputError("mesh: expected surfaces in the box, found none; see box and resolution")
-    vertices, faces, _, _ = marching_cubes(np.where(known, distances, np.float32(TRUNCATION)), 0.0, mask=inside)
+        raise InputError(NO_SURFACE)
+    try:
+        vertices, faces, _, _ = marching_cubes(np.where(known, distances, np.float32(TRUNCATION)), 0.0, mask=inside)
+    except RuntimeError as error:  # voxels in front of surfaces and behind them do not touch
+        raise InputError(NO_SURFACE) from error
     at = [map_coordinates(colors[..., k], vertices.T, order=1, mode="nearest") for k in range(3)]
-    rgb = np.rint(255 * np.clip(np.stack(at, axis=1), 0, 1)).astype(np.uint8)
+    rgb = np.rint(np.clip(np.stack(at, axis=1), 0, 255)).astype(np.uint8)
     return Mesh(corner + voxel * vertices.astype(np.float64), faces.astype(np.int64), rgb)
 
 
 def save_mesh(path: Path | str, mesh: Mesh) -> None:
-    """Write a mesh as a binary PLY file with colours, which MeshLab, Blender and others read."""
+    """Write a mesh as a binary PLY file with colours, which MeshLab, Blender and others read.
+
+    Coordinates have double precision where single precision would blur the mesh: far from the origin.
+    """
     from plyfile import PlyData, PlyElement
 
     names = ("x", "y", "z", "red", "green", "blue")
-    vertices = np.empty(len(mesh.vertices), [(name, "f4" if name in "xyz" else "u1") for name in names])
+    steps = np.spacing(np.abs(mesh.vertices).max(axis=0).astype(np.float32))
+    real = "f8" if (steps > STEP * np.ptp(mesh.vertices, axis=0).max()).any() else "f4"
+    vertices = np.empty(len(mesh.vertices), [(name, real if name in "xyz" else "u1") for name in names])
     for name, column in zip(names, (*mesh.vertices.T, *mesh.colors.T), strict=True):
         vertices[name] = column
     faces = np.empty(len(mesh.faces), [("vertex_indices", "i4", (3,))])

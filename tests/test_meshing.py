@@ -9,7 +9,7 @@ from plyfile import PlyData
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.meshing import make_mesh, save_mesh
+from clsplat.meshing import Mesh, _zeros, make_mesh, save_mesh
 from clsplat.renderer import Renderer
 
 
@@ -70,5 +70,30 @@ def test_meshes_need_pinholes_and_surfaces(device):
         make_mesh(faint, cameras, renderer)
     with pytest.raises(InputError, match="found none"):
         make_mesh(ball(), cameras, renderer, resolution=16, box=([5, 5, 5], [6, 6, 6]))
-    with pytest.raises(InputError, match="positive size"):
-        make_mesh(ball(), cameras, renderer, resolution=16, box=([5, 5, 5], [5, 5, 5]))
+    for high in ([5, 5, 5], [6, 4, 6]):
+        with pytest.raises(InputError, match="positive size"):
+            make_mesh(ball(), cameras, renderer, resolution=16, box=([5, 5, 5], high))
+
+
+def test_views_past_the_surface_do_not_darken_it(device):
+    """They show that space is free, and have no colour for it."""
+    cameras, past = around(), [Camera.look_at([3, 0, z], [0, 0, z], [0, 0, 1], 64, 64, 64) for z in (1.9, -1.9)]
+    colors = [
+        make_mesh(ball(), views, Renderer(device), resolution=32).colors.max(axis=1).astype(float)
+        for views in (cameras, cameras + 4 * past)
+    ]
+    assert colors[1].mean() == pytest.approx(colors[0].mean(), rel=0.02)
+
+
+def test_voxels_of_both_signs_that_do_not_touch():
+    distances = np.full((12, 12, 12), np.nan, np.float32)
+    distances[:5], distances[7:] = 1, -1
+    with pytest.raises(InputError, match="expected surfaces in the box, found none"):
+        _zeros(distances, np.zeros((12, 12, 12, 3), np.float32), np.zeros(3), 1.0)
+
+
+def test_a_mesh_far_from_the_origin_keeps_its_shape(tmp_path):
+    vertices = np.array([[0.01, 5.4e6, 0], [0.11, 5.4e6 + 0.3, 0], [0.31, 5.4e6 + 0.7, 1]])
+    save_mesh(tmp_path / "far.ply", Mesh(vertices, np.array([[0, 1, 2]]), np.zeros((3, 3), np.uint8)))
+    ply = PlyData.read(tmp_path / "far.ply")["vertex"]
+    np.testing.assert_array_equal(np.stack([ply[name] for name in "xyz"], axis=1), vertices)

@@ -28,7 +28,7 @@ class Mesh:
     resolution: Annotated[int, within(least=8, most=2048)] = 256
     """Voxels along the longest edge of the box. Memory and time grow with the cube of it."""
     box: Annotated[tuple[float, ...], within(least=-COORDINATE_MAX, most=COORDINATE_MAX)] = ()
-    """Smallest x, y and z and largest x, y and z of the mesh, in the scene's units: six numbers. Default: the box of
+    """Smallest x, y and z and largest x, y and z of the mesh, in world coordinates: six numbers. Default: the box of
     all surface points that the cameras see, except for the outermost fiftieth on each side."""
     device: DeviceName = None
     """Part of the name of the platform or device."""
