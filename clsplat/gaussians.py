@@ -137,5 +137,8 @@ class Gaussians:
 
     @staticmethod
     def concatenate(parts: list["Gaussians"]) -> "Gaussians":
-        """The rows of all parts, one after the other."""
-        return Gaussians(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in SHAPES})
+        """The rows of all parts, one after the other. Coefficients of the harmonics that some parts lack are zero."""
+        most = max(part.sh.shape[1] for part in parts)
+        arrays = {name: [getattr(part, name) for part in parts] for name in SHAPES}
+        arrays["sh"] = [np.pad(sh, ((0, 0), (0, most - sh.shape[1]), (0, 0))) for sh in arrays["sh"]]
+        return Gaussians(**{name: np.concatenate(values) for name, values in arrays.items()})

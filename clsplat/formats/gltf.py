@@ -199,10 +199,6 @@ class SplatDocument(GlbDocument):
         parts = [self.gaussians(primitive, matrix) for primitive, matrix in self.primitives()]
         if not parts:
             raise InputError(f"{self.path}: expected a primitive with {EXTENSION}, found none; is it a mesh?")
-        most = max(part.sh.shape[1] for part in parts)
-        for part in parts:
-            missing = ((0, 0), (0, most - part.sh.shape[1]), (0, 0))
-            part.sh = np.pad(part.sh, missing)
         whole = parts[0] if len(parts) == 1 else Gaussians.concatenate(parts)
         extras = self.json["asset"].get("extras")  # data of any application
         own = extras.get("clsplat", {}) if isinstance(extras, dict) else {}

@@ -174,6 +174,8 @@ def check_size(path: str | Path, header: PlyHeader) -> None:
 
 def _read_text(path: str | Path, file: BinaryIO, skip: int, count: int, names: list[str]) -> Array:
     """Read `count` rows of an ASCII file, after `skip` other rows, as a structured array of float64."""
+    if not count:  # NumPy would give the empty array one column
+        return np.empty(0, [(name, np.float64) for name in names])
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about empty lines; the shape is checked below

@@ -70,9 +70,6 @@ def load_streamed_sog(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.flo
             rows = np.concatenate([np.arange(first, first + count) for _, first, count in own])
             gaussians = gaussians.take(rows)
         parts.append(gaussians)
-    most = max(part.sh.shape[1] for part in parts)
-    for part in parts:
-        part.sh = np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))
     return Gaussians.concatenate(parts), "antialiased" if "antialiased" in modes else "classic", offsets[0]
 
 

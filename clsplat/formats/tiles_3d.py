@@ -11,6 +11,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -130,14 +131,11 @@ def load_tiles(path: str | Path) -> tuple[Gaussians, Mode, NDArray[np.float64]]:
     """
     folder, names = read_tileset(path)
     parts = [load_glb(folder / name) for name in names]
-    most = max(part[0].sh.shape[1] for part in parts)
-    for gaussians, _, _ in parts:
-        gaussians.sh = np.pad(gaussians.sh, ((0, 0), (0, most - gaussians.sh.shape[1]), (0, 0)))
     return Gaussians.concatenate([part[0] for part in parts]), parts[0][1], parts[0][2]
 
 
 def read_tileset(path: str | Path) -> tuple[Path, list[str]]:
-    """Read tileset.json; return its folder, and the names of the contents of the tiles without children.
+    """Read tileset.json; return its folder, and the names of the contents that the finest view shows.
 
     Raises
     ------
@@ -160,15 +158,19 @@ def read_tileset(path: str | Path) -> tuple[Path, list[str]]:
 
 
 def _finest(path: Path, root: dict[str, Any]) -> Iterator[str]:
-    waiting = [root]
+    """Names of the contents that the finest view shows: those of tiles without children, and of tiles whose children
+    are drawn in addition to them."""
+    waiting = [(root, "REPLACE")]
     while waiting:
-        tile = waiting.pop()
+        tile, inherited = waiting.pop()
         if "transform" in tile:
             raise InputError(f"{path}: expected tiles in one coordinate system, found a tile with a transform")
-        children = tile.get("children") or []
-        waiting += reversed(children)
-        if not children and "content" in tile:
-            name = tile["content"]["uri"]
+        refine, children = str(tile.get("refine", inherited)).upper(), tile.get("children") or []
+        waiting += [(child, refine) for child in reversed(children)]
+        if children and refine == "REPLACE":
+            continue
+        for content in [tile["content"]] if "content" in tile else tile.get("contents", []):
+            name = unquote(content["uri"])
             parts = PurePosixPath(name).parts
             if not parts or name.startswith("/") or ".." in parts or "\\" in name or ":" in name:
                 raise InputError(f"{path}: expected contents beside {TILESET}, found {name!r}")

@@ -23,6 +23,8 @@ def test_points_come_from_the_ply(root, binary):
     np.testing.assert_array_equal(dataset.colors, [[4, 5, 6], [255, 0, 7]])
     PlyData([PlyElement.describe(repack_fields(vertices[["x", "y", "z"]]), "vertex")]).write(root / "points.ply")
     np.testing.assert_array_equal(read_dataset(root, DataConfig()).colors, np.full((2, 3), 128))
+    PlyData([PlyElement.describe(vertices[:0], "vertex")], text=not binary).write(root / "points.ply")
+    assert read_dataset(root, DataConfig()).points.shape == (0, 3), "points are then triangulated"
     vertices["x"] = np.nan
     PlyData([PlyElement.describe(vertices, "vertex")]).write(root / "points.ply")
     with pytest.raises(InputError, match=r"points\.ply.*finite"):

@@ -146,6 +146,18 @@ def test_a_broken_tileset_is_one_sentence(written, case):
     assert len(str(caught.value).splitlines()) == 1
 
 
+def test_tiles_whose_children_add_to_them_are_read_too(tmp_path):
+    """And contents of a list, and names with escapes."""
+    parts = {"root a.glb": 50, "b.glb": 60, "c.glb": 7}
+    for seed, (name, count) in enumerate(parts.items()):
+        save_gaussians(tmp_path / name, random_gaussians(count, seed))
+    child = {"contents": [{"uri": "b.glb"}, {"uri": "c.glb"}]}
+    root = {"refine": "ADD", "content": {"uri": "root%20a.glb"}, "children": [child]}
+    for refine, count in (("ADD", 117), ("REPLACE", 67)):
+        (tmp_path / TILESET).write_text(json.dumps({"root": root | {"refine": refine}}))
+        assert len(load_gaussians(tmp_path / TILESET)[0]) == count
+
+
 def test_export_writes_levels(scene, tmp_path, capsys):
     save_gaussians(tmp_path / "a.ply", scene)
     run("export", tmp_path / "a.ply", tmp_path / "both")
