@@ -85,8 +85,10 @@ def build_options(real: DTypeLike, defines: dict[str, Any], language: str = BASE
     """Compiler options of a program for reals of the type `real`, float32 or float64."""
     double = np.dtype(real) == np.float64
     options = [language, *BUILD_OPTIONS, "-DUSE_DOUBLE" if double else "-cl-single-precision-constant"]
+    # NumPy's float64 is a float whose repr is np.float64(...).
     return options + [
-        f"-D{name}={value!r}" if isinstance(value, float) else f"-D{name}={value}" for name, value in defines.items()
+        f"-D{name}={float(value)!r}" if isinstance(value, float) else f"-D{name}={value}"
+        for name, value in defines.items()
     ]
 
 

@@ -1,7 +1,7 @@
 """`rasterization`: gsplat's function of that name on OpenCL, with its gradients."""
 
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, get_args
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +11,7 @@ from clsplat.constants import BLUR
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians, logit
 from clsplat.raster_gradients import Rasterization, RasterPass, on_host
-from clsplat.renderer import Renderer, default_device, download
+from clsplat.renderer import Renderer, download
 from clsplat.stages import AnySplats
 from clsplat.surface import surface_of
 
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 CAMERA_MODELS: dict[str, CameraModel] = {"pinhole": "pinhole", "ortho": "orthographic", "fisheye": "fisheye"}
 """gsplat's names of camera models, and ours."""
+
+_BLURRED: "WeakKeyDictionary[Device, Device]" = WeakKeyDictionary()
+"""The last result of `_blurred` for each device, as long as that lives: it holds the compiled kernels."""
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
@@ -131,7 +134,7 @@ def rasterization(
     channels = colors.shape[2] if sh_degree is None else 3
     behind = _behind(backgrounds, (count, channels))
 
-    renderer = Renderer(device if eps2d == BLUR else _blurred(device, eps2d))
+    renderer = _renderer(device, eps2d)
     placed, antialiased = renderer.place(gaussians), rasterize_mode == "antialiased"
     parts: list[tuple[RasterPass, dict[str, Any]]] = []
     for i, camera in enumerate(cameras):
@@ -183,15 +186,22 @@ def _clipped(renderer: Renderer, splats: AnySplats, radius_clip: float) -> AnySp
     return splats._replace(extents=renderer.upload("extents", extents * kept))
 
 
-@lru_cache(maxsize=4)
-def _blurred(device: Any, eps2d: float) -> Any:
-    """A device whose kernels add `eps2d` to the 2D covariances; it is kept, since it holds the compiled kernels."""
-    if not 0 < eps2d < float("inf") or device == "reference":
-        raise InputError(f"eps2d: expected a number above 0, on the reference {BLUR}, found {eps2d}")
-    from clsplat.device import Device
+def _renderer(device: "Device | Literal['reference'] | None", eps2d: float) -> Renderer:
+    """A renderer that adds `eps2d` to the 2D covariances."""
+    renderer = Renderer(device)
+    return renderer if eps2d == BLUR else Renderer(_blurred(renderer.device, eps2d))
 
-    device = device or default_device()
-    return Device(device.cl_device, device.real, device.memory_limit, {"BLUR": eps2d})
+
+def _blurred(device: "Device | None", eps2d: float) -> "Device":
+    """The same device with kernels that add `eps2d` to the 2D covariances."""
+    if device is None or not 0 < eps2d < float("inf"):
+        raise InputError(f"eps2d: expected a number above 0, on the reference {BLUR}, found {eps2d}")
+    if device not in _BLURRED or _BLURRED[device].model["BLUR"] != eps2d:
+        from clsplat.device import Device
+
+        model = device.model | {"BLUR": float(eps2d)}
+        _BLURRED[device] = Device(device.cl_device, device.real, device.memory_limit, model)
+    return _BLURRED[device]
 
 
 def _gaussians(means: Any, scales: ArrayLike, quats: ArrayLike, opacities: ArrayLike, sh: Any) -> Gaussians:

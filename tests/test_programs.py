@@ -120,6 +120,9 @@ class TestPrograms:
         with pytest.raises(cl.RuntimeError, match="must be passed as -D"):
             build(device.context, source, [option for option in whole if not option.startswith(f"-D{name}=")])
 
+    def test_values_of_numpy(self):
+        assert "-DBLUR=0.1" in build_options(np.float32, {"BLUR": np.float64(0.1)})
+
     def test_a_build_that_fails_with_subgroups_is_repeated_without(self, monkeypatch):
         """OpenCL C 1.2 does not declare their functions. The warning comes once, and the device runs without them."""
         device = Device()

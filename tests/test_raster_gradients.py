@@ -1,6 +1,8 @@
 """The gradients of rasterization against central differences, for features, harmonics, depths and cameras."""
 
+import gc
 from typing import Any
+from weakref import ref
 
 import numpy as np
 import pytest
@@ -146,13 +148,35 @@ def test_small_splats_are_clipped(given: dict[str, Any], device: Device) -> None
 def test_eps2d_is_the_variance_that_is_added(given: dict[str, Any], device64: Device) -> None:
     inputs = with_colors(given, 3)
     covariances = []
-    for eps2d in (0.3, 0.8):
+    for eps2d in (0.3, np.float64(0.8)):
         meta = rasterization(**inputs, eps2d=eps2d, device=device64).meta
         xx, xy, yy = meta["conics"][0][meta["radii"][0].any(axis=1)].T
         covariances.append(np.linalg.inv(np.array([[xx, xy], [xy, yy]]).transpose(2, 0, 1)))
     np.testing.assert_allclose(
         covariances[1] - covariances[0], np.broadcast_to(0.5 * np.eye(2), covariances[0].shape), atol=1e-9
     )
+
+
+def test_eps2d_keeps_the_model_of_the_device(given: dict[str, Any]) -> None:
+    inputs = with_colors(given, 3) | {"opacities": np.full(12, 0.5)}
+    faint = Device(model={"ALPHA_MIN": 0.6})
+    assert not rasterization(**inputs, eps2d=0.5, device=faint).alpha.any()
+
+
+def test_eps2d_opens_one_device_that_ends_with_the_given_one(
+    given: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Any] = []
+    create = Device.__init__
+    monkeypatch.setattr(Device, "__init__", lambda d, *a: opened.append(ref(d)) or create(d, *a))
+    device = Device()
+    for eps2d in (0.5, 0.5, 0.8):
+        rasterization(**with_colors(given, 3), eps2d=eps2d, device=device)
+    gc.collect()
+    assert [d() is not None for d in opened] == [True, False, True]  # the given one, 0.5 and 0.8
+    del device
+    gc.collect()
+    assert not any(d() for d in opened)
 
 
 @pytest.mark.parametrize(
