@@ -80,9 +80,11 @@ class Buffers:
             If the array exceeds the device's largest buffer, its memory, or the limit.
         """
         nbytes = prod(shape) * dtype.itemsize
-        if nbytes > self._most:
+        # Of what is far too large, the pool knows no size class.
+        block = self._block(nbytes) if 0 < nbytes <= self._most else nbytes
+        if block > self._most:
             raise DeviceError(
-                f"{what}: needs a buffer of {nbytes / 2**20:.0f} MiB, but {self._label} allows at most "
+                f"{what}: needs a buffer of {block / 2**20:.0f} MiB, but {self._label} allows at most "
                 f"{self._most / 2**20:.0f} MiB per buffer; use fewer Gaussians or a smaller image (--downscale)"
             )
         return self._array(shape, dtype, self.allocate(what, nbytes) if nbytes else None)

@@ -88,6 +88,13 @@ class TestBuffers:
         with pytest.raises(DeviceError, match=r"^splats: needs a buffer of \d+ MiB, but .* allows at most \d+ MiB"):
             device.empty("splats", size)
 
+    @pytest.mark.parametrize("most", [1 << 20, (1 << 20) - 64])
+    def test_too_large_with_what_the_pool_adds(self, device, monkeypatch, most):
+        monkeypatch.setattr(device.buffers, "_most", most)
+        assert device.empty("splats", 15 << 16, np.uint8).nbytes == 15 << 16
+        with pytest.raises(DeviceError, match=r"^splats: needs a buffer of 1 MiB, but .* allows at most 1 MiB"):
+            device.empty("splats", most, np.uint8)
+
     def test_memory_is_counted(self):
         device = Device()
         assert device.memory == device.memory_peak == 0
