@@ -78,7 +78,7 @@ class _Outputs(NamedTuple):
 class Rasterization(_Outputs):
     """The result of `rasterization`: the tuple (render, alpha, meta), and its gradients."""
 
-    _kept: tuple[Renderer, Gaussians, Gaussians, list[RasterPass], int | None, bool] | None = None
+    _kept: tuple[Renderer, Gaussians, Gaussians, list[RasterPass], int | None, bool, bool] | None = None
 
     def remember(
         self,
@@ -88,13 +88,12 @@ class Rasterization(_Outputs):
         passes: list[RasterPass],
         sh_degree: int | None,
         antialiased: bool,
+        shared: bool,
     ) -> None:
-        """Keep what `backward` needs; `rasterization` calls it."""
-        self._kept = (renderer, placed, gaussians, passes, sh_degree, antialiased)
+        """Keep what `backward` needs; `rasterization` calls it. shared: whether all cameras have the same values."""
+        self._kept = (renderer, placed, gaussians, passes, sh_degree, antialiased, shared)
 
-    def backward(
-        self, v_render: Any, v_alpha: Any = None, *, shared_colors: bool = True, absgrad: bool = False
-    ) -> RasterGradients:
+    def backward(self, v_render: Any, v_alpha: Any = None, *, absgrad: bool = False) -> RasterGradients:
         """Gradients of a scalar with respect to the Gaussians and the cameras.
 
         Parameters
@@ -103,8 +102,6 @@ class Rasterization(_Outputs):
             The scalar's gradient with respect to render.
         v_alpha : (C, H, W, 1), optional
             The same for alpha; default 0.
-        shared_colors : bool
-            Whether all cameras have the same values (N, D), whose gradients are summed. False keeps (C, N, D).
         absgrad : bool
             Whether absolute gradients with respect to the centres are computed, too.
 
@@ -121,7 +118,7 @@ class Rasterization(_Outputs):
         """
         if self._kept is None:
             raise InputError("gradients: expected a rasterization made with gradients=True, found another")
-        renderer, placed, gaussians, passes, sh_degree, antialiased = self._kept
+        renderer, placed, gaussians, passes, sh_degree, antialiased, shared = self._kept
         v_render = _checked("v_render", v_render, self.render.shape)
         v_alpha = np.zeros(self.alpha.shape) if v_alpha is None else _checked("v_alpha", v_alpha, self.alpha.shape)
         total = {name: np.zeros(array.shape) for name, array in gaussians.arrays().items()}
@@ -156,7 +153,7 @@ class Rasterization(_Outputs):
             total["quats"],
             _quotient(total["log_scales"], np.asarray(gaussians.scales, np.float64)),
             _quotient(total["logit_opacities"], gaussians.opacities * (1 - gaussians.opacities)),
-            total["sh"] if sh_degree is not None else v_features.sum(axis=0) if shared_colors else v_features,
+            total["sh"] if sh_degree is not None else v_features.sum(axis=0) if shared else v_features,
             np.stack(viewmats),
             np.stack(intrinsics),
             np.stack(backgrounds),

@@ -121,8 +121,9 @@ def rasterization(
     n, count = len(means), len(viewmats)
     if n == 0 or count == 0:
         raise InputError(f"means, viewmats: expected at least one Gaussian and one camera, found {n} and {count}")
+    shared = colors.ndim == 2
     if sh_degree is None:
-        colors = np.broadcast_to(colors, (count, *colors.shape)) if colors.ndim == 2 else colors
+        colors = np.broadcast_to(colors, (count, *colors.shape)) if shared else colors
         _check_shape("colors", colors, (count, n, colors.shape[-1] if colors.ndim else 0))
     sh = np.zeros((n, 1, 3)) if sh_degree is None else colors
     gaussians = _gaussians(means, scales, quats, opacities, sh)
@@ -148,7 +149,7 @@ def rasterization(
     stacked |= {"width": width, "height": height, "tile_size": tile_size, "n_cameras": count}
     result = Rasterization(np.stack([run.render for run in passes]), np.stack([run.alpha for run in passes]), stacked)
     if gradients:
-        result.remember(renderer, placed, gaussians, passes, sh_degree, antialiased)
+        result.remember(renderer, placed, gaussians, passes, sh_degree, antialiased, shared)
     return result
 
 

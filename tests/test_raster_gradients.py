@@ -82,13 +82,15 @@ def test_gradients_are_those_of_differences(
 
 def test_values_of_each_camera_have_gradients_of_their_own(given: dict[str, Any], device64: Device) -> None:
     inputs = with_colors(given, 4)
+    v_render = np.random.default_rng(3).normal(size=(2, given["height"], given["width"], 4))
+    together = rasterization(**inputs, device=device64, gradients=True).backward(v_render).colors
+    inputs["colors"] = np.stack([inputs["colors"]] * 2)
     result = rasterization(**inputs, device=device64, gradients=True)
-    v_render = np.random.default_rng(3).normal(size=result.render.shape)
-    apart, together = (result.backward(v_render, shared_colors=shared).colors for shared in (False, True))
+    apart = result.backward(v_render).colors
     assert apart.shape == (2, 12, 4)
     np.testing.assert_allclose(apart.sum(axis=0), together)
     v_render[1] = 0
-    assert not result.backward(v_render, shared_colors=False).colors[1].any()
+    assert not result.backward(v_render).colors[1].any()
 
 
 def test_reference_and_device_agree(given: dict[str, Any], device64: Device) -> None:
