@@ -26,6 +26,17 @@ _BLURRED: "WeakKeyDictionary[Device, Device]" = WeakKeyDictionary()
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
+CHOICES: dict[str, tuple[Any, ...]] = {
+    "tile_size": (8, 16, 32),
+    "render_mode": get_args(RenderMode),
+    "rasterize_mode": ("classic", "antialiased"),
+    "camera_model": tuple(CAMERA_MODELS),
+}
+"""Values of the options that are names or sizes."""
+
+CHANNELS_MAX = 32
+"""Largest number of channels of the values."""
+
 
 def rasterization(
     means: ArrayLike,
@@ -116,6 +127,9 @@ def rasterization(
     DeviceError
         If there is no OpenCL device, or a buffer exceeds its limits.
     """
+    _check_choices(
+        tile_size=tile_size, render_mode=render_mode, rasterize_mode=rasterize_mode, camera_model=camera_model
+    )
     means, quats, scales, opacities = _arrays(means=means, quats=quats, scales=scales, opacities=opacities)
     colors, viewmats, Ks = _arrays(colors=colors, viewmats=viewmats, Ks=Ks)
     n, count = len(means), len(viewmats)
@@ -123,14 +137,8 @@ def rasterization(
         raise InputError(f"means, viewmats: expected at least one Gaussian and one camera, found {n} and {count}")
     shared = colors.ndim == 2
     if sh_degree is None:
-        colors = np.broadcast_to(colors, (count, *colors.shape)) if shared else colors
-        _check_shape("colors", colors, (count, n, colors.shape[-1] if colors.ndim else 0))
-    sh = np.zeros((n, 1, 3)) if sh_degree is None else colors
-    gaussians = _gaussians(means, scales, quats, opacities, sh)
-    if sh_degree is not None and not 0 <= sh_degree <= gaussians.sh_degree:
-        raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree} (what colors hold), found {sh_degree}")
-    if render_mode not in get_args(RenderMode):
-        raise InputError(f"render_mode: expected {', '.join(get_args(RenderMode))}, found {render_mode!r}")
+        colors = _values(np.broadcast_to(colors, (count, *colors.shape)) if shared else colors, (count, n))
+    gaussians = _gaussians(means, scales, quats, opacities, colors, sh_degree)
     cameras = _cameras(viewmats, Ks, (width, height), camera_model, radial_coeffs, near_plane)
     channels = colors.shape[2] if sh_degree is None else 3
     behind = _behind(backgrounds, (count, channels))
@@ -156,6 +164,17 @@ def rasterization(
 def _arrays(**given: ArrayLike) -> list[NDArray[np.float64]]:
     """Arguments by name as arrays of NumPy."""
     return [np.asarray(on_host(name, array), np.float64) for name, array in given.items()]
+
+
+def _values(colors: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
+    """The values of the cameras, of the shape (C, N, D)."""
+    channels = colors.shape[-1] if colors.ndim else 0
+    _check_shape("colors", colors, (*shape, channels))
+    if not 1 <= channels <= CHANNELS_MAX:
+        raise InputError(
+            f"colors: expected 1 to {CHANNELS_MAX} channels, found {channels}; rasterize more in several calls"
+        )
+    return colors
 
 
 def _behind(backgrounds: ArrayLike | None, shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -205,16 +224,30 @@ def _blurred(device: "Device | None", eps2d: float) -> "Device":
     return _BLURRED[device]
 
 
-def _gaussians(means: Any, scales: ArrayLike, quats: ArrayLike, opacities: ArrayLike, sh: Any) -> Gaussians:
-    """Gaussians from activated parameters."""
+def _gaussians(
+    means: NDArray[Any],
+    scales: NDArray[Any],
+    quats: NDArray[Any],
+    opacities: NDArray[Any],
+    colors: NDArray[Any],
+    sh_degree: int | None,
+) -> Gaussians:
+    """Gaussians from activated parameters, without spherical harmonics if `sh_degree` is None."""
+    _check_shape("scales", scales, (len(means), 3))
+    _check_shape("opacities", opacities, (len(means),))
+    if (scales < 0).any():
+        raise InputError(f"scales: expected numbers of 0 or more, found {scales.min()}; take exp() of logarithms")
+    if ((opacities < 0) | (opacities > 1)).any():
+        raise InputError(
+            f"opacities: expected numbers from 0 to 1, found {opacities.min()} to {opacities.max()}; take the "
+            "sigmoid of logits"
+        )
+    sh = np.zeros((len(means), 1, 3)) if sh_degree is None else colors
     with np.errstate(divide="ignore"):  # opacities 0 and 1, scales 0
-        return Gaussians(
-            means,
-            np.log(np.asarray(scales, dtype=np.float64)),
-            np.asarray(quats, dtype=np.float64),
-            logit(np.asarray(opacities, dtype=np.float64)),
-            sh,
-        ).validate()
+        result = Gaussians(means, np.log(scales), quats, logit(opacities), sh).validate()
+    if sh_degree is not None and sh_degree not in range(result.sh_degree + 1):
+        raise InputError(f"sh_degree: expected 0 to {result.sh_degree} (what colors hold), found {sh_degree}")
+    return result
 
 
 def _cameras(
@@ -229,8 +262,6 @@ def _cameras(
     count = len(viewmats)
     _check_shape("viewmats", viewmats, (count, 4, 4))
     _check_shape("Ks", Ks, (count, 3, 3))
-    if model not in CAMERA_MODELS:
-        raise InputError(f"camera_model: expected {', '.join(CAMERA_MODELS)}, found {model!r}")
     distortions = np.zeros((count, 4))
     if radial_coeffs is not None:
         (distortions,) = _arrays(radial_coeffs=radial_coeffs)
@@ -292,3 +323,9 @@ def _with_depth(values: NDArray[Any], depths: NDArray[Any], render_mode: str) ->
 def _check_shape(name: str, array: NDArray[Any], expected: tuple[int, ...]) -> None:
     if array.shape != expected:
         raise InputError(f"{name}: expected shape {expected}, found {array.shape}")
+
+
+def _check_choices(**given: Any) -> None:
+    for name, value in given.items():
+        if value not in CHOICES[name]:
+            raise InputError(f"{name}: expected {', '.join(map(str, CHOICES[name]))}, found {value!r}")

@@ -185,7 +185,18 @@ def test_opacities_and_scales_at_their_bounds(scene: tuple[Gaussians, list[Camer
         ({"colors": np.ones((59, 3))}, r"colors: expected shape \(2, 60, 3\)"),
         ({"backgrounds": np.ones(3)}, r"backgrounds: expected shape \(2, 3\)"),
         ({"render_mode": "rgb"}, "render_mode: expected RGB"),
+        ({"rasterize_mode": "antialised"}, "rasterize_mode: expected classic, antialiased, found 'antialised'"),
+        ({"camera_model": "orthographic"}, "camera_model: expected pinhole, ortho, fisheye, found 'orthographic'"),
+        ({"tile_size": 7}, "tile_size: expected 8, 16, 32, found 7"),
+        ({"tile_size": 64}, "tile_size: expected 8, 16, 32, found 64"),
+        ({"colors": np.ones((60, 0))}, "colors: expected 1 to 32 channels, found 0"),
+        ({"colors": np.ones((2, 60, 33))}, "colors: expected 1 to 32 channels, found 33"),
+        ({"scales": np.ones((60, 1))}, r"^scales: expected shape \(60, 3\), found \(60, 1\)"),
+        ({"scales": np.full((60, 3), -2.0)}, r"scales: expected numbers of 0 or more, found -2.0; take exp\(\)"),
+        ({"opacities": np.ones((60, 1))}, r"^opacities: expected shape \(60,\), found \(60, 1\)"),
+        ({"opacities": np.linspace(0, 3, 60)}, "opacities: expected numbers from 0 to 1, found 0.0 to 3.0; take"),
         ({"sh_degree": 4, "colors": np.zeros((60, 16, 3))}, "sh_degree: expected 0 to 3"),
+        ({"sh_degree": 0.5, "colors": np.zeros((60, 16, 3))}, "sh_degree: expected 0 to 3"),
     ],
 )
 def test_errors_name_the_argument(
