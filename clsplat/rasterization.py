@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsplat.camera import Camera, CameraModel
 from clsplat.constants import BLUR
-from clsplat.errors import InputError
+from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians, logit
 from clsplat.raster_gradients import Rasterization, RasterPass, on_host
 from clsplat.renderer import Renderer, download
@@ -125,7 +125,8 @@ def rasterization(
         If shapes do not fit each other, a number is out of range, or an array of another library is not in the memory
         of the host; the message names the argument.
     DeviceError
-        If there is no OpenCL device, or a buffer exceeds its limits.
+        If there is no OpenCL device, a buffer exceeds its limits, or the pixels of a tile exceed the local memory,
+        which holds them for the gradients.
     """
     _check_choices(
         tile_size=tile_size, render_mode=render_mode, rasterize_mode=rasterize_mode, camera_model=camera_model
@@ -144,6 +145,8 @@ def rasterization(
     behind = _behind(backgrounds, (count, channels))
 
     renderer = _renderer(device, eps2d)
+    if gradients:
+        _check_local(renderer.device, tile_size, channels * ("RGB" in render_mode) + ("D" in render_mode))
     placed, antialiased = renderer.place(gaussians), rasterize_mode == "antialiased"
     parts: list[tuple[RasterPass, dict[str, Any]]] = []
     for i, camera in enumerate(cameras):
@@ -248,6 +251,18 @@ def _gaussians(
     if sh_degree is not None and sh_degree not in range(result.sh_degree + 1):
         raise InputError(f"sh_degree: expected 0 to {result.sh_degree} (what colors hold), found {sh_degree}")
     return result
+
+
+def _check_local(device: "Device | None", tile_size: int, channels: int) -> None:
+    """Raise a DeviceError if the local memory of a GPU does not hold what `backward` keeps of a tile's pixels."""
+    if device is None or device.is_cpu:
+        return
+    needed = tile_size**2 * (2 + channels) * device.real.itemsize + 4  # cl/composite_gpu.cl: composite_bwd
+    if needed > device.cl_device.local_mem_size:
+        raise DeviceError(
+            f"tile_size: gradients of {channels} channels in tiles of {tile_size} px need {needed} bytes of local "
+            f"memory, but {device.label} has {device.cl_device.local_mem_size}; use smaller tiles or fewer channels"
+        )
 
 
 def _cameras(

@@ -9,7 +9,7 @@ import pytest
 from test_rasterization import arguments
 
 from clsplat.device import Device
-from clsplat.errors import InputError
+from clsplat.errors import DeviceError, InputError
 from clsplat.rasterization import rasterization
 from clsplat.testing import synthetic_scene
 
@@ -193,6 +193,39 @@ def test_eps2d_opens_one_device_that_ends_with_the_given_one(
 def test_errors_name_the_argument(given: dict[str, Any], change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         rasterization(**(with_colors(given, 3) | change))
+
+
+class SmallMemory:
+    """A device with the least local memory that OpenCL demands."""
+
+    local_mem_size = 32 << 10
+
+    def __init__(self, device: Any):
+        self._device = device
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._device, name)
+
+
+@pytest.mark.parametrize(("tile_size", "fitting"), [(16, 29), (32, 5)])
+def test_tiles_that_exceed_the_local_memory_are_refused(
+    given: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tile_size: Any, fitting: int
+) -> None:
+    device = Device()
+    monkeypatch.setattr(device, "is_cpu", False)
+    assert device.subgroup_size >= 0  # asked before the device is replaced
+    monkeypatch.setattr(device, "cl_device", SmallMemory(device.cl_device))
+    options: dict[str, Any] = {"tile_size": tile_size, "gradients": True, "device": device}
+    result = rasterization(**with_colors(given, fitting), **options)
+    assert result.backward(np.ones(result.render.shape)).means.any()
+    refused = rf"^tile_size: gradients of {fitting + 1} channels in tiles of {tile_size} px need 32772 bytes"
+    monkeypatch.setattr(device, "launch", None)  # it is refused before the forward pass
+    for inputs in (
+        with_colors(given, fitting + 1),
+        with_colors(given, fitting) | {"render_mode": "RGB+D"},
+    ):
+        with pytest.raises(DeviceError, match=refused + ".* has 32768; use smaller tiles or fewer channels"):
+            rasterization(**inputs, **options)
 
 
 def test_what_backward_refuses(given: dict[str, Any], device: Device) -> None:
