@@ -8,6 +8,9 @@ from clsplat.device import Device
 CHAINS = 16
 """Number of independent values per work-item, as in cl/roof.cl."""
 
+GPU_GROUP = 256
+"""Work-items of a group on GPUs, if these run so many."""
+
 BUFFER_BYTES = 512 * 2**20
 """Size of each buffer for bandwidth, bytes, if memory permits. It exceeds the caches of all devices, except for a few
 CPUs whose last level holds part of it."""
@@ -44,7 +47,7 @@ def defines(device: Device, width: int) -> dict[str, int]:
 def _arithmetic(device: Device, kernel: str, *scalars: float) -> float:
     """Number of results per second."""
     # CPU cores are fastest with wide vectors, GPUs with many scalar work-items.
-    width, group = (16, 1) if device.is_cpu else (1, 256)
+    width, group = (16, 1) if device.is_cpu else (1, device.group(GPU_GROUP))
     items = (4 if device.is_cpu else 2048) * device.cl_device.max_compute_units
     out = device.empty("roof", items * width)
 
@@ -61,7 +64,7 @@ def _arithmetic(device: Device, kernel: str, *scalars: float) -> float:
 
 def _bandwidth(device: Device, kernel: str, buffers: int, *scalars: float) -> tuple[float, int]:
     """Bytes read and written per second, and the size of each buffer, bytes."""
-    width, group = (16, 1) if device.is_cpu else (4, 256)
+    width, group = (16, 1) if device.is_cpu else (4, device.group(GPU_GROUP))
     items = (4 if device.is_cpu else 2048) * device.cl_device.max_compute_units
     limit = min(BUFFER_BYTES, device.cl_device.global_mem_size // MEMORY_SHARE, device.cl_device.max_mem_alloc_size)
     count = int(limit // (items * width * device.real.itemsize))

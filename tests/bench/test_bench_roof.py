@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.bench import roof
+from clsplat.device import Device
 
 
 class TestRoof:
@@ -36,6 +37,17 @@ class TestRoof:
         measured = roof.measure_roof(configured_device)
         assert all(math.isfinite(value) and value > 0 for value in measured.values()), measured
         assert 0.5 < measured["buffer_mib"] <= 1
+
+    def test_groups_are_as_small_as_the_device_demands(self, quick_roof, monkeypatch):
+        device, groups = Device(), []
+        monkeypatch.setattr(device, "is_cpu", False)
+        monkeypatch.setattr(device, "largest_group", 64)
+        launch = device.launch
+        monkeypatch.setattr(
+            device, "launch", lambda *a, group, **b: groups.append(group) or launch(*a, group=group, **b)
+        )
+        roof.measure_roof(device)
+        assert set(groups) == {(1,), (64,)}
 
     def test_rates_are_work_over_time(self, device, monkeypatch):
         monkeypatch.setattr(roof, "_best", lambda device, run, runs: 2.0)  # every run takes 2 s
