@@ -51,9 +51,9 @@ class RenderConfig:
     """affine: the paper's local affine approximation of the camera. Its error grows with the angle from the axis and
     with the size of a Gaussian. ray: exact along the ray of each pixel, for wide angles, fisheyes and panoramas."""
     near: Annotated[float | None, within(above=0)] = None
-    """Depth up to which nothing is drawn, world units. Default: three tenths of the depth of the nearest points in
-    each photo for a dataset's cameras, 0.01 for others. Gaussians very close to a camera would otherwise spread over
-    its whole image."""
+    """Depth up to which nothing is drawn, world units. Default: for a dataset's cameras, three tenths of the depth of
+    the nearest points in each photo; for others, by the size of the scene. Gaussians very close to a camera would
+    otherwise spread over its whole image."""
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ def rasterization(
     radial_coeffs : (C, 4), optional
         k1 to k4 of fisheyes; default 0.
     near_plane : float, optional
-        Depth below which nothing is drawn, world units; default: as `Camera` chooses it.
+        Depth below which nothing is drawn, world units; default: 0.01, as in gsplat.
     eps2d : float
         Variance that is added to the splats' 2D covariances, px^2. The reference has the default only.
     radius_clip : float

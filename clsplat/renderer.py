@@ -186,7 +186,8 @@ class Renderer:
         gaussians : Gaussians of N >= 1 rows
             On the host or where the stages run.
         camera : Camera
-            An equirectangular one needs the projection along rays.
+            An equirectangular one needs the projection along rays. If neither it nor the configuration has a near
+            plane, that is at 0.01, whatever the size of the scene; `render` chooses it by `default_near`.
         sh_degree : int, optional
             Highest degree of the spherical harmonics evaluated; default: all that are stored.
         background : (3,) floats, optional
