@@ -6,9 +6,16 @@ from pyopencl.array import Array
 from clsplat.device import Device
 from clsplat.stages import AnyGrads, AnySplats
 
-# Number of pixels per work-item of the loss on a CPU, and number of work-items on a GPU. The host adds up their sums.
+# Number of pixels per work-item on a CPU, and number of work-items on a GPU, where the host adds up their sums.
 CPU_PIXELS = 4096
 GPU_ITEMS = 2048
+
+
+def pixel_shares(device: Device, pixels: int) -> tuple[int, int, int, int]:
+    """Arguments of kernels that sum over pixels: items, first, step and count (cl/disparity.cl)."""
+    if device.is_cpu:
+        return -(-pixels // CPU_PIXELS), CPU_PIXELS, 1, CPU_PIXELS
+    return GPU_ITEMS, 1, GPU_ITEMS, -(-pixels // GPU_ITEMS)
 
 
 def disparity_fwd(device: Device, splats: AnySplats) -> None:
@@ -57,12 +64,9 @@ def disparity_loss(device: Device, image: Array, target: Array, weight: float) -
         The first three channels, for losses of colours.
     """
     pixels = target.size
-    if device.is_cpu:
-        items, first, step, count = -(-pixels // CPU_PIXELS), CPU_PIXELS, 1, CPU_PIXELS
-    else:
-        items, first, step, count = GPU_ITEMS, 1, GPU_ITEMS, -(-pixels // GPU_ITEMS)
+    items, *shares = pixel_shares(device, pixels)
     rgb, parts = device.empty("image without depth", (*target.shape, 3)), device.empty("parts of the depths", items)
-    arguments = [pixels, items, first, step, count, image, target, rgb, parts]
+    arguments = [pixels, items, *shares, image, target, rgb, parts]
     device.launch("disparity", "disparity_loss", (items,), arguments)
     return weight * float(parts.get().sum(dtype=np.float64)), rgb
 

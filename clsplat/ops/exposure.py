@@ -7,11 +7,7 @@ from numpy.typing import NDArray
 from pyopencl.array import Array
 
 from clsplat.device import Device
-
-# Number of pixels per work-item of the backward kernel on a CPU, and number of work-items on a GPU. The host adds up
-# their sums.
-CPU_PIXELS = 4096
-GPU_ITEMS = 2048
+from clsplat.ops.disparity import pixel_shares
 
 
 def exposure_fwd(device: Device, image: Array, affine: NDArray[Any], photo: Array) -> Array:
@@ -56,13 +52,10 @@ def exposure_bwd(
     v_affine : float64, on the host, of the shape of `affine`
     """
     pixels = image.size // 3
-    if device.is_cpu:
-        items, first, step, count = -(-pixels // CPU_PIXELS), CPU_PIXELS, 1, CPU_PIXELS
-    else:
-        items, first, step, count = GPU_ITEMS, 1, GPU_ITEMS, -(-pixels // GPU_ITEMS)
+    items, *shares = pixel_shares(device, pixels)
     packed, response, defines = _packed(device, image, affine)
     parts = device.empty("v_affine", (items, affine.size))
-    arguments = [pixels, items, first, step, count, packed, image, photo, v_image, parts, *response]
+    arguments = [pixels, items, *shares, packed, image, photo, v_image, parts, *response]
     device.launch("exposure", "exposure_bwd", (items,), arguments, defines=defines)
     total = parts.get().sum(axis=0, dtype=np.float64)
     return np.concatenate([total[:12].reshape(3, 4), total[12:].reshape(-1, 3).T], axis=1)
