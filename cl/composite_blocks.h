@@ -114,6 +114,11 @@ static inline Grid pixel_grid(void) {
     for (int b = 0; b < BLOCKS; ++b) {
         grid.x[b] = 4 * (b % COLUMNS);
         grid.y[b] = BLOCK_ROWS * (b / COLUMNS);
+#if RAYS == 2
+        // Pixels outside the image have no directions. Their gradients are 0 times what follows from these.
+        for (int k = 0; k < 3; ++k)
+            grid.rays[b][k] = 0;
+#endif
     }
     return grid;
 }

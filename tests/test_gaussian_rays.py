@@ -162,6 +162,23 @@ def test_compositing_matches_twin(any_device, model, compositor):
         assert_matches(f"v_{name}", getattr(v, name).get(), getattr(v_expected, name), tolerances)
 
 
+@pytest.mark.parametrize("model", ["fisheye", "equirectangular"])
+def test_pixels_outside_the_image_do_not_matter(kernels, model):
+    """Blocks that the border cuts off have pixels without directions, whatever the stack holds in their place."""
+    gaussians, camera = wide_scene(model)
+    camera = replace(camera, width=37, height=29)
+    path, results = kernels / "composite_blocks.h", []
+    source = path.read_text()
+    assert source.count("Grid grid;") == 1
+    for filling in ("(REALV)1", "(REALV)NAN"):
+        fill = f"\n#if RAYS == 2\nfor (int i = 0; i < 3 * BLOCKS; ++i) (&grid.rays[0][0])[i] = {filling};\n#endif\n"
+        path.write_text(source.replace("Grid grid;", "Grid grid;" + fill))
+        rendering = render(gaussians, camera, replace(RAYS, tile_size=16, compositor="cpu"), Device())
+        results.append(rendering.backward(np.ones_like(rendering.rgb)).gaussians)
+    assert np.abs(results[0].means).max() > 0
+    np.testing.assert_array_equal(results[1].means, results[0].means)
+
+
 def scalar(image, camera, device, config, weights):
     """A function of the Gaussians and the camera whose gradient is that of `weights` by colours and depth."""
 
