@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsplat import display
 from clsplat.constants import FISHEYE_ANGLE_MAX, FRUSTUM_MARGIN, NEAR, NEAR_EXTENTS
-from clsplat.errors import InputError
+from clsplat.errors import InputError, whole
 
 CameraModel = Literal["pinhole", "orthographic", "fisheye", "equirectangular"]
 
@@ -52,8 +52,8 @@ class Camera:
     ------
     InputError
         If the model is unknown, a camera other than a fisheye has a distortion, a value is not finite as float32, a
-        focal length or a size is not positive, or the upper left 3x3 of `viewmat` is not a rotation (not orthonormal
-        to 1e-3, or a reflection).
+        focal length or a size is not positive, a size is not an integer, or the upper left 3x3 of `viewmat` is not a
+        rotation (not orthonormal to 1e-3, or a reflection).
     """
 
     viewmat: NDArray[np.float64]
@@ -87,6 +87,8 @@ class Camera:
             raise InputError(f"camera: expected finite viewmat and intrinsics, as float32, found {values.max()}")
         if min(self.fx, self.fy) < np.finfo(np.float32).tiny:
             raise InputError(f"camera: expected positive focal lengths, as float32, found fx={self.fx}, fy={self.fy}")
+        for name in ("width", "height"):  # kernels take integers of 32 bits, and no others
+            object.__setattr__(self, name, whole(name, getattr(self, name)))
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: expected a size of at least 1x1, found {self.width}x{self.height}")
         if self.near is not None and not np.finfo(np.float32).tiny <= self.near <= np.finfo(np.float32).max:

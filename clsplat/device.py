@@ -49,6 +49,9 @@ MODEL_CONSTANTS = (
 # PoCL compiles a kernel again for each size, that is, whenever the number of Gaussians changes.
 GROUP = 64
 
+# Number of values of an integer argument of 32 bits.
+WORDS = 2**32
+
 # Variable that selects the variants of all stages, as --compositor does for one: auto (those for the device's type),
 # cpu or gpu. Both compute the same on every device.
 VARIANTS = "CLSPLAT_VARIANTS"
@@ -283,9 +286,9 @@ class Device:
     ) -> None:
         """Queue `kernel` of cl/`stage`.cl, built with `defines`, over `global_size` work-items.
 
-        Arguments are device arrays, Python ints (passed as 32 bits), floats (passed as real), or NumPy scalars and
-        structs. A one-dimensional range without a `group` is rounded up to whole groups. Kernels launched this way
-        ignore surplus work-items.
+        Arguments are device arrays, integers of Python or NumPy (passed as 32 bits), floats (passed as real), or
+        vectors and structs of NumPy. A one-dimensional range without a `group` is rounded up to whole groups. Kernels
+        launched this way ignore surplus work-items.
         """
         if group is None and len(global_size) == 1:
             group = (self.group(GROUP),)
@@ -295,19 +298,20 @@ class Device:
         if run is None:
             if program not in self._programs:
                 self._programs[program] = self.program(stage, defines or {})
-            run = self._kernels[kernel, program] = cl.Kernel(self._programs[program], kernel)
+            run = cl.Kernel(self._programs[program], kernel)
             # pyopencl passes a value whose type it does not know beforehand several times more slowly.
             run.set_scalar_arg_dtypes([self._type_of(a) for a in arguments])
-        # An int becomes its lower 32 bits, unsigned or not the same. A step passes 200 arguments: no calls here.
+        # A step passes 200 arguments: no calls for most of them.
         passed: list[Any] = [
-            a.data if isinstance(a, cl.array.Array) else a & 0xFFFFFFFF if isinstance(a, int) else a
+            a.data if isinstance(a, cl.array.Array) else a if type(a) is int and 0 <= a < WORDS else _passed(a)
             for a in arguments
         ]
         run(self.queue, global_size, group, *passed)
+        self._kernels[kernel, program] = run  # not before its arguments have proved to fit
 
     def _type_of(self, argument: Any) -> np.dtype[Any] | None:
         """Type of a number or struct passed to a kernel; None for arrays, vectors and local memory."""
-        if isinstance(argument, int):
+        if isinstance(argument, (int, np.integer)):
             return np.dtype(np.uint32)
         if isinstance(argument, float):
             return self.real
@@ -333,3 +337,8 @@ class Device:
             warnings.warn(f"{self.label}: cl/{stage}.cl is built without subgroups: {reason}", stacklevel=2)
             self.subgroup_size = 0
             return result
+
+
+def _passed(argument: Any) -> Any:
+    """An argument of a kernel that is no array as it is passed: of an integer the lower 32 bits, signed or not."""
+    return int(argument) % WORDS if isinstance(argument, (int, np.integer)) else argument

@@ -4,12 +4,14 @@ A wrong value: "NAME: expected X, found Y; what to do". A failed action: "cannot
 """
 
 import errno
+import operator
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
+from typing import SupportsIndex
 
 PROBE = 2**22
 """Bytes that `unwritable` writes, and that must be free to build a kernel: more than a file of a driver's compiler or
@@ -40,6 +42,14 @@ def named(names: list[str], most: int = NAMED) -> str:
     """The first names of a list, and how many more there are."""
     left_out = len(names) - most
     return ", ".join(names[:most]) + (f" and {left_out} more" if left_out > 0 else "")
+
+
+def whole(name: str, value: SupportsIndex) -> int:
+    """An integer of Python or NumPy as an int; an InputError names the argument."""
+    try:
+        return operator.index(value)
+    except TypeError as error:
+        raise InputError(f"{name}: expected an integer, found {value!r:.60}") from error
 
 
 def unwritable(folder: Path) -> str | None:

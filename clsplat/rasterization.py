@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsplat.camera import Camera, CameraModel
 from clsplat.constants import BLUR
-from clsplat.errors import DeviceError, InputError
+from clsplat.errors import DeviceError, InputError, whole
 from clsplat.gaussians import Gaussians, logit
 from clsplat.raster_gradients import Rasterization, RasterPass, on_host
 from clsplat.renderer import Renderer, download
@@ -248,7 +248,7 @@ def _gaussians(
     sh = np.zeros((len(means), 1, 3)) if sh_degree is None else colors
     with np.errstate(divide="ignore"):  # opacities 0 and 1, scales 0
         result = Gaussians(means, np.log(scales), quats, logit(opacities), sh).validate()
-    if sh_degree is not None and sh_degree not in range(result.sh_degree + 1):
+    if sh_degree is not None and not 0 <= whole("sh_degree", sh_degree) <= result.sh_degree:
         raise InputError(f"sh_degree: expected 0 to {result.sh_degree} (what colors hold), found {sh_degree}")
     return result
 

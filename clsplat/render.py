@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clsplat import display, panorama
 from clsplat.camera import Camera, default_near
 from clsplat.config import RenderConfig
-from clsplat.errors import InputError
+from clsplat.errors import InputError, whole
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import BLACK, Gradients, Pass, Renderer, along_rays, download, fetch
 from clsplat.scene import Color
@@ -269,7 +269,7 @@ def renderings(
         )
     if isinstance(gaussians.means, np.ndarray):
         gaussians.validate()
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    degree = gaussians.sh_degree if sh_degree is None else whole("sh_degree", sh_degree)
     if not 0 <= degree <= gaussians.sh_degree:
         raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree} (what is stored), found {degree}")
     return _renderings(renderer, gaussians, cameras, degree, depth, gradients)

@@ -32,6 +32,8 @@ def random_camera(seed=0):
         ({"fx": 0}, "positive focal lengths, as float32, found fx=0"),
         ({"fy": -1}, "positive focal lengths"),
         ({"width": 0}, "at least 1x1, found 0x48"),
+        ({"width": 64.0}, "width: expected an integer, found 64.0"),
+        ({"height": "48"}, "height: expected an integer, found '48'"),
         ({"viewmat": viewmat_with(np.diag([1, 1, -1]))}, "determinant -1"),
         ({"viewmat": viewmat_with(2 * np.eye(3))}, "determinant 8"),
         ({"viewmat": viewmat_with([[1, 0.1, 0], [0, 1, 0], [0, 0, 1]])}, "expected a rotation"),
@@ -40,6 +42,11 @@ def random_camera(seed=0):
 def test_refused(changes, message):
     with pytest.raises(InputError, match=message):
         make(**changes)
+
+
+def test_a_size_of_numpy_is_one_of_python():
+    camera = make(width=np.int64(64), height=np.uint16(48))
+    assert type(camera.width) is type(camera.height) is int
 
 
 def test_poses_of_four_digits_are_accepted():

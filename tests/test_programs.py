@@ -36,6 +36,21 @@ class TestPrograms:
         expected = np.array([-7, 2**31, 0.1, 4, 0.5 * any_device.real.type(0.1)])
         np.testing.assert_array_equal(out.get(), expected.astype(any_device.real))
 
+    def test_integers_have_32_bits(self, device, kernels):
+        (kernels / "two.cl").write_text("__kernel void two(int i, int j, __global int *x) { x[0] = i; x[1] = j; }\n")
+        out = device.empty("out", 2, np.int32)
+        for i, j in ((np.int64(-7), 8), (-7, np.int8(8)), (np.int32(-7), np.uint64(8))):
+            device.launch("two", "two", (1,), [i, j, out.fill(0)])
+            assert out.get().tolist() == [-7, 8]
+
+    def test_arguments_that_do_not_fit_leave_nothing_behind(self, device, kernels):
+        (kernels / "one.cl").write_text("__kernel void one(int i, __global int *x) { x[0] = i; }\n")
+        out = device.empty("out", 1, np.int32)
+        with pytest.raises(cl.Error):
+            device.launch("one", "one", (1,), [np.zeros(1, [("a", "i4"), ("b", "i4")])[0], out])
+        device.launch("one", "one", (1,), [5, out])
+        assert out.get()[0] == 5
+
     def test_built_once_for_each_set_of_defines(self, device, kernels, monkeypatch):
         (kernels / "fill.cl").write_text(
             "__kernel void one(__global float *x) { x[0] = VALUE; }\n"

@@ -196,7 +196,7 @@ def test_opacities_and_scales_at_their_bounds(scene: tuple[Gaussians, list[Camer
         ({"opacities": np.ones((60, 1))}, r"^opacities: expected shape \(60,\), found \(60, 1\)"),
         ({"opacities": np.linspace(0, 3, 60)}, "opacities: expected numbers from 0 to 1, found 0.0 to 3.0; take"),
         ({"sh_degree": 4, "colors": np.zeros((60, 16, 3))}, "sh_degree: expected 0 to 3"),
-        ({"sh_degree": 0.5, "colors": np.zeros((60, 16, 3))}, "sh_degree: expected 0 to 3"),
+        ({"sh_degree": 3.0, "colors": np.zeros((60, 16, 3))}, "sh_degree: expected an integer, found 3.0"),
     ],
 )
 def test_errors_name_the_argument(

@@ -320,12 +320,22 @@ def test_gradients_left_out_are_zero(device):
     assert all((a == 0).all() for a in rendering.backward().gaussians.arrays().values())
 
 
+def test_integers_of_numpy_are_those_of_python():
+    gaussians, camera = synthetic_scene(30, sh_degree=1)
+    device = Device()  # no kernel has been launched: the first launch decides on types
+    other = replace(camera, width=np.int64(camera.width), height=np.int32(camera.height))
+    found = render(gaussians, other, device=device, sh_degree=np.int64(1)).rgb
+    np.testing.assert_array_equal(found, render(gaussians, camera, device=device, sh_degree=1).rgb)
+
+
 def test_input_errors(device):
     gaussians, camera = synthetic_scene(3, sh_degree=1)
     with pytest.raises(InputError, match="sh_degree: expected 0 to 1"):
         render(gaussians, camera, sh_degree=2, device="reference")
     with pytest.raises(InputError, match="sh_degree"):
         render(gaussians, camera, sh_degree=-1, device="reference")
+    with pytest.raises(InputError, match=r"sh_degree: expected an integer, found 1\.0"):
+        render(gaussians, camera, sh_degree=1.0, device="reference")
     with pytest.raises(InputError, match="quats: expected shape"):
         render(replace(gaussians, quats=gaussians.quats[:2]), camera, device="reference")
     rendering = render(gaussians, camera, RenderConfig(), device)
