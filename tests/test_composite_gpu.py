@@ -147,6 +147,21 @@ def test_another_image_between_both_passes(device64):
         np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
 
 
+def test_other_lists_of_the_same_splats_between_both_passes(device64):
+    """States belong to the lists too."""
+    splats, _ = wide_scene(32, 3 * composite.SEGMENT, 0.03)
+    splats = Splats(*(device64.upload("splats", a) for a in splats))
+    small, large = (ops.bin_splats(device64, splats, 32, 32, size) for size in (8, 32))
+    background, v_image = background_and_gradient(splats, small)
+    v_image = Image(*(device64.upload("v_image", a) for a in v_image))
+    image = ops.composite_fwd(device64, splats, small, background, compositor="gpu")
+    expected = ops.composite_bwd(device64, splats, small, image, v_image, compositor="gpu")
+    ops.composite_fwd(device64, splats, large, background, compositor="gpu")
+    found = ops.composite_bwd(device64, splats, small, image, v_image, compositor="gpu")
+    for name in SplatGrads._fields:
+        np.testing.assert_array_equal(getattr(found, name).get(), getattr(expected, name).get(), err_msg=name)
+
+
 @pytest.mark.parametrize("batch", [1, 48, 128])
 def test_the_batch_changes_no_bit(device64, monkeypatch, batch):
     """Also where a batch exceeds the 64 pixels of a tile, or is a single splat."""

@@ -123,6 +123,11 @@ STATES = ("states", "reached")
 """Names of what the GPU variant's forward pass saves for its backward pass (cl/composite_gpu.cl)."""
 
 
+def _listed(splats: AnySplats, bins: Bins) -> tuple[Any, ...]:
+    """The arrays on which `STATES` depend."""
+    return *splats, bins.gauss_ids, bins.tile_ranges
+
+
 def _saved(device: Device, splats: AnySplats, bins: Bins) -> list[Any]:
     """Last arguments of the GPU variant's forward pass: whether it saves, and the arrays that it saves to."""
     tiles, saves = bins.tile_ranges.shape[0], bins.slots is not None
@@ -131,7 +136,7 @@ def _saved(device: Device, splats: AnySplats, bins: Bins) -> list[Any]:
     arrays = [device.empty(STATES[0], shape), device.empty(STATES[1], tiles, np.uint32)]
     for name, array in zip(STATES, arrays, strict=True):
         if saves:
-            device.keep(name, splats, array)
+            device.keep(name, _listed(splats, bins), array)
     return [int(saves), *arrays]
 
 
@@ -223,9 +228,10 @@ def composite_bwd(
         pack = packed(device, splats, bins, stage)
     arguments, groups = [pack, bins.slots, *image, *v_image], bins.tile_ranges.shape[0]
     if stage == "composite_gpu":
-        if device.kept(STATES[0], splats) is None:  # another camera's image has been composited since
+        owner = _listed(splats, bins)
+        if device.kept(STATES[0], owner) is None:  # another image has been composited since
             composite_fwd(device, splats, bins, np.zeros(channels), compositor="gpu")
-        arguments += [device.kept(name, splats) for name in STATES]
+        arguments += [device.kept(name, owner) for name in STATES]
         groups += m // SEGMENT
     arguments += [records] if disparities is None else [records, disparities]
     _launch(device, stage, "composite_bwd", bins, splats, arguments, groups=groups)
