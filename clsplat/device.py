@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Mapping
 from functools import cached_property
 from math import log2
+from threading import RLock
 from typing import Any
 from weakref import ref
 
@@ -18,13 +19,16 @@ from clsplat.buffers import Buffers
 from clsplat.errors import DeviceError, InputError
 from clsplat.processors import name_processor, vector_width
 from clsplat.programs import (
+    WORDS,
     Subgroups,
+    argument_type,
     ask,
     build,
     build_options,
     check_space,
     inline_includes,
     kernel_folder,
+    passed,
     probe_subgroups,
 )
 
@@ -48,9 +52,6 @@ MODEL_CONSTANTS = (
 # Work-group size of kernels that require no particular one. A driver would choose it by the range's divisors, and
 # PoCL compiles a kernel again for each size, that is, whenever the number of Gaussians changes.
 GROUP = 64
-
-# Number of values of an integer argument of 32 bits.
-WORDS = 2**32
 
 # Variable that selects the variants of all stages, as --compositor does for one: auto (those for the device's type),
 # cpu or gpu. Both compute the same on every device.
@@ -108,6 +109,8 @@ def select_device(name: str | None = None) -> cl.Device:
 class Device:
     """An OpenCL device with its queue, programs and buffers.
 
+    Several threads may render with one device: `launch`, and each function of `clsplat.ops.Launches`, holds `lock`.
+
     Parameters
     ----------
     cl_device : pyopencl.Device, optional
@@ -130,6 +133,8 @@ class Device:
         Buffers in the device's memory.
     lengths : dict
         Lengths of lists when they were last made, by name. The next lists are probably of similar lengths.
+    lock : threading.RLock
+        Held while kernels, which keep their arguments, and what is kept between launches are used.
     """
 
     def __init__(
@@ -156,6 +161,7 @@ class Device:
         self.memory_limit = min(memory_limit or self.cl_device.global_mem_size, self.cl_device.global_mem_size)
         self.buffers = Buffers(self.queue, self.label, self.memory_limit)
         self.lengths: dict[str, int] = {}
+        self.lock = RLock()
         self._constants: dict[str, tuple[bytes, cl.array.Array]] = {}
         self._programs: dict[tuple[Any, ...], cl.Program] = {}
         self._kernels: dict[tuple[Any, ...], cl.Kernel] = {}
@@ -242,11 +248,12 @@ class Device:
 
         It is filled with zeros when it is created, and again when `size` or `layout` changes.
         """
-        if what in self._scratch and self._scratch[what][0] != (size, layout):
-            del self._scratch[what]
-        if what not in self._scratch:
-            self._scratch[what] = (size, layout), self.zeros(what, size)
-        return self._scratch[what][1]
+        known, result = self._scratch.pop(what, (None, None))
+        if result is None or known != (size, layout):
+            result = None  # frees the memory before more is allocated
+            result = self.zeros(what, size)
+        self._scratch[what] = (size, layout), result
+        return result
 
     def upload(self, what: str, array: Any, dtype: DTypeLike | None = None) -> cl.array.Array:
         """Copy a host array to the device, converted to `dtype` (default: real)."""
@@ -259,9 +266,11 @@ class Device:
         """Numbers named `what` on the device (default: reals), uploaded only when they change: uploads wait for the
         queue."""
         host = np.ascontiguousarray(values, dtype=self.real if dtype is None else dtype)
-        if what not in self._constants or self._constants[what][0] != host.tobytes():
-            self._constants[what] = host.tobytes(), self.upload(what, host, host.dtype)
-        return self._constants[what][1]
+        known, result = self._constants.get(what, (None, None))
+        if result is None or known != host.tobytes():
+            result = self.upload(what, host, host.dtype)
+            self._constants[what] = host.tobytes(), result
+        return result  # not from the dictionary, where another thread may have replaced it
 
     def keep(self, what: str, owner: tuple[cl.array.Array, ...], result: cl.array.Array) -> None:
         """Keep what was computed from the arrays of `owner`, for `kept`, until the first of them is freed."""
@@ -294,29 +303,21 @@ class Device:
             group = (self.group(GROUP),)
             global_size = (-(-global_size[0] // group[0]) * group[0],)
         program = stage, frozenset((defines or {}).items())
-        run = self._kernels.get((kernel, program))
-        if run is None:
-            if program not in self._programs:
-                self._programs[program] = self.program(stage, defines or {})
-            run = cl.Kernel(self._programs[program], kernel)
-            # pyopencl passes a value whose type it does not know beforehand several times more slowly.
-            run.set_scalar_arg_dtypes([self._type_of(a) for a in arguments])
         # A step passes 200 arguments: no calls for most of them.
-        passed: list[Any] = [
-            a.data if isinstance(a, cl.array.Array) else a if type(a) is int and 0 <= a < WORDS else _passed(a)
+        values: list[Any] = [
+            a.data if isinstance(a, cl.array.Array) else a if type(a) is int and 0 <= a < WORDS else passed(a)
             for a in arguments
         ]
-        run(self.queue, global_size, group, *passed)
-        self._kernels[kernel, program] = run  # not before its arguments have proved to fit
-
-    def _type_of(self, argument: Any) -> np.dtype[Any] | None:
-        """Type of a number or struct passed to a kernel; None for arrays, vectors and local memory."""
-        if isinstance(argument, (int, np.integer)):
-            return np.dtype(np.uint32)
-        if isinstance(argument, float):
-            return self.real
-        known = isinstance(argument, np.generic) or (isinstance(argument, np.ndarray) and argument.dtype.names)
-        return argument.dtype if known else None
+        with self.lock:
+            run = self._kernels.get((kernel, program))
+            if run is None:
+                if program not in self._programs:
+                    self._programs[program] = self.program(stage, defines or {})
+                run = cl.Kernel(self._programs[program], kernel)
+                # pyopencl passes a value whose type it does not know beforehand several times more slowly.
+                run.set_scalar_arg_dtypes([argument_type(a, self.real) for a in arguments])
+            run(self.queue, global_size, group, *values)
+            self._kernels[kernel, program] = run  # not before its arguments have proved to fit
 
     def program(self, stage: str, defines: dict[str, Any]) -> cl.Program:
         """Build cl/`stage`.cl with `defines`, the model's constants and the device's real type.
@@ -337,8 +338,3 @@ class Device:
             warnings.warn(f"{self.label}: cl/{stage}.cl is built without subgroups: {reason}", stacklevel=2)
             self.subgroup_size = 0
             return result
-
-
-def _passed(argument: Any) -> Any:
-    """An argument of a kernel that is no array as it is passed: of an integer the lower 32 bits, signed or not."""
-    return int(argument) % WORDS if isinstance(argument, (int, np.integer)) else argument

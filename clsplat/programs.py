@@ -1,4 +1,4 @@
-"""Programs: the sources in cl/, how they are built, and what a device's compiler offers."""
+"""Programs: the sources in cl/, how they are built, their arguments, and what a device's compiler offers."""
 
 import os
 import re
@@ -25,6 +25,9 @@ BASE_LANGUAGE = "-cl-std=CL1.2"
 # from which a driver has to know each. In OpenCL C 3.0 they are a feature, in 2.0 the extension cl_khr_subgroups.
 # OpenCL C 1.2 has them nowhere: Clang, from which most drivers come, does not declare them there.
 SUBGROUP_LANGUAGES = (("-cl-std=CL3.0", (3, 0)), ("-cl-std=CL2.0", (2, 0)))
+
+# Number of values of an integer argument, which has 32 bits.
+WORDS = 2**32
 
 # Name of PoCL's platform.
 POCL = "Portable Computing Language"
@@ -152,3 +155,18 @@ def probe_subgroups(context: cl.Context, device: cl.Device) -> Subgroups:
         except cl.Error:
             continue
     return Subgroups(0, BASE_LANGUAGE)
+
+
+def argument_type(argument: Any, real: np.dtype[Any]) -> np.dtype[Any] | None:
+    """Type of a number or struct passed to a kernel; None for arrays, vectors and local memory."""
+    if isinstance(argument, (int, np.integer)):
+        return np.dtype(np.uint32)
+    if isinstance(argument, float):
+        return real
+    known = isinstance(argument, np.generic) or (isinstance(argument, np.ndarray) and argument.dtype.names)
+    return argument.dtype if known else None
+
+
+def passed(argument: Any) -> Any:
+    """A number, struct or vector as it is passed to a kernel: of an integer the lower 32 bits, signed or not."""
+    return int(argument) % WORDS if isinstance(argument, (int, np.integer)) else argument

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cache
+from threading import Lock
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 BLACK: Color = (0.0, 0.0, 0.0)
+
+_OPENING = Lock()
 
 
 class Gradients(NamedTuple):
@@ -62,6 +65,8 @@ class Pass:
 
 class Renderer:
     """A device, settings and a background with which Gaussians are rendered.
+
+    Several threads may use one renderer, and several renderers one device: they take turns, stage by stage.
 
     Parameters
     ----------
@@ -313,7 +318,6 @@ def check_color(name: str, color: Any) -> None:
         raise InputError(f"{name}: expected three finite numbers, RGB, found {color!r:.60}")
 
 
-@cache
 def default_device() -> "Device":
     """The OpenCL device that `clsplat.device.select_device` chooses, opened once and kept.
 
@@ -322,6 +326,13 @@ def default_device() -> "Device":
     DeviceError
         If there is none.
     """
+    with _OPENING:
+        return opened_device()
+
+
+@cache
+def opened_device() -> "Device":
+    """See `default_device`, which one thread at a time is in."""
     from clsplat.device import Device
 
     try:

@@ -1,6 +1,10 @@
 """The renderer: its default device, the reference by name, Gaussians of host and device."""
 
+from concurrent.futures import ThreadPoolExecutor
+from time import sleep
+
 import numpy as np
+import pyopencl as cl
 import pytest
 
 import clsplat.device
@@ -12,7 +16,7 @@ from clsplat.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.render import renderings
-from clsplat.renderer import default_device, download, fetch
+from clsplat.renderer import default_device, download, fetch, opened_device
 from clsplat.stages import Image
 from clsplat.testing import synthetic_scene
 
@@ -33,14 +37,60 @@ def test_the_reference_is_asked_for_by_name():
 
 def test_without_opencl_the_error_names_the_reference(monkeypatch):
     monkeypatch.setattr(clsplat.device, "list_devices", list)
-    default_device.cache_clear()
+    opened_device.cache_clear()
     try:
         with pytest.raises(DeviceError, match=r'no OpenCL device found: .*device="reference"'):
             Renderer()
         gaussians, camera = synthetic_scene(5)
         assert np.isfinite(render(gaussians, camera, device="reference").rgb).all()
     finally:
-        default_device.cache_clear()
+        opened_device.cache_clear()
+
+
+def test_threads_share_a_device(monkeypatch):
+    """With another camera, size and background each, and with a pause before each kernel is queued."""
+
+    class Slow:
+        def __init__(self, program, name, kernel=cl.Kernel):
+            self._kernel = kernel(program, name)
+            self.set_scalar_arg_dtypes = self._kernel.set_scalar_arg_dtypes
+
+        def __call__(self, queue, global_size, group, *arguments):
+            self._kernel.set_args(*arguments)
+            sleep(1e-4)
+            cl.enqueue_nd_range_kernel(queue, self._kernel, global_size, group)
+
+    gaussians, camera = synthetic_scene(200)
+    device = Device()
+    cameras = [camera, camera.translated(np.array([1.0, 0.0, 0.0])).resized(24, 28)]
+
+    def work(k):
+        rendering = render(gaussians, cameras[k], device=device, background=(k, k, k))
+        gradients = rendering.backward(np.ones_like(rendering.rgb)).gaussians
+        return rendering.rgb, gradients.means
+
+    expected = [work(k) for k in range(2)]
+    device._kernels.clear()
+    monkeypatch.setattr(cl, "Kernel", Slow)
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(work, 10 * [0, 1]))
+    for k, arrays in enumerate(found):
+        for one, other in zip(arrays, expected[k % 2], strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_threads_open_one_default_device(monkeypatch):
+    class Slow:
+        def __init__(self):
+            sleep(0.01)
+
+    monkeypatch.setattr(clsplat.device, "Device", Slow)
+    opened_device.cache_clear()
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            assert len(set(pool.map(lambda _: default_device(), range(4)))) == 1
+    finally:
+        opened_device.cache_clear()
 
 
 @pytest.mark.parametrize("where", ["device", "reference"])

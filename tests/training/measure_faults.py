@@ -30,7 +30,7 @@ from textured_corner import CONFIG, take_photos
 from clsplat.atomic import PART
 from clsplat.commands.console import Out
 from clsplat.dataset.sfm.reconstruction import reconstruct
-from clsplat.renderer import default_device
+from clsplat.renderer import opened_device
 from clsplat.resuming import CHECKPOINT
 from clsplat.run_log import LOG
 from clsplat.training.run_folder import LOCK
@@ -132,7 +132,7 @@ class Command:
 
     def _run(self, calls: Calls, more: Iterable[str] = (), fresh: bool = False) -> Ended:
         if fresh:
-            default_device.cache_clear()
+            opened_device.cache_clear()
 
         def replaced(path: Path) -> None:
             if not calls.failed:
