@@ -32,7 +32,7 @@ class Camera:
     Parameters
     ----------
     viewmat : (4, 4) float64
-        World to camera, in world units.
+        World to camera, in world units; copied, and read-only.
     fx, fy : float
         Focal lengths in pixels; for orthographic cameras in pixels per world unit, for equirectangular ones in pixels
         per radian.
@@ -72,12 +72,14 @@ class Camera:
             raise InputError(
                 f"camera: expected a model among {', '.join(get_args(CameraModel))}, found {self.model!r}"
             )
+        object.__setattr__(self, "distortion", tuple(map(float, self.distortion)))
         if len(self.distortion) != 4 or (any(self.distortion) and self.model != "fisheye"):
             raise InputError(
                 "camera: expected a distortion k1, k2, k3, k4, which is 0 for models other than fisheye, found "
                 f"{self.distortion} for a camera of model {self.model}"
             )
-        viewmat = np.ascontiguousarray(self.viewmat, dtype=np.float64)
+        viewmat = np.array(self.viewmat, dtype=np.float64, order="C")
+        viewmat.flags.writeable = False  # what follows from it is kept
         if viewmat.shape != (4, 4):
             raise InputError(f"viewmat: expected shape (4, 4), found {viewmat.shape}")
         object.__setattr__(self, "viewmat", viewmat)

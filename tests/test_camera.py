@@ -1,9 +1,11 @@
 """Cameras: invalid values are refused, and the geometry of known cases."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from clsplat.camera import Camera, focus_point
+from clsplat.camera import Camera, focus_point, pixel_rays
 from clsplat.errors import InputError
 
 
@@ -56,6 +58,19 @@ def test_poses_of_four_digits_are_accepted():
 def test_viewmat_is_float64_and_contiguous():
     camera = make(viewmat=np.asfortranarray(random_camera().viewmat.astype(np.float32)))
     assert camera.viewmat.dtype == np.float64 and camera.viewmat.flags.c_contiguous
+
+
+def test_a_camera_does_not_follow_the_arrays_of_its_arguments():
+    viewmat, distortion = random_camera().viewmat.copy(), np.array([0.1, 0.0, 0.0, 0.0])
+    camera = make(viewmat=viewmat, distortion=distortion, model="fisheye")
+    position, directions = camera.position.copy(), pixel_rays(camera)
+    viewmat[0, 3] += 0.5
+    distortion[0] = 0.2
+    assert camera.distortion == (0.1, 0, 0, 0)
+    np.testing.assert_array_equal(replace(camera).position, position)
+    np.testing.assert_array_equal(pixel_rays(replace(camera)), directions)
+    with pytest.raises(ValueError, match="read-only"):
+        camera.viewmat[0, 3] += 0.5
 
 
 def test_intrinsic_matrix():

@@ -31,7 +31,9 @@ def test_points_behind_the_wall_do_not_count():
 
 def test_a_photo_that_looks_away_does_not_count():
     away = view("a")
-    away.camera.viewmat[:3, :3] = np.diag([-1, 1, -1])
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
+    turned[:3, 3] = away.camera.viewmat[:3, 3]
+    away = replace(away, camera=replace(away.camera, viewmat=turned))
     near = [view("0"), view("1")]
     assert rare_pixels(scene_of([*near, away], [view("t")]), wall())[0].all()
     assert not rare_pixels(scene_of([*near, view("2")], [view("t")]), wall())[0].any()
