@@ -10,8 +10,8 @@
 
 __kernel void take_rows(const uint m, const uint width, const __global int *rows, const __global real *in,
                         __global real *out) {
-    const uint i = get_global_id(0);
-    if (i >= m * width)
+    const size_t i = get_global_id(0);
+    if (i >= (size_t)m * width)
         return;
     const int row = rows[i / width];
     out[i] = row < 0 ? 0 : in[(size_t)row * width + i % width];

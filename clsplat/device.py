@@ -305,7 +305,7 @@ class Device:
         program = stage, frozenset((defines or {}).items())
         # A step passes 200 arguments: no calls for most of them.
         values: list[Any] = [
-            a.data if isinstance(a, cl.array.Array) else a if type(a) is int and 0 <= a < WORDS else passed(a)
+            a.data if isinstance(a, cl.array.Array) else a if type(a) is int and 0 <= a < WORDS else passed(kernel, a)
             for a in arguments
         ]
         with self.lock:

@@ -167,6 +167,19 @@ def argument_type(argument: Any, real: np.dtype[Any]) -> np.dtype[Any] | None:
     return argument.dtype if known else None
 
 
-def passed(argument: Any) -> Any:
-    """A number, struct or vector as it is passed to a kernel: of an integer the lower 32 bits, signed or not."""
-    return int(argument) % WORDS if isinstance(argument, (int, np.integer)) else argument
+def passed(kernel: str, argument: Any) -> Any:
+    """A number, struct or vector as it is passed to a kernel: a negative integer by its 32 bits.
+
+    Raises
+    ------
+    DeviceError
+        If an integer has more bits.
+    """
+    if not isinstance(argument, (int, np.integer)):
+        return argument
+    if not -WORDS // 2 <= argument < WORDS:
+        raise DeviceError(
+            f"{kernel}: expected integers of 32 bits, found {argument}; use fewer Gaussians or a smaller image "
+            "(--downscale)"
+        )
+    return int(argument) % WORDS

@@ -43,6 +43,16 @@ class TestPrograms:
             device.launch("two", "two", (1,), [i, j, out.fill(0)])
             assert out.get().tolist() == [-7, 8]
 
+    def test_integers_of_more_bits_are_refused(self, device, kernels):
+        (kernels / "large.cl").write_text("__kernel void large(int i, __global int *x) { x[0] = i; }\n")
+        out = device.empty("out", 1, np.int32)
+        for largest in (2**32 - 1, -(2**31)):
+            device.launch("large", "large", (1,), [largest, out])
+            assert out.get()[0] == np.uint32(largest % 2**32).astype(np.int32)
+        for larger in (2**32, np.int64(2**40), -(2**31) - 1):
+            with pytest.raises(DeviceError, match=f"^large: expected integers of 32 bits, found {larger}; use fewer"):
+                device.launch("large", "large", (1,), [larger, out])
+
     def test_arguments_that_do_not_fit_leave_nothing_behind(self, device, kernels):
         (kernels / "one.cl").write_text("__kernel void one(int i, __global int *x) { x[0] = i; }\n")
         out = device.empty("out", 1, np.int32)
