@@ -94,6 +94,7 @@ __kernel void absgrad_sum(const uint n, const __global uint *first_slots, const 
     real2 total = 0;
     for (uint slot = first_slots[i]; slot < first_slots[i + 1]; ++slot)
         total += load2(records, slot);
-    const bool finite = 0 * (total.x + total.y) == 0;
+    const real any = total.x + total.y;
+    const bool finite = FINITE(any);
     store2(sums, i, finite ? total : (real2)0);
 }

@@ -359,7 +359,8 @@ __kernel VECTORS void project_disparities(const uint n, const Camera camera, con
     const reals slope_x = -inv_z * inv_z * (conic.x * xz + conic.y * yz);
     const reals slope_y = -inv_z * inv_z * (conic.y * xz + conic.z * yz);
     // Disparities that are not finite at some pixel have no order.
-    const masks finite = visible & (0 * (slope_x * extent.x + slope_y * extent.y) == zero);
+    const reals most = slope_x * extent.x + slope_y * extent.y;
+    const masks finite = visible & FINITE(most);
     store_vectors3(disparities, i, n, vector3(IF_VISIBLE(inv_z), finite ? slope_x : zero, finite ? slope_y : zero));
 }
 #endif

@@ -149,6 +149,13 @@ def test_a_forbidden_define_is_a_sentence(device, name, define, value):
         device.program(name, DEFINES[name] | {define: value})
 
 
+@pytest.mark.parametrize("path", sorted(kernel_folder().iterdir()), ids=lambda path: path.name)
+def test_no_kernel_multiplies_by_zero_to_find_what_is_not_finite(path):
+    """Mesa takes 0 * x for 0; cl/common.h has FINITE."""
+    code = re.sub(r"//.*", "", path.read_text())
+    assert not re.search(r"\b0 \*[^;]*==", code)
+
+
 def test_missing_constants_are_a_sentence(device):
     source = inline_includes("scan.cl", kernel_folder())
     constants = [f"-D{name}=1" for name in MODEL_CONSTANTS]
