@@ -98,8 +98,10 @@ static inline uint samples_of(const Ray ray, real offset, int cells, const __glo
                               uint place, uint r, __global real *positions, __global real *deltas,
                               __global uint *rays_of) {
     uint count = 0;
-    real t = ray.near + offset * step_at(&ray, ray.near);
-    while (t < ray.far) {
+    // Far from the origin, a step may be lost in rounding: t, which would stay, ends the ray.
+    real t = ray.near + offset * step_at(&ray, ray.near), last = -INFINITY;
+    while (t < ray.far && t > last) {
+        last = t;
         const real3 x = position_at(&ray, t);
         const size_t cell = cell_of(x.x, cells) + (size_t)cells * (cell_of(x.y, cells) + cells * cell_of(x.z, cells));
         if (!occupied[cell]) {

@@ -46,6 +46,15 @@ def test_in_numbers(any_device):
         assert samples.total == 4
 
 
+def test_a_ray_from_so_far_away_that_no_step_changes_it_ends(any_device):
+    distance = 1e6 if any_device.real == np.float32 else 2.0**50
+    given = np.array([[0.5, 0.5, -distance]]), np.array([[0.0, 0, 1]]), np.zeros(1), np.ones((1, 1, 1), np.uint8)
+    march = Marching(1e-3, 0.0, 0.0, 2 * distance, False)
+    assert by_kernel(any_device, *given, march).total == 1
+    if any_device.real == np.float64:
+        assert reference.march(*given, march).total == 1
+
+
 def test_the_contraction_in_numbers():
     points = np.array([[0.5, 0, 0], [0, 1, 0], [0, 0, -4], [3e8, 0, 0]])
     np.testing.assert_allclose(contract(points), [[0.5, 0, 0], [0, 1, 0], [0, 0, -1.75], [2, 0, 0]])

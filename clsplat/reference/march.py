@@ -27,8 +27,9 @@ def march(origins: Array, directions: Array, offsets: Array, occupied: Array, ma
                     near, far = max(near, min(-o / d, (1 - o) / d)), min(far, max(-o / d, (1 - o) / d))
                 elif not 0 <= o <= 1:
                     far = near
-        t, own = near + offset * _step(near, marching), []
-        while t < far:
+        own: list[float] = []
+        t = near + offset * _step(near, marching)
+        while t < far and t not in own[-1:]:  # a step may be lost in rounding
             own.append(t)
             t += _step(t, marching)
         steps = [_step(t, marching) for t in own]
