@@ -308,7 +308,7 @@ def _drawn(
     """The pass, where there is one, its image and its alpha: on the host, or where the stages ran."""
     if len(gaussians) == 0:
         behind = np.array([*renderer.background, *[0.0] * depth], renderer.real)
-        image: Array = np.broadcast_to(behind, (camera.height, camera.width, len(behind)))
+        image: Array = np.tile(behind, (camera.height, camera.width, 1))
         return None, image, np.zeros(image.shape[:2], renderer.real)
     if camera.model == "equirectangular" and not along_rays(renderer.config, camera):
         layers = []

@@ -286,6 +286,8 @@ def test_no_gaussians(device, twin):
     )
     np.testing.assert_allclose(rendering.rgb, np.broadcast_to(BACKGROUND, rendering.rgb.shape), rtol=1e-6)
     assert (rendering.alpha == 0).all() and (rendering.depth == 0).all()
+    rendering.rgb[0, 0] = 0.5  # an array of its own, as of any Gaussians
+    assert (rendering.rgb == 0.5).all(axis=2).sum() == 1
     v = rendering.backward(*random_grads(rendering), viewmat_grad=True)
     assert len(v.gaussians) == 0 and v.gaussians.sh.shape == (0, 16, 3) and v.means2d.shape == (0, 2)
     assert (v.viewmat == 0).all()
