@@ -64,9 +64,7 @@ class Pass:
 
 
 class Renderer:
-    """A device, settings and a background with which Gaussians are rendered.
-
-    Several threads may use one renderer, and several renderers one device: they take turns, stage by stage.
+    """A device, settings and a background with which Gaussians are rendered; threads take turns, stage by stage.
 
     Parameters
     ----------
