@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clsplat.dataset.coverage import projected
 from clsplat.dataset.decoding import Dataset, PosedPhoto, fits, nearest, plan_view
 from clsplat.dataset.lenses import Intrinsics, is_pinhole
-from clsplat.dataset.photos import opened
+from clsplat.dataset.photos import as_stored, opened
 from clsplat.dataset.undistortion import lens_positions, resampled
 from clsplat.errors import InputError
 from clsplat.scene import DepthMap, Scene, View
@@ -112,7 +112,7 @@ def _read_picture(path: Path) -> NDArray[np.float32]:
                 f"{path}: expected one channel of 16 bits or floats, found mode {image.mode}; 8 bits are too coarse "
                 "for depths: write a 16-bit PNG, a TIFF with floats, or .npy"
             )
-        return np.asarray(image).astype(np.float32)
+        return np.asarray(as_stored(image)).astype(np.float32)
 
 
 def load_depth_map(path: Path, photo: PosedPhoto, dataset: Dataset) -> DepthMap:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
+from PIL.TiffImagePlugin import TiffImageFile
 
 from clsplat.errors import InputError
 
@@ -30,6 +31,17 @@ video and how the frames were chosen."""
 
 TRANSPARENT = ("RGBA", "RGBa", "LA", "La", "PA")
 """Pillow image modes with an alpha channel."""
+
+TURNED_BACK = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+"""How upright pixels become those that are stored, by the EXIF orientation."""
 
 
 def photo_folder(path: Path) -> Path:
@@ -109,7 +121,16 @@ def photo_size(path: Path) -> tuple[int, int]:
         If the file is not an image.
     """
     with opened(path) as image:
+        if isinstance(image, TiffImageFile):  # Pillow 11 declares the turned size
+            return image.tag_v2[ExifTags.Base.ImageWidth], image.tag_v2[ExifTags.Base.ImageLength]
         return image.size
+
+
+def as_stored(image: Image.Image) -> Image.Image:
+    """Load an opened image with its pixels as stored. Pillow itself turns those of a TIFF by its orientation."""
+    tag = image.getexif().get(ExifTags.Base.Orientation, 1) if isinstance(image, TiffImageFile) else 1
+    image.load()
+    return image.transpose(TURNED_BACK[tag]) if tag in TURNED_BACK else image
 
 
 def orientation(path: Path) -> int:
@@ -180,7 +201,7 @@ def is_transparent(path: Path) -> bool:
 def write_upright_png(source: Path, target: Path) -> None:
     """Write the photo `source` as an upright 8-bit RGB PNG, whatever the suffix of `target`.
 
-    EXIF data other than the orientation are copied: structure from motion reads the focal length from them.
+    EXIF data of the camera and its place are copied: structure from motion reads the focal length from them.
 
     Raises
     ------
@@ -188,14 +209,25 @@ def write_upright_png(source: Path, target: Path) -> None:
         If `source` cannot be decoded.
     """
     with opened(source) as image:
-        upright = ImageOps.exif_transpose(image)
+        rgb = Image.fromarray(_rgb(ImageOps.exif_transpose(image), (0.0, 0.0, 0.0), source))
         try:
-            exif = upright.getexif().tobytes()
+            exif = _exif_of_camera(image)
         except Exception:  # damaged tags, which Pillow reads but cannot write: the pixels are those of the photo
             exif = b""
-        rgb = Image.fromarray(_rgb(upright, (0.0, 0.0, 0.0), source))
     target.parent.mkdir(parents=True, exist_ok=True)
     rgb.save(target, format="PNG", exif=exif, compress_level=1)  # a temporary file: fast rather than small
+
+
+def _exif_of_camera(image: Image.Image) -> bytes:
+    """EXIF data of the camera and its place. The other tags of a TIFF describe its own pixels."""
+    found, kept = image.getexif(), Image.Exif()
+    for tag in (ExifTags.Base.Make, ExifTags.Base.Model):
+        if tag in found:
+            kept[tag] = found[tag]
+    for ifd in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
+        if tags := found.get_ifd(ifd):
+            kept[ifd] = tags
+    return kept.tobytes()
 
 
 def read_photo(path: Path, background: tuple[float, float, float], upright: bool) -> NDArray[np.uint8]:
@@ -221,7 +253,7 @@ def read_photo(path: Path, background: tuple[float, float, float], upright: bool
         If the file is damaged, is not an image, or has floating-point or 32-bit pixels; the message names it.
     """
     with opened(path) as image:
-        return _rgb(ImageOps.exif_transpose(image) if upright else image, background, path)
+        return _rgb(ImageOps.exif_transpose(image) if upright else as_stored(image), background, path)
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
@@ -233,7 +265,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
         If the file cannot be decoded, or has grey pixels but no white ones: a mask of 0 and 1 would hide everything.
     """
     with opened(path) as image:
-        values = _rgb(image, (0.0, 0.0, 0.0), path).max(axis=2)
+        values = _rgb(as_stored(image), (0.0, 0.0, 0.0), path).max(axis=2)
     mask: NDArray[np.bool_] = values >= 128
     if values.any() and not mask.any():
         raise InputError(f"{path}: expected a mask of black (0) and white (255), found values up to {values.max()}")

@@ -144,28 +144,34 @@ def test_views_keep_order_and_share_no_pixels(tmp_path):
         np.testing.assert_array_equal(view.image, images[k])
 
 
-@pytest.mark.parametrize("tag", [1, 3, 6])
-def test_orientation_is_ignored_where_stored_pixels_fit(tmp_path, tag):
+def turned(tag):
     exif = Image.Exif()
     exif[0x0112] = tag
+    return exif
+
+
+ENDINGS = pytest.mark.parametrize("ending", ["png", "tif"])  # Pillow itself turns a TIFF
+
+
+@ENDINGS
+@pytest.mark.parametrize("tag", [1, 3, 6])
+def test_orientation_is_ignored_where_stored_pixels_fit(tmp_path, tag, ending):
     pixels = noise()
-    path = save(tmp_path / "a.png", pixels, exif=exif)
+    path = save(tmp_path / f"a.{ending}", pixels, exif=turned(tag))
     np.testing.assert_array_equal(load(posed(path))[0].image, pixels)
 
 
-def test_orientation_is_applied_where_only_the_upright_photo_fits(tmp_path):
-    exif = Image.Exif()
-    exif[0x0112] = 6
+@ENDINGS
+def test_orientation_is_applied_where_only_the_upright_photo_fits(tmp_path, ending):
     pixels = noise(48, 64)
-    path = save(tmp_path / "a.png", pixels, exif=exif)
+    path = save(tmp_path / f"a.{ending}", pixels, exif=turned(6))
     np.testing.assert_array_equal(load(posed(path))[0].image, pixels.swapaxes(0, 1)[:, ::-1])
 
 
-def test_upright_datasets_apply_every_orientation(tmp_path):
-    exif = Image.Exif()
-    exif[0x0112] = 3
+@ENDINGS
+def test_upright_datasets_apply_every_orientation(tmp_path, ending):
     pixels = noise()
-    path = save(tmp_path / "a.png", pixels, exif=exif)
+    path = save(tmp_path / f"a.{ending}", pixels, exif=turned(3))
     np.testing.assert_array_equal(load(posed(path), upright=True)[0].image, pixels[::-1, ::-1])
 
 
@@ -222,6 +228,14 @@ def test_reduced_masks_count_pixels_without_a_masked_part(tmp_path):
     photo, mask = save(tmp_path / "a.png", noise()), save(tmp_path / "m.png", full.astype(np.uint8) * 255)
     (view,) = load(posed(photo, mask=mask), reduce=2)
     np.testing.assert_array_equal(view.mask, full.reshape(24, 2, 32, 2).all(axis=(1, 3)))
+
+
+@ENDINGS
+def test_the_orientation_of_a_mask_is_ignored(tmp_path, ending):
+    pattern = RNG.integers(0, 2, (48, 64)).astype(bool)
+    photo = save(tmp_path / f"a.{ending}", noise(), exif=turned(6))
+    mask = save(tmp_path / f"m.{ending}", pattern.astype(np.uint8) * 255, exif=turned(6))
+    np.testing.assert_array_equal(load(posed(photo, mask=mask))[0].mask, pattern)
 
 
 def test_a_mask_of_another_shape_is_refused(tmp_path):

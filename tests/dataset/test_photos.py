@@ -7,7 +7,7 @@ import zlib
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from clsplat.dataset.photos import (
     is_plain,
@@ -36,7 +36,9 @@ def save_turned(path, tag, pixels=RGB):
     exif = Image.Exif()
     exif[0x0112] = tag
     exif[0x010F] = "maker"
-    Image.fromarray(pixels).save(path, exif=exif)
+    exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLength: 24.5}
+    exif[ExifTags.IFD.GPSInfo] = {ExifTags.GPS.GPSLatitudeRef: "N"}
+    Image.fromarray(pixels).save(path, exif=exif.tobytes())
     return path
 
 
@@ -109,9 +111,10 @@ def test_a_transparent_colour_that_pillow_cannot_compare_is_refused(tmp_path):
         read_photo(tmp_path / "a.png", WHITE, True)
 
 
+@pytest.mark.parametrize("ending", ["png", "tif"])  # Pillow itself turns a TIFF
 @pytest.mark.parametrize("tag", range(1, 9))
-def test_orientation_is_applied_when_asked(tmp_path, tag):
-    path = save_turned(tmp_path / "a.png", tag)
+def test_orientation_is_applied_when_asked(tmp_path, tag, ending):
+    path = save_turned(tmp_path / f"a.{ending}", tag)
     # EXIF 2.32, "Orientation": where row 0 and column 0 of the stored pixels are when the photo is upright
     upright = {
         1: RGB,
@@ -131,7 +134,9 @@ def test_orientation_is_applied_when_asked(tmp_path, tag):
     np.testing.assert_array_equal(read(tmp_path / "sub" / "b.jpg"), upright)
     assert orientation(tmp_path / "sub" / "b.jpg") == 1
     with Image.open(tmp_path / "sub" / "b.jpg") as copy:
-        assert copy.getexif()[0x010F] == "maker"
+        exif = copy.getexif()
+        assert exif[0x010F] == "maker" and exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] == 24.5
+        assert exif.get_ifd(ExifTags.IFD.GPSInfo)[ExifTags.GPS.GPSLatitudeRef] == "N"
 
 
 def test_plain_photos_are_upright_8_bit_rgb_or_grey(tmp_path):
