@@ -7,6 +7,7 @@ ignored.
 
 import json
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,9 @@ PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RAD
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE")
 """Accepted values of ``camera_model``. For all of them, the given distortion coefficients are used and missing ones
 are zero."""
+
+TRAIN_LIST, TEST_LISTS = "train_filenames", ("val_filenames", "test_filenames")
+"""Keys of nerfstudio's split: lists of frames to train on, and of held-out ones."""
 
 Json = dict[str, Any]
 
@@ -59,7 +63,8 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
     Returns
     -------
     Dataset
-        Photos without a file are left out with a warning. Points are read from ``ply_file_path``.
+        Photos without a file, or in none of nerfstudio's lists, are left out with a warning. Points are read from
+        ``ply_file_path``.
 
     Raises
     ------
@@ -70,9 +75,9 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
     """
     metas = [(path, held_out, _read_json(path)) for path, held_out in find_transforms(root)]
     frames = [
-        ({**meta, **frame}, path, _is_held_out(frame, meta, held_out))
+        ({**meta, **frame}, path, part)
         for path, held_out, meta in metas
-        for frame in meta["frames"]
+        for frame, part in (_split(meta, path) if held_out is None else [(f, held_out) for f in meta["frames"]])
     ]
     names = [checked_name(frame["file_path"], path) for frame, path, _ in frames]
     files, reduce = locate(root, names, config.downscale)
@@ -108,10 +113,36 @@ def _read_json(path: Path) -> Json:
     return dict(meta)
 
 
-def _is_held_out(frame: Json, meta: Json, held_out: bool | None) -> bool | None:
-    """Whether a frame is held out, by the name of its file (`held_out`) or by nerfstudio's lists of file names."""
-    lists = [meta[key] for key in ("test_filenames", "val_filenames") if isinstance(meta.get(key), list)]
-    return any(frame["file_path"] in names for names in lists) if lists and held_out is None else held_out
+def _split(meta: Json, path: Path) -> list[tuple[Json, bool | None]]:
+    """List the frames with whether nerfstudio's lists hold them out, None without lists.
+
+    As in nerfstudio, a list of frames to train on leaves out those in no list.
+    """
+    frames = meta["frames"]
+    names = [checked_name(frame["file_path"], path) for frame in frames]
+    lists = {key: _listed(meta[key], key, names, path) for key in (TRAIN_LIST, *TEST_LISTS) if meta.get(key)}
+    if not lists:
+        return [(frame, None) for frame in frames]
+    train = lists.pop(TRAIN_LIST, set(names))
+    test = set[str]().union(*lists.values())
+    unlisted = [name for name in names if name not in train | test]
+    if unlisted:
+        warnings.warn(
+            f"{path}: {len(unlisted)} of {len(names)} photos are in none of the lists {TRAIN_LIST}, "
+            f"{', '.join(TEST_LISTS)} and are left out (first: {unlisted[0]})",
+            stacklevel=3,
+        )
+    return [(f, name in test) for f, name in zip(frames, names, strict=True) if name in train | test]
+
+
+def _listed(found: Any, key: str, names: list[str], path: Path) -> set[str]:
+    """Check one of nerfstudio's lists."""
+    listed = {checked_name(name, path) for name in found} if isinstance(found, list) else set[str]()
+    if listed.isdisjoint(names):
+        raise InputError(
+            f'{path}: expected a list of the "file_path" of frames as {key}, found none of them in {str(found)[:80]}'
+        )
+    return listed
 
 
 def _number(frame: Json, key: str, where: str) -> float | None:

@@ -87,6 +87,23 @@ def test_nerfstudios_split_is_kept(root):
     assert [view.name for view in scene.test] == NAMES[2:]
 
 
+def test_names_in_nerfstudios_split_may_be_written_in_another_way(root):
+    write(root, fl_x=50, test_filenames=["./images/2.png", "images\\3.png"], val_filenames=[], train_filenames=[])
+    scene = load_scene(root, DataConfig())
+    assert [view.name for view in scene.train] == NAMES[:2] and [view.name for view in scene.test] == NAMES[2:]
+
+
+def test_a_list_of_photos_to_train_on_leaves_out_those_in_no_list(root):
+    write(root, fl_x=50, train_filenames=[f"./{name}" for name in NAMES[:2]])
+    with pytest.warns(UserWarning, match=r"transforms\.json: 2 of 4 photos are in none of the lists .*2\.png"):
+        scene = load_scene(root, DataConfig())
+    assert [view.name for view in scene.train] == NAMES[:2] and not scene.test
+    write(root, fl_x=50, train_filenames=NAMES[:2], test_filenames=NAMES[3:])
+    with pytest.warns(UserWarning, match=r"transforms\.json: 1 of 4 photos"):
+        scene = load_scene(root, DataConfig())
+    assert [view.name for view in scene.train] == NAMES[:2] and [view.name for view in scene.test] == NAMES[3:]
+
+
 def test_frames_have_intrinsics_of_their_own(root):
     rows = frames()
     rows[0] |= {"fl_x": 70, "fl_y": 71, "cx": 30, "cy": 20}
@@ -210,6 +227,9 @@ MIRRORED = (np.array(opengl(CAMERAS[1])) @ np.diag([-1, 1, 1, 1])).tolist()
         ({"fl_x": None}, "fl_x"),
         ({"camera_model": "PINBALL"}, "camera_model.*PINBALL"),
         ({"k4": 0.1}, "k4"),
+        ({"test_filenames": ["1.png"]}, "test_filenames.*found none of them in"),
+        ({"train_filenames": NAMES, "val_filenames": "images"}, "val_filenames.*found none of them in images"),
+        ({"test_filenames": [3]}, "found 3"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "p1"),
         ({"ply_file_path": "../points.ply"}, r"\.\./points\.ply"),
     ],
