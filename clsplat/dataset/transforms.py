@@ -27,6 +27,16 @@ FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FISHEYE
 """Accepted values of ``camera_model``. For all of them, the given distortion coefficients are used and missing ones
 are zero."""
 
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+"""Keys of the distortion."""
+
+GROUPS = (
+    ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y"),
+    ("camera_model", "is_fisheye"),
+    COEFFICIENTS,
+)
+"""Keys that belong together: a frame that gives one of a group has none of the file's."""
+
 TRAIN_LIST, TEST_LISTS = "train_filenames", ("val_filenames", "test_filenames")
 """Keys of nerfstudio's split: lists of frames to train on, and of held-out ones."""
 
@@ -75,7 +85,7 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
     """
     metas = [(path, held_out, _read_json(path)) for path, held_out in find_transforms(root)]
     frames = [
-        ({**meta, **frame}, path, part)
+        (_complete(frame, meta), path, part)
         for path, held_out, meta in metas
         for frame, part in (_split(meta, path) if held_out is None else [(f, held_out) for f in meta["frames"]])
     ]
@@ -111,6 +121,12 @@ def _read_json(path: Path) -> Json:
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise InputError(f'{path}: expected a "file_path" in every frame, found none in frame {number}')
     return dict(meta)
+
+
+def _complete(frame: Json, meta: Json) -> Json:
+    """Add the values of the whole file to a frame."""
+    own = {key for group in GROUPS if not frame.keys().isdisjoint(group) for key in group}
+    return {**{key: value for key, value in meta.items() if key not in own}, **frame}
 
 
 def _split(meta: Json, path: Path) -> list[tuple[Json, bool | None]]:
@@ -184,8 +200,7 @@ def _intrinsics(frame: Json, where: str, file: Path, downscaled: int) -> Intrins
         raise InputError(f"{where}: expected fl_x or camera_angle_x, found neither")
     cx, cy = _number_or(width / 2, frame, "cx", where), _number_or(height / 2, frame, "cy", where)
 
-    keys = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-    k1, k2, k3, k4, k5, k6, p1, p2 = (_number_or(0.0, frame, key, where) for key in keys)
+    k1, k2, k3, k4, k5, k6, p1, p2 = (_number_or(0.0, frame, key, where) for key in COEFFICIENTS)
     if model in FISHEYE:
         if p1 or p2 or k5 or k6:
             raise InputError(f"{where}: expected only k1 to k4 for a {model} camera, found p1, p2, k5 or k6")

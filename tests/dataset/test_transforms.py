@@ -1,5 +1,6 @@
 """transforms.json in its dialects: known cameras are read, and impossible values are refused."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -111,6 +112,37 @@ def test_frames_have_intrinsics_of_their_own(root):
     first, second, *_ = (photo.intrinsics for photo in read_dataset(root, DataConfig()).photos)
     assert first == Intrinsics("PINHOLE", (70, 71, 30, 20), 64, 48)
     assert second == Intrinsics("PINHOLE", (50, 50, 32, 24), 64, 48)
+
+
+@pytest.mark.parametrize(
+    ("whole", "own", "expected"),
+    [
+        ({"fl_x": 50}, {"camera_angle_x": 2 * np.arctan(0.5)}, Intrinsics("PINHOLE", (64, 64, 32, 24), 64, 48)),
+        (
+            {"camera_angle_x": 1, "camera_angle_y": 0.8},
+            {"fl_x": 70},
+            Intrinsics("PINHOLE", (70, 70, 32, 24), 64, 48),
+        ),
+        (
+            {"fl_x": 50, "k1": 0.1, "k2": 0.2},
+            {"k1": 0.3},
+            Intrinsics("FULL_OPENCV", (50, 50, 32, 24, 0.3, *[0] * 7), 64, 48),
+        ),
+        (
+            {"fl_x": 50, "camera_model": "OPENCV", "cx": 33},
+            {"is_fisheye": True, "k4": 0.1},
+            Intrinsics("OPENCV_FISHEYE", (50, 50, 33, 24, 0, 0, 0, 0.1), 64, 48),
+        ),
+    ],
+    ids=["angle", "focal length", "distortion", "fisheye"],
+)
+def test_a_frames_own_focal_lengths_and_lens_replace_those_of_the_file(root, whole, own, expected):
+    rows = frames()
+    rows[0] |= own
+    (root / "transforms.json").write_text(json.dumps({"frames": rows, **whole}))
+    found = intrinsics_of(root)
+    np.testing.assert_allclose(found.params, expected.params)
+    assert found == dataclasses.replace(expected, params=found.params)
 
 
 @pytest.mark.parametrize(
