@@ -7,13 +7,14 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
+from clsplat.dataset.finding import without_suffix
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, psnr_fitted, ssim, to_uint8
@@ -22,6 +23,7 @@ from clsplat.renderer import Renderer
 from clsplat.scene import View, in_turn
 from clsplat.show.comparisons import save_difference, save_png
 from clsplat.show.evaluation_page import write_page
+from clsplat.show.picture_names import distinct_stems
 
 Result = TypeVar("Result")
 Metric = Callable[..., float | None]
@@ -209,12 +211,5 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 def _file_names(views: list[View]) -> list[str]:
     """File names of PNGs for the views: valid in any file system and different from each other."""
-    names: list[str] = []
-    taken: set[str] = set()
-    for view in views:
-        stem = re.sub(r"[^\w.-]+", "_", str(PurePosixPath(view.name).with_suffix(""))).strip("._")[:100] or "view"
-        while stem.casefold() in taken:
-            stem += "_"
-        taken.add(stem.casefold())
-        names.append(f"{stem}.png")
-    return names
+    stems = (re.sub(r"[^\w.-]+", "_", without_suffix(view.name)).strip("._") or "view" for view in views)
+    return [f"{stem}.png" for stem in distinct_stems(stems)]

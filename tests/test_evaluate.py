@@ -150,6 +150,14 @@ def test_views_of_one_name_do_not_overwrite_each_other(gaussians, tmp_path):
         np.testing.assert_array_equal(read(tmp_path / record["truth"]), view.image)
 
 
+def test_long_names_are_cut_to_what_a_file_system_allows(gaussians, tmp_path):
+    views = make_views(gaussians, [5, 20])
+    views = [View("照" * 80 + f"{k}.jpg", view.camera, view.image) for k, view in enumerate(views)]
+    records = evaluate(gaussians, views, tmp_path, REFERENCE)["views"]
+    for view, record in zip(views, records, strict=True):
+        np.testing.assert_array_equal(read(tmp_path / record["truth"]), view.image)
+
+
 def test_the_same_again_is_the_same_bytes(gaussians, tmp_path):
     views = make_views(gaussians, [5, 20])
     for out in ("one", "two"):

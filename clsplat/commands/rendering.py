@@ -114,10 +114,12 @@ class Render:
         from tqdm import tqdm
 
         from clsplat.dataset import load_scene
+        from clsplat.dataset.finding import without_suffix
         from clsplat.formats import load_gaussians
         from clsplat.render import renderings
         from clsplat.renderer import Renderer
         from clsplat.show.camera_paths import orbit
+        from clsplat.show.picture_names import distinct_stems
 
         data, out = dataset_of("render", self.data), place_of(self.out, self.scene, "render")
         try_folder(out)
@@ -127,7 +129,9 @@ class Render:
         gaussians = moved(gaussians, offset - scene.offset)
         views = scene.test or scene.train
         if self.path == "test":
-            cameras = {view.name: view.camera for view in views}
+            endings = "", *["_depth"] * self.depth, *["_median", "_normals"] * self.surface
+            stems = distinct_stems((without_suffix(view.name) for view in views), endings)
+            cameras = {stem: view.camera for stem, view in zip(stems, views, strict=True)}
         else:
             first = scene.train[0].camera
             path = orbit([view.camera for view in scene.train], self.frames, first.width, first.height)
@@ -154,7 +158,10 @@ class Render:
 
 
 def write_maps(path: Path, rendering: "Rendering", surface: "Surface | None", camera: "Camera") -> None:
-    """Write a rendering as PNG files: colours, the expected depth if it has one, and the surface's maps."""
+    """Write a rendering as PNG files: colours, the expected depth if it has one, and the surface's maps.
+
+    `path` is that of the colours without ``.png``.
+    """
     from PIL import Image
 
     from clsplat.atomic import replacing
@@ -167,8 +174,7 @@ def write_maps(path: Path, rendering: "Rendering", surface: "Surface | None", ca
     if surface is not None:
         maps["_median"] = scaled_depth(surface.depth)
         maps["_normals"] = colored_normals(surface.normals, camera)
-    target = path.with_suffix(".png")
-    new_folder(target.parent)
-    for suffix, pixels in maps.items():
-        with replacing(target.with_name(f"{target.stem}{suffix}.png")) as file:
+    new_folder(path.parent)
+    for ending, pixels in maps.items():
+        with replacing(path.with_name(f"{path.name}{ending}.png")) as file:
             Image.fromarray(pixels).save(file, format="PNG")

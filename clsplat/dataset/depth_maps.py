@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from clsplat.dataset.coverage import projected
 from clsplat.dataset.decoding import Dataset, PosedPhoto, fits, nearest, plan_view
+from clsplat.dataset.finding import without_suffix
 from clsplat.dataset.lenses import Intrinsics, is_pinhole
 from clsplat.dataset.photos import as_stored, opened
 from clsplat.dataset.undistortion import lens_positions, resampled
@@ -66,8 +67,7 @@ def find_depth_map(folder: Path, name: str) -> Path:
         If the photo has no depth map.
     """
     inside = name if (folder / "images").is_dir() else name.removeprefix("images/")
-    plain = folder / inside
-    candidates = [c for s in SUFFIXES for c in (plain.with_suffix(s), plain.with_name(plain.name + s))]
+    candidates = [folder / f"{stem}{s}" for s in SUFFIXES for stem in (without_suffix(inside), inside)]
     for file in candidates:
         if file.is_file():
             return file

@@ -28,6 +28,12 @@ def checked_name(name: Any, source: Path) -> str:
     return path.as_posix()
 
 
+def without_suffix(name: str) -> str:
+    """Remove the suffix of a photo's name. In ``render.0001``, as Blender writes it, what follows the dot is none."""
+    suffix = PurePosixPath(name).suffix
+    return name.removesuffix(suffix) if suffix.lower() in SUFFIXES else name
+
+
 def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path | None], int]:
     """Locate the files of photos, in the requested size if the dataset has it.
 
@@ -91,8 +97,8 @@ def _find(root: Path, name: str, downscale: int = 1) -> Path | None:
     if _is_file(path):
         return path
     # Smaller copies often have another suffix, and the transforms of Blender scenes omit it.
-    stem = path.with_suffix("") if path.suffix.lower() in SUFFIXES else path
-    candidates = (stem.with_name(stem.name + case) for suffix in SUFFIXES for case in (suffix, suffix.upper()))
+    stem = without_suffix(path.name)
+    candidates = (path.with_name(stem + case) for suffix in SUFFIXES for case in (suffix, suffix.upper()))
     return next((file for file in candidates if _is_file(file)), None)
 
 
@@ -111,8 +117,7 @@ def find_mask(folder: Path, name: str) -> Path:
     InputError
         If the photo has no mask.
     """
-    plain = folder / name
-    candidates = [plain.with_suffix(".png"), plain.with_name(plain.name + ".png")]
+    candidates = [folder / f"{without_suffix(name)}.png", folder / f"{name}.png"]
     for file in candidates:
         if _is_file(file):
             return file

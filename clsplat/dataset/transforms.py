@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from clsplat.config import DataConfig
 from clsplat.dataset.decoding import SIZE_MAX, Dataset, PosedPhoto
-from clsplat.dataset.finding import checked_name, find_mask, locate, mask_folder, warn_of_missing
+from clsplat.dataset.finding import (
+    checked_name,
+    find_mask,
+    locate,
+    mask_folder,
+    warn_of_missing,
+    without_suffix,
+)
 from clsplat.dataset.lenses import Intrinsics
 from clsplat.dataset.photos import photo_size
 from clsplat.errors import InputError
@@ -97,7 +104,8 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
     for (frame, path, held_out), name, file in zip(frames, names, files, strict=True):
         if file is None:
             continue
-        name = name if (root / name).suffix else name + file.suffix
+        if without_suffix(name) == name and not name.endswith(file.suffix):
+            name += file.suffix
         intrinsics = _intrinsics(frame, f"{path}, frame {name}", file, config.downscale // reduce)
         if masks is not None:
             inside = name if (masks / "images").is_dir() else name.removeprefix("images/")

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -98,6 +99,25 @@ def test_render_writes_views_and_orbits(trained: Path, dataset: Path, tmp_path: 
     run("render", trained / "scene.ply", dataset, "-o", tmp_path / "orbit", "--path", "orbit", "--frames", 3)
     assert sorted(p.name for p in (tmp_path / "orbit").iterdir()) == ["0000.png", "0001.png", "0002.png"]
     assert read_image(tmp_path / "orbit" / "0000.png").shape[:2] == SIZE[::-1]
+
+
+def test_each_view_is_rendered_to_files_of_its_own(trained: Path, dataset: Path, tmp_path: Path) -> None:
+    """Also where names differ in the suffix alone, or in what follows a dot and is no suffix."""
+    shutil.copytree(dataset, tmp_path / "data")
+    meta = json.loads((dataset / "transforms.json").read_text())
+    named = ["a.jpg", "a.png", "a_depth.png", "f/render.0001", "f/render.0002"]
+    (tmp_path / "data" / "f").mkdir()
+    for k, name in enumerate(named):
+        meta["frames"][k]["file_path"] = name
+        photo = tmp_path / "data" / f"{k}.png"
+        photo.rename(tmp_path / "data" / (f"{name}.png" if name.startswith("f") else name))
+    (tmp_path / "data" / "transforms.json").write_text(json.dumps(meta | {"test_filenames": named}))
+    out = tmp_path / "out"
+    run("render", trained / "scene.ply", tmp_path / "data", "-o", out, "--depth")
+    stems = ["a", "a_", "a_depth_", "f/render.0001", "f/render.0002"]
+    files = {path.relative_to(out).as_posix() for path in out.rglob("*.png")}
+    assert files == {f"{stem}{ending}.png" for stem in stems for ending in ("", "_depth")}
+    assert len({read_image(out / f"{stem}.png").tobytes() for stem in stems}) == 5
 
 
 def test_mesh_of_a_run(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

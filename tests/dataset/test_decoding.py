@@ -96,6 +96,9 @@ def test_masks_are_found_by_both_names(tmp_path):
     assert mask_folder(tmp_path, "masks") == tmp_path / "masks"
     assert find_mask(tmp_path / "masks", "a.jpg") == tmp_path / "masks/a.png"
     assert find_mask(tmp_path / "masks", "s/b.jpg") == tmp_path / "masks/s/b.jpg.png"
+    touch(tmp_path, "masks/render.png", "masks/render.0001.png")
+    for name in ("render.0001", "render.0001.png"):
+        assert find_mask(tmp_path / "masks", name) == tmp_path / "masks/render.0001.png"
     with pytest.raises(InputError, match=r"c\.png"):
         find_mask(tmp_path / "masks", "c.jpg")
     with pytest.raises(InputError, match="nowhere"):

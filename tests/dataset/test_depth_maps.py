@@ -99,13 +99,14 @@ def test_files_that_are_no_depth_maps_are_refused_by_name(tmp_path: Path, wrong:
 
 
 def test_maps_are_found_by_the_names_of_photos(tmp_path: Path) -> None:
-    for name in ("a.png", "s/b.jpg.npy", "c.tiff", "d.tif", "d.npy"):
+    for name in ("a.png", "s/b.jpg.npy", "c.tiff", "d.tif", "d.npy", "render.png", "render.0001.npy"):
         saved(tmp_path / name, np.ones((2, 2), np.float32 if "png" not in name else np.uint16))
     for photo, name in {
         "a.jpg": "a.png",
         "images/a.jpg": "a.png",
         "s/b.jpg": "s/b.jpg.npy",
         "c.png": "c.tiff",
+        "render.0001": "render.0001.npy",
     }.items():
         assert find_depth_map(tmp_path, photo) == tmp_path / name
     assert find_depth_map(tmp_path, "d.jpg") == tmp_path / "d.npy"

@@ -72,6 +72,17 @@ def test_blender_angle_and_names_without_ending(tmp_path):
     assert (scene.train[0].image == 255).all()  # transparent: the background
 
 
+def test_the_number_of_a_frame_is_no_suffix(tmp_path):
+    """Blender writes render.0001.png, and its file_path without .png."""
+    names = [f"images/render.{k:04d}" for k in range(4)]
+    write_photos(tmp_path, [f"{name}.png" for name in names] + ["masks/render.png"])
+    write_photos(tmp_path, [f"{name}.png".replace("images", "masks") for name in names])
+    write(tmp_path, names=names, fl_x=50)
+    photos = read_dataset(tmp_path, DataConfig(masks="masks")).photos
+    assert [photo.name for photo in photos] == [f"{name}.png" for name in names]
+    assert [photo.mask for photo in photos] == [tmp_path / "masks" / f"render.{k:04d}.png" for k in range(4)]
+
+
 def test_validation_photos_are_held_out_where_there_are_no_test_photos(tmp_path):
     names = ["train/0.png", "val/0.png", "test/0.png"]
     write_photos(tmp_path, names)
