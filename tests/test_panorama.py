@@ -100,6 +100,16 @@ def test_masks_become_faces_too(tmp_path):
         np.testing.assert_array_equal(view.mask[clear], (x > 0)[clear])
 
 
+@pytest.mark.parametrize("panoramas", ["faces", "whole"])
+def test_a_panorama_that_is_not_twice_as_wide_as_high_is_refused(tmp_path, panoramas):
+    write_dataset(tmp_path, 2)
+    for path in tmp_path.glob("*.png"):
+        with Image.open(path) as image:
+            image.crop((0, 0, 256, 120)).save(path)
+    with pytest.raises(InputError, match=r"\.png: expected a panorama twice as wide as high.*found 256x120 pixels"):
+        load_scene(tmp_path, DataConfig(panoramas=panoramas))
+
+
 def test_faces_of_a_panorama_are_held_out_together(tmp_path):
     write_dataset(tmp_path, 3)
     scene = load_scene(tmp_path, DataConfig(test_every=2))

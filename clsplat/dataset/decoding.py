@@ -212,6 +212,11 @@ def plan_view(photo: PosedPhoto, dataset: Dataset, invert_mask: bool) -> Plan:
             f"{photo.path}: expected {declared.width}x{declared.height} pixels, the size of its camera, or a smaller "
             f"copy, found {width}x{height}"
         )
+    if declared.model == "EQUIRECTANGULAR" and not fits((width, height), Intrinsics("", (), 2, 1)):
+        raise InputError(
+            f"{photo.path}: expected a panorama twice as wide as high, 360 by 180 degrees, found {width}x{height} "
+            "pixels; pad what was cut off, and mask it"
+        )
     sx, sy = width / declared.width, height / declared.height
     if photo.face is None and declared.model == "EQUIRECTANGULAR":
         whole = Camera.panorama(photo.viewmat, width)
