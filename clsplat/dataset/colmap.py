@@ -235,7 +235,7 @@ def _points_bin(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    text = path.read_text(encoding="utf-8", errors="surrogateescape")
+    text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
     yield from ((number, line.strip()) for number, line in enumerate(text.split("\n"), 1))
 
 

@@ -118,8 +118,9 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
 
 
 def _read_json(path: Path) -> Json:
+    """Read a file and check its frames; null means the same as a missing value."""
     try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
+        meta = json.loads(path.read_text(encoding="utf-8-sig"), object_hook=_without_null)
     except (RecursionError, ValueError) as error:
         raise InputError(f"cannot read {path} as JSON: {error}") from error
     frames = meta.get("frames") if isinstance(meta, dict) else None
@@ -129,6 +130,10 @@ def _read_json(path: Path) -> Json:
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise InputError(f'{path}: expected a "file_path" in every frame, found none in frame {number}')
     return dict(meta)
+
+
+def _without_null(values: Json) -> Json:
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def _complete(frame: Json, meta: Json) -> Json:

@@ -89,6 +89,15 @@ def test_both_encodings_say_the_same(tmp_path, ending):
     assert colors.dtype == np.uint8
 
 
+def test_a_byte_order_mark_is_skipped(tmp_path):
+    """Also before a first line that is no comment."""
+    write_txt(tmp_path)
+    for path in tmp_path.glob("*.txt"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().removeprefix(b"# a comment\n"))
+    cameras, images, points, _ = read_model(tmp_path)
+    assert (len(cameras), len(images), len(points)) == (2, 3, 2)
+
+
 @pytest.mark.parametrize("folder", FOLDERS)
 @pytest.mark.parametrize("photos", ["images", "."])
 def test_models_and_photos_are_found_where_they_may_be(tmp_path, folder, photos, ending):

@@ -292,6 +292,24 @@ def test_neither_focal_length_nor_angle_is_an_error(root):
         load_scene(root, DataConfig())
 
 
+def test_null_is_the_same_as_missing(root):
+    empty = {"mask_path": None, "k1": None, "fl_x": None, "camera_angle_x": None, "camera_model": None}
+    rows = [frame | empty for frame in frames()]
+    whole = {"fl_x": 50, "ply_file_path": None, "test_filenames": None, "is_fisheye": None}
+    (root / "transforms.json").write_text(json.dumps({"frames": rows, **whole}))
+    photos = read_dataset(root, DataConfig()).photos
+    assert {photo.intrinsics for photo in photos} == {Intrinsics("PINHOLE", (50, 50, 32, 24), 64, 48)}
+    assert {(photo.mask, photo.held_out) for photo in photos} == {(None, None)}
+
+
+def test_a_byte_order_mark_is_skipped(root):
+    """Windows' Notepad and PowerShell write it."""
+    write(root, fl_x=50)
+    path = root / "transforms.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(read_dataset(root, DataConfig()).photos) == 4
+
+
 @pytest.mark.parametrize("content", ["", "{", "[]", "\xff"])
 def test_files_that_are_no_transforms_are_refused_by_name(root, content):
     (root / "transforms.json").write_text(content, encoding="latin-1")
@@ -355,13 +373,12 @@ def test_whole_numbers_in_text_are_not_wrapped(root):
 @pytest.mark.parametrize(
     "change",
     [
-        {"mask_path": None},
         {"fl_x": 10**400},
         {"w": 1e300, "h": 7.5e299},
         {"transform_matrix": [[10**400] * 4] * 4},
         {"transform_matrix": [[1, 0, 0, 0], [1e308, -1, 0, 1e308], [0, 0, -1, 0], [0, 0, 0, 1]]},
     ],
-    ids=["mask", "focal length", "size", "pose", "product of a pose"],
+    ids=["focal length", "size", "pose", "product of a pose"],
 )
 def test_values_that_broke_the_reader(root, change):
     """Found by fuzzing: TypeError, OverflowError, a NumPy warning, and lists of 1e300 pixels."""
