@@ -34,6 +34,9 @@ training, and on a CPU for the memory of the device."""
 LAYERS = ("image", "mask", "clear")
 """Arrays of a view."""
 
+NO_COPIES = "photos are decoded each time that they are used"
+"""What a warning says where no copies can be written."""
+
 LOCK = ".lock"
 """Name of the file, in a folder of copies, that is locked while their process lives."""
 
@@ -157,8 +160,9 @@ class PhotoStream:
 
     def _read(self, name: str) -> View:
         source, known = self._sources[name], self._digests.get(name)
-        if self._copies is not None and known is not None:
-            copy = self._copies.read(name, source.camera)
+        copies = self._copies  # bound once: another thread may give them up
+        if copies is not None and known is not None:
+            copy = copies.read(name, source.camera)
             if copy is not None and copy.digests == known:
                 return copy
         view = source.decode()
@@ -169,10 +173,10 @@ class PhotoStream:
                 f"photo {name}: expected the pixels and mask that the run has read before, found others; put it back"
             )
         try:
-            if self._copies:
-                self._copies.write(view)
+            if copies is not None:
+                copies.write(view)
         except InputError as error:
-            warnings.warn(f"{error}; photos are decoded each time that they are used", stacklevel=2)
+            warnings.warn(f"{error}; {NO_COPIES}", stacklevel=2)
             self._copies = None
         return view
 
@@ -268,16 +272,24 @@ class Files:
         self._folder = folder
 
     @classmethod
-    def temporary(cls) -> "Files":
-        """Files in the user's cache that are removed when they are no longer used, and those of dead processes."""
-        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
-        root.mkdir(parents=True, exist_ok=True)
-        for left in root.glob("photos-*"):
-            with suppress(Timeout, OSError), FileLock(left / LOCK, blocking=False):
-                rmtree(left, ignore_errors=True)
-        folder = Path(mkdtemp(prefix="photos-", dir=root))
-        lock = FileLock(folder / LOCK)
-        lock.acquire()
+    def temporary(cls) -> "Files | None":
+        """Files in the user's cache that are removed when they are no longer used, and those of dead processes.
+
+        None, with a warning, where none can be written there.
+        """
+        try:
+            root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
+            root.mkdir(parents=True, exist_ok=True)
+            for left in root.glob("photos-*"):
+                with suppress(Timeout, OSError), FileLock(left / LOCK, blocking=False):
+                    rmtree(left, ignore_errors=True)
+            folder = Path(mkdtemp(prefix="photos-", dir=root))
+            lock = FileLock(folder / LOCK)
+            lock.acquire()
+        # Without a home, or on a file system without locks, it is a RuntimeError.
+        except (OSError, RuntimeError) as error:
+            warnings.warn(f"cannot write copies of photos to the cache: {error}; {NO_COPIES}", stacklevel=2)
+            return None
         result = cls(folder)
         finalize(result, _removed, folder, lock)
         return result

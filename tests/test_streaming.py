@@ -311,3 +311,26 @@ def test_a_full_disk_costs_the_copies_only(dataset: Path) -> None:
     with small_files(512), pytest.warns(UserWarning, match="photos are decoded each time that they are used"):
         found = [view.image for view in in_turn(scene.train)]
     assert all(np.array_equal(a, b.image) for a, b in zip(found, expected, strict=True))
+
+
+def test_a_cache_that_takes_no_files_costs_the_copies_only(dataset: Path, cache: Path) -> None:
+    cache.parent.mkdir(parents=True)
+    cache.write_text("a file where the folder would be")
+    with pytest.warns(UserWarning, match="cannot write copies of photos to the cache: .*each time"):
+        scene = streamed(dataset, DataConfig(downscale=2), photos=0.5)
+    expected = load_scene(dataset, DataConfig(downscale=2)).train
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(in_turn(scene.train), expected, strict=True))
+
+
+def test_a_reader_is_not_stopped_by_another_one_that_gives_up_the_copies(tmp_path: Path) -> None:
+    """As where two threads meet a full disk."""
+    view = View("a", streamed_camera(), np.zeros((2, 2, 3), np.uint8))
+    found = iter([Files(tmp_path)])
+
+    class GivenUp(PhotoStream):
+        _copies = property(lambda self: next(found, None), lambda self, copies: None)
+
+    stream = GivenUp({"a": Source(lambda: view, view.camera, ("image",))}, 12)
+    assert view.digests
+    stream.expect("a", view.digests)
+    np.testing.assert_array_equal(stream("a").image, view.image)
