@@ -243,7 +243,8 @@ class StreamedView(View):
         return self.of(self.name, camera, self._stream, self._load, self._depth)
 
     def with_depth(self, depth: DepthMap | None) -> View:
-        return self.of(self.name, self.camera, self._stream, self._load, depth)
+        load = (lambda: replace(self.loaded(), depth=depth)) if self._load else None
+        return self.of(self.name, self.camera, self._stream, load, depth)
 
     def changed(self, change: Callable[[View], View], camera: Camera | None = None) -> View:
         return self.of(self.name, camera or self.camera, self._stream, lambda: change(self.loaded()))

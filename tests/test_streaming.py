@@ -119,6 +119,10 @@ def test_views_keep_streaming_through_changes_of_camera_and_pixels(dataset: Path
     assert inverted.digests != view.digests == moved.digests
     deep = view.with_depth(DepthMap(np.ones(SIZE[::-1], np.float32))).with_camera(view.camera)
     assert isinstance(deep, StreamedView) and deep.loaded().depth is deep.depth is not None
+    deep = inverted.with_depth(DepthMap(np.ones(SIZE[::-1], np.float32)))
+    assert isinstance(deep, StreamedView) and deep.loaded().depth is deep.depth is not None
+    np.testing.assert_array_equal(deep.image, inverted.image)
+    assert deep.with_depth(None).depth is None is inverted.depth
     assert type(replace(view, name="other")) is View, "an ordinary view, in memory"
 
 
