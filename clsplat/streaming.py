@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from clsplat.atomic import replacing
 from clsplat.camera import Camera
 from clsplat.errors import InputError
+from clsplat.host_memory import physical_memory
 from clsplat.scene import DepthMap, View
 
 MOST_AHEAD = 8
@@ -39,14 +40,6 @@ NO_COPIES = "photos are decoded each time that they are used"
 
 LOCK = ".lock"
 """Name of the file, in a folder of copies, that is locked while their process lives."""
-
-
-def physical_memory() -> int | None:
-    """Memory of the machine in bytes; None where the system does not tell it."""
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError):  # Windows has no sysconf
-        return None
 
 
 def photo_budget(memory: int | None) -> int | None:

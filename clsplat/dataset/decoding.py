@@ -16,16 +16,20 @@ from clsplat.dataset.lenses import Intrinsics, is_pinhole, rendered
 from clsplat.dataset.photos import is_transparent, orientation, photo_size, read_mask, read_photo
 from clsplat.dataset.undistortion import lens_positions, resampled, squares_of
 from clsplat.errors import InputError
+from clsplat.host_memory import physical_memory
 from clsplat.panorama import FACES, bordered, face_positions, rotated
 from clsplat.scene import View
-from clsplat.streaming import Files, PhotoStream, Source, photo_budget, physical_memory
+from clsplat.streaming import Files, PhotoStream, Source, photo_budget
 
 SIZE_MAX = 1 << 20
 """Largest width or height of a photo, px. A larger declared size means a damaged file; undistortion would take time
 in proportion to it."""
 
 CHANNELS = 3
-"""Bytes of a decoded pixel."""
+"""Bytes of a pixel of a decoded image."""
+
+DOWNSCALES = (2, 4, 8)
+"""Values of ``--downscale`` that make photos smaller."""
 
 ASPECT_TOLERANCE = 0.01
 """Largest relative difference between the aspect ratios of a photo and its camera. The size of a smaller copy may
@@ -142,49 +146,54 @@ def load_views(dataset: Dataset, config: DataConfig, memory: int | None = None) 
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         plans = list(pool.map(lambda photo: plan_view(photo, dataset, config.invert_masks), dataset.photos))
-        _check_memory(plans, config)
+        sizes = list(pool.map(lambda plan: _decoded(plan, config), plans))
+        _check_memory(plans, sizes, config)
         budget = photo_budget(memory)
-        if budget is not None and sum(map(_decoded, plans)) > budget:
+        if budget is not None and sum(sizes) > budget:
             return _stream(plans, dataset.reduce, config, budget).views()
         views = pool.map(lambda plan: _view(plan, dataset.reduce, config), plans)
         return list(tqdm(views, "photos", len(plans), unit="photo", dynamic_ncols=True, leave=False))
 
 
-def _check_memory(plans: list[Plan], config: DataConfig) -> None:
-    """Raise an InputError if the largest file and what is decoded of it do not fit the machine."""
-    largest = max(CHANNELS * plan.size[0] * plan.size[1] for plan in plans)
-    need = max(map(_decoded, plans))
+def _check_memory(plans: list[Plan], sizes: list[int], config: DataConfig) -> None:
+    """Raise an InputError if a file and what is decoded of it do not fit the machine."""
+    files = [CHANNELS * plan.size[0] * plan.size[1] for plan in plans]
+    k = max(range(len(plans)), key=lambda k: files[k] + sizes[k])
     available = physical_memory()
-    if available is None or need + largest <= available:
+    if available is None or files[k] + sizes[k] <= available:
         return
-    fitting = [d for d in (2, 4, 8, 16) if need / d**2 + largest <= available]
-    remedy = f"--downscale {config.downscale * fitting[0]}" if fitting else "use fewer or smaller photos"
+    fitting = [d for d in DOWNSCALES if d > config.downscale]
+    fitting = [d for d in fitting if files[k] + sizes[k] * (config.downscale / d) ** 2 <= available]
+    remedy = f"--downscale {fitting[0]}" if fitting else "use smaller photos"
     raise InputError(
-        f"{plans[0].photo.path.parent}: expected photos that fit this machine's memory of {available / 1e9:.2f} GB, "
-        f"found one that takes {(need + largest) / 1e9:.2f} GB; {remedy}"
+        f"{plans[k].photo.path}: expected photos that fit this machine's memory of {available / 1e9:.2f} GB, found "
+        f"one that takes {(files[k] + sizes[k]) / 1e9:.2f} GB; {remedy}"
     )
 
 
-def _decoded(plan: Plan) -> int:
-    """Bytes of a decoded photo."""
-    return CHANNELS * plan.camera.width * plan.camera.height
+def _layers(plan: Plan, config: DataConfig) -> tuple[str, ...]:
+    """Arrays that a decoded photo may have."""
+    masked = plan.photo.mask is not None or plan.camera.model == "fisheye"
+    clear = config.random_background and is_transparent(plan.photo.path)
+    return "image", *["mask"] * masked, *["clear"] * clear
+
+
+def _decoded(plan: Plan, config: DataConfig) -> int:
+    """Bytes of a decoded photo, at most: one per pixel for each array beside the image."""
+    return (CHANNELS + len(_layers(plan, config)) - 1) * plan.camera.width * plan.camera.height
 
 
 def _stream(plans: list[Plan], reduce: int, config: DataConfig, memory: int) -> PhotoStream:
     """The photos, decoded when they are needed. Where that is more than reading the file, copies are kept on disk."""
 
     def source(plan: Plan) -> Source:
-        layers = ["image"]
-        if plan.photo.mask is not None or plan.camera.model == "fisheye":
-            layers.append("mask")
-        if config.random_background and is_transparent(plan.photo.path):
-            layers.append("clear")
+        layers = _layers(plan, config)
 
         def used() -> bool:
             mask = _mask(plan, reduce, _source_positions(plan, reduce)) if "mask" in layers else None
             return mask is None or bool(mask.any())
 
-        return Source(lambda: _view(plan, reduce, config), plan.camera, tuple(layers), used)
+        return Source(lambda: _view(plan, reduce, config), plan.camera, layers, used)
 
     slow = reduce > 1 or any(plan.photo.face or not is_pinhole(plan.photo.intrinsics) for plan in plans)
     sources = {plan.photo.name: source(plan) for plan in plans}

@@ -207,6 +207,38 @@ def test_headers_are_checked_before_any_photo_is_decoded(tmp_path, monkeypatch):
         load(*photos, posed(tmp_path / "x.png"))
 
 
+# ---- memory
+
+
+def test_masks_and_transparency_count_among_the_bytes_of_photos(tmp_path):
+    """A photo takes 3 bytes per pixel, its mask and its transparency 1 each."""
+    rgba = np.dstack([noise(), np.full((48, 64), 100, np.uint8)])
+    photo, mask = save(tmp_path / "a.png", rgba), save(tmp_path / "m.png", np.full((48, 64), 255, np.uint8))
+    dataset = Dataset([posed(photo, mask=mask)], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    config = DataConfig(random_background=True)
+    (view,) = load_views(dataset, config, memory=5 * 64 * 48)
+    assert not view.ahead and view.mask is not None and view.clear is not None
+    (view,) = load_views(dataset, config, memory=5 * 64 * 48 - 1)
+    assert view.ahead, "it streams"
+
+
+@pytest.mark.parametrize(
+    ("downscale", "available", "remedy"),
+    [(1, 10_800, "--downscale 4"), (2, 10_800, "--downscale 4"), (2, 9_500, "--downscale 8"), (8, 0, "use smaller")],
+)
+def test_photos_that_do_not_fit_the_memory_are_named_with_a_remedy(
+    tmp_path, monkeypatch, downscale, available, remedy
+):
+    """The larger file takes 9216 bytes, and as many once more where it is not reduced."""
+    monkeypatch.setattr("clsplat.dataset.decoding.physical_memory", lambda: available)
+    small = posed(
+        save(tmp_path / "small.png", noise(32, 24)), Intrinsics("PINHOLE", (50.0, 60.0, 16.0, 12.0), 32, 24)
+    )
+    large = posed(save(tmp_path / "large.png", noise()))
+    with pytest.raises(InputError, match=rf"large\.png: expected photos that fit .*; {remedy}"):
+        load(small, large, reduce=downscale, downscale=downscale)
+
+
 # ---- masks
 
 

@@ -236,7 +236,7 @@ def test_a_photo_that_exceeds_the_machines_memory_is_refused(scene, trained, mon
     found = trained(scene)
     assert found.error and "found one that takes 0.00 GB; --downscale 2" in found.sentence
     monkeypatch.setattr(decoding, "physical_memory", lambda: 3_000)
-    assert trained(scene).sentence.endswith("use fewer or smaller photos")
+    assert trained(scene).sentence.endswith("use smaller photos")
 
 
 def test_large_photos_that_exceed_the_devices_memory_are_refused(scene, trained):
