@@ -10,9 +10,19 @@ from typing import BinaryIO
 
 from clsplat.errors import InputError
 
+NAME_MAX = 200
+"""Most bytes of a name to which something is added. File systems allow 255 in all."""
+
 PART = re.compile(r"\..*\.[0-9a-f]{16}\.part", re.DOTALL)
-"""Name of a hidden file that `replacing` writes: that of the file, and a random number. It differs from those of all
-other processes, also on machines that share the folder."""
+"""Name of a hidden file that `replacing` writes: that of the file, `shortened`, and a random number. It differs from
+those of all other processes, also on machines that share the folder."""
+
+
+def shortened(name: str) -> str:
+    """Cut a file's name to `NAME_MAX` bytes, between two characters."""
+    while len(os.fsencode(name)) > NAME_MAX:
+        name = name[:-1]
+    return name
 
 
 @contextmanager
@@ -29,7 +39,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
         If the file cannot be written, for example because the folder does not exist or the disk is full.
     """
     path = Path(path)
-    part = path.with_name(f".{path.name}.{token_hex(8)}.part")
+    part = path.with_name(f".{shortened(path.name)}.{token_hex(8)}.part")
     try:
         with part.open("wb") as file:
             yield file

@@ -78,6 +78,13 @@ def test_two_writers_of_a_file_have_parts_of_their_own(tmp_path: Path) -> None:
     assert (tmp_path / "a.bin").read_bytes() == b"1111"  # the outer one ends last
 
 
+def test_a_name_may_be_as_long_as_the_file_system_allows(tmp_path: Path) -> None:
+    path = tmp_path / ("a" * 251 + ".bin")
+    with replacing(path) as file:
+        file.write(b"12345")
+    assert path.read_bytes() == b"12345"
+
+
 def test_only_parts_are_removed(tmp_path: Path) -> None:
     kept = {"scene.ply", ".hidden", ".mine.part", "film.part", "below"}
     for name in kept - {"below"}:

@@ -1,10 +1,8 @@
 """Names of the pictures that are written for photos."""
 
-import os
 from collections.abc import Iterable
 
-STEM_MAX = 200
-"""Most bytes of a picture's name without its ending. File systems allow 255 with it."""
+from clsplat.atomic import shortened
 
 
 def distinct_stems(stems: Iterable[str], endings: tuple[str, ...] = ("",)) -> list[str]:
@@ -21,9 +19,7 @@ def distinct_stems(stems: Iterable[str], endings: tuple[str, ...] = ("",)) -> li
     taken: set[str] = set()
     for stem in stems:
         folder, slash, last = stem.rpartition("/")
-        while len(os.fsencode(last)) > STEM_MAX:
-            last = last[:-1]
-        stem = folder + slash + last
+        stem = folder + slash + shortened(last)
         while not taken.isdisjoint(files := {f"{stem}{ending}".casefold() for ending in endings}):
             stem += "_"
         taken |= files
