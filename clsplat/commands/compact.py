@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from clsplat.commands.console import DeviceName, Out, SceneOrRun, moved, open_device, say
+from clsplat.commands.info import bytes_of
 from clsplat.commands.options import DrawOptions, PhotoOptions
 from clsplat.commands.run_folders import scene_file, with_run
 from clsplat.config import BACKGROUNDS
@@ -94,9 +95,9 @@ class Compact:
 
         found = compact(gaussians, pricing, loss, limits, stored, renderer)
         save_gaussians(self.out, found.gaussians, mode, offset)
-        size = source.stat().st_size if source.is_file() else stored(gaussians)[1]
         say(
-            f"{self.scene}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, {bytes_text(size)}\n"
+            f"{self.scene}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, "
+            f"{bytes_text(bytes_of(source))}\n"
             f"{self.out}: {len(found.gaussians)} Gaussians of degree {found.gaussians.sh_degree}, "
             f"{bytes_text(self.out.stat().st_size)}"
         )

@@ -56,11 +56,11 @@ class Info:
 
 def scene_lines(path: Path) -> list[str]:
     """Describe a file of Gaussians."""
-    from clsplat.formats import anatomy_of, load_gaussians, suffix_of
+    from clsplat.formats import anatomy_of, load_gaussians
 
     gaussians, mode, offset = load_gaussians(path)
     anatomy = anatomy_of(path)
-    size = path.stat().st_size if suffix_of(path) and path.is_file() else sum(anatomy.parts.values())
+    size = bytes_of(path)
     low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
     first, middle, last = np.percentile(gaussians.means, [1, 50, 99], axis=0)
     rows = {
@@ -80,6 +80,13 @@ def scene_lines(path: Path) -> list[str]:
     title = "bytes by part, before compression" if anatomy.packed else "bytes by part"
     parts = {name: (_size(n), n) for name, n in anatomy.parts.items()}
     return [str(path), *_table(rows), "", title, *_bars(parts), "", *_histograms(gaussians)]
+
+
+def bytes_of(path: Path) -> int:
+    """Size of a file of Gaussians, or of all files that belong to a folder or to what describes one."""
+    from clsplat.formats import anatomy_of, suffix_of
+
+    return path.stat().st_size if suffix_of(path) and path.is_file() else sum(anatomy_of(path).parts.values())
 
 
 def run_lines(folder: Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import zipfile
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from clsplat.cli import main
 from clsplat.commands.run_folders import read_run
 from clsplat.commands.train import Train
 from clsplat.formats import load_gaussians
+from clsplat.training.memory import bytes_text
 
 SETTINGS = ("--downscale", 2, "--background", "white", "--test-every", 3, "--mode", "antialiased")
 
@@ -85,6 +87,18 @@ def test_compact_compares_with_the_photos_of_the_run(copied: Path, tmp_path: Pat
     run("compact", copied, "-o", tmp_path / "small.ply", "--max-gaussians", 100)
     assert "against the evaluation photos" in capsys.readouterr().err
     assert len(load_gaussians(tmp_path / "small.ply")[0]) == 100
+
+
+@pytest.mark.parametrize("part", [".", "meta.json"])
+def test_compact_tells_the_size_of_all_files_of_a_scene(
+    white: Path, dataset: Path, tmp_path: Path, capsys, part: str
+) -> None:
+    run("export", white / "scene.ply", tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(tmp_path / "sog")
+    files = sum(path.stat().st_size for path in (tmp_path / "sog").iterdir())
+    run("compact", tmp_path / "sog" / part, "-o", tmp_path / "b.ply", "--cameras", dataset, "--max-gaussians", 100)
+    assert f", {bytes_text(files)}\n" in capsys.readouterr().err
 
 
 def test_info_tells_scores_and_settings(copied: Path, dataset: Path, capsys) -> None:
