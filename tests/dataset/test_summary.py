@@ -67,6 +67,20 @@ def test_photos_without_a_pose_are_named(model):
     assert found.summary().startswith("3 of 15 photos")
 
 
+def test_warnings_take_time_in_proportion_to_the_photos(model):
+    """Thousands of photos took minutes: everything was read again for each of them."""
+    passes = []
+
+    class Counted(list):
+        def __iter__(self):
+            passes.append(None)
+            return super().__iter__()
+
+    names = [f"{k}.jpg" for k in range(50)]
+    Preview(names, replace(model, names=Counted(model.names)), np.ones(50)).warnings()
+    assert len(passes) < 5
+
+
 @pytest.fixture
 def dataset(tmp_path):
     """Photos, one of them blurred and one without a pose, with a model written by pycolmap."""

@@ -137,17 +137,15 @@ class Preview:
     def warnings(self) -> list[str]:
         """List problems of photos and poses, each with a remedy; empty if there are none."""
         m, found = self.model, []
-        missing = [name for name in self.photos if name not in set(m.names)]
+        posed = set(m.names)
+        missing = [name for name in self.photos if name not in posed]
         if missing:
             found.append(
                 f"no pose was found for {self._share(missing)}; they are not trained on. They overlap too little "
                 "with the others, are blurred, or lack texture; take photos in between"
             )
-        blurred = [
-            name
-            for name, value in zip(self.photos, self.sharpness, strict=True)
-            if value < BLUR_MAX * np.median(self.sharpness)
-        ]
+        least = BLUR_MAX * np.median(self.sharpness) if self.photos else 0
+        blurred = [name for name, value in zip(self.photos, self.sharpness, strict=True) if value < least]
         if blurred:
             found.append(f"blurred compared with the others: {self._share(blurred)}; leave them out")
         weak = [name for name, count in zip(m.names, m.points_seen, strict=True) if count < POINTS_MIN]
