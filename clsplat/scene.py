@@ -75,10 +75,12 @@ class View:
     name : str
         Path of the photo inside its folder, with forward slashes.
     camera : Camera
-        Pinhole or fisheye camera of the photo's size, in the coordinates of the scene.
+        Pinhole, fisheye or, of a whole panorama, equirectangular camera of the photo's size, in the coordinates of
+        the scene.
     image : (H, W, 3) uint8
-        The photo, RGB: upright, undistorted unless the camera is a fisheye, composited on the background where it was
-        transparent.
+        The photo, RGB, composited on the background where it was transparent. It is undistorted unless the camera is
+        a fisheye or a panorama. It is upright if its camera was recovered by clsplat; otherwise as its file stores
+        it, unless only the upright photo has the camera's size.
     mask : (H, W) bool, optional
         True where pixels are used.
     clear : (H, W) uint8, optional
