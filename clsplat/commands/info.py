@@ -142,23 +142,30 @@ def _scores(folder: Path, last: Mapping[str, Any]) -> dict[str, str]:
 def dataset_lines(path: Path) -> list[str]:
     """Describe a dataset, without recovering its cameras."""
     from clsplat.config import DataConfig
-    from clsplat.dataset import colmap, transforms
+    from clsplat.dataset import colmap
+    from clsplat.dataset.finding import PhotosMissing
+    from clsplat.dataset.loading import COLMAP, PHOTOS, TRANSFORMS, detect
     from clsplat.dataset.photos import list_photos, photo_folder, photo_size
     from clsplat.dataset.sfm import reconstruction as sfm
 
     record, model = sfm.read_record(path), colmap.find_model(path)
     source = sfm.recorded_photos(path, record) if record else path
     photos = [photo_folder(source) / name for name in list_photos(source)]
-    if model is not None:
+    try:
+        what, dataset = detect(path, DataConfig())
+    except PhotosMissing:
+        if model is None:
+            raise
+        what, dataset, photos = COLMAP, None, []
+    if dataset is not None:
+        photos = [photo.path for photo in dataset.photos]
+    if what == TRANSFORMS and dataset is not None:
+        lenses, points, model = [photo.intrinsics for photo in dataset.photos], dataset.points, None
+    elif model is not None:
         cameras, posed, points, _ = colmap.read_model(model)
         lenses = [cameras[camera] for _, camera, _ in posed]
-        what = "photos with cameras recovered by clsplat" if record else "COLMAP model"
-    elif transforms.find_transforms(path):
-        dataset = transforms.read_dataset(path, DataConfig())
-        photos = [photo.path for photo in dataset.photos]
-        lenses, points, what = [photo.intrinsics for photo in dataset.photos], dataset.points, "transforms.json"
     elif photos:
-        lenses, points, what = [], np.empty((0, 3)), "photos without cameras: train or sfm recovers them"
+        lenses, points, what = [], np.empty((0, 3)), f"{PHOTOS}: train or sfm recovers them"
     else:
         raise InputError(f"{path}: expected a scene, a run or a dataset, found neither photos nor cameras")
     rows = {"what": what, "photos": f"{len(photos):,}"}

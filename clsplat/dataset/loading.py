@@ -23,6 +23,14 @@ from clsplat.errors import InputError, named
 from clsplat.ranges import FLOAT32_MAX, check
 from clsplat.scene import Scene, View
 
+RECOVERED, COLMAP, TRANSFORMS, PHOTOS = (
+    "photos with cameras recovered by clsplat",
+    "COLMAP model",
+    "transforms.json",
+    "photos without cameras",
+)
+"""Kinds of datasets."""
+
 OFFSET_EXTENTS = 1000
 """Largest distance of the cameras from the origin, in scene extents, at which the origin is kept. Farther out, it is
 moved to the cameras. At this distance float32 resolves 6e-5 extents; a coarser resolution would lose the small steps
@@ -251,24 +259,45 @@ def _faces_of(names: set[str], dataset: Dataset, config: DataConfig) -> list[Pos
     return sorted(chosen, key=lambda photo: photo.name)
 
 
-def _read_dataset(path: Path, config: DataConfig, verbose: bool) -> Dataset:
-    """Read a dataset of any kind; recover the cameras if it has none."""
-    record = sfm.read_record(path)
-    model = colmap.find_model(path)
-    has_transforms = bool(transforms.find_transforms(path))
-    if record is None and model is not None:
+def detect(path: Path, config: DataConfig) -> tuple[str, Dataset | None]:
+    """Find out of which kind a dataset is, and read it if it comes with cameras.
+
+    Returns
+    -------
+    str
+        `RECOVERED`, `COLMAP`, `TRANSFORMS` or `PHOTOS`.
+    Dataset or None
+        The content of the kinds `COLMAP` and `TRANSFORMS`.
+
+    Raises
+    ------
+    PhotosMissing
+        If none of their photos is found.
+    InputError
+        If a file is missing or damaged; the message names it.
+    """
+    if sfm.read_record(path) is not None:
+        return RECOVERED, None
+    model, has_transforms = colmap.find_model(path), bool(transforms.find_transforms(path))
+    if model is not None:
         try:
-            return colmap.read_dataset(path, model, config)
+            return COLMAP, colmap.read_dataset(path, model, config)
         except PhotosMissing:
             if not has_transforms:
                 raise
-    if record is None and has_transforms:
-        return transforms.read_dataset(path, config)
-    if record is None and not list_photos(path):
+    return (TRANSFORMS, transforms.read_dataset(path, config)) if has_transforms else (PHOTOS, None)
+
+
+def _read_dataset(path: Path, config: DataConfig, verbose: bool) -> Dataset:
+    """Read a dataset of any kind; recover the cameras if it has none."""
+    kind, dataset = detect(path, config)
+    if dataset is not None:
+        return dataset
+    if kind == PHOTOS and not list_photos(path):
         raise InputError(
             f"{path}: expected a COLMAP model (sparse/0), a transforms.json or photos (here or in images), found none"
         )
-    photos, options = path, config.sfm
+    photos, options, record = path, config.sfm, sfm.read_record(path)
     if record is not None:
         photos = sfm.recorded_photos(path, record)
         # Cameras that were recovered with other options are kept, unless options are given now.

@@ -1,14 +1,18 @@
 """The output of `clsplat info` for files of every format, runs and datasets."""
 
 import json
+import shutil
 import warnings
 
 import numpy as np
 import pytest
 from bounds import HOLDS
 from PIL import Image
+from test_colmap import IMAGES, write_photos, write_txt
 
 from clsplat.cli import main
+from clsplat.config import DataConfig
+from clsplat.dataset import load_scene
 from clsplat.formats import FORMATS, save_gaussians
 from clsplat.testing import synthetic_scene
 
@@ -134,6 +138,23 @@ def test_photos_and_transforms(tmp_path, capsys):
     rows, _ = info(tmp_path, capsys)
     assert rows["what"] == "transforms.json" and rows["poses"] == "2" and rows["points"] == "0"
     assert rows["cameras"] == "2 of PINHOLE 40x20" and rows["sizes"] == "2 of 40x20"
+
+
+def test_a_dataset_is_that_which_train_reads(tmp_path, capsys):
+    """A COLMAP model whose photos are in folders beside it; the transforms.json if there are none."""
+    images = [(f"cam0/{name}", camera, *pose) for name, camera, *pose in IMAGES]
+    write_txt(tmp_path / "sparse" / "0", images=images)
+    write_photos(tmp_path, images)
+    rows, _ = info(tmp_path, capsys)
+    assert (rows["what"], rows["photos"], rows["poses"]) == ("COLMAP model", "3", "3")
+    assert rows["sizes"] == "2 of 64x48, 1 of 40x30"
+    shutil.rmtree(tmp_path / "cam0")
+    Image.new("RGB", (40, 20)).save(tmp_path / "0.png")
+    frames = [{"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "frames": frames}))
+    rows, _ = info(tmp_path, capsys)
+    assert rows["what"] == "transforms.json" and rows["photos"] == rows["poses"] == "1" and "model" not in rows
+    assert [view.name for view in load_scene(tmp_path, DataConfig(test_every=0)).train] == ["0.png"]
 
 
 def test_a_colmap_model(shared, capsys):
