@@ -8,21 +8,22 @@
 // Mapping: one work-item per splat.
 //
 // Buffers, N splats: in and out extents[N,2] px, 0 for dropped splats, opacities[N], v_opacities[N].
-// A splat that is invisible, because it is too faint or too far outside, stays invisible: its gradients are small.
+// A splat that is invisible, because it is too faint or too far outside, stays invisible: its gradients are small. The
+// outline of a splat along rays does not grow in proportion: project.cl has computed it for the new opacity (`outlined`).
 #include "common.h"
 #include "ellipse.h"
 #include "philox.h"
 
 // Draws below `threshold` = r 2^32 are dropped; gain is 1 / (1 - r).
 __kernel void dropout_fwd(const uint n, const uint2 key, const uint iteration, const uint threshold, const real gain,
-                          __global real *extents, __global real *opacities) {
+                          const int outlined, __global real *extents, __global real *opacities) {
     const size_t i = get_global_id(0);
     if (i >= n || !(extents[2 * i] > 0))
         return;
     const real opacity = opacities[i];
     const bool kept = philox((uint4)((uint)i, iteration, 1, 0), key).x >= threshold;
     // Half widths are proportional to the square root of r2.
-    const real growth = kept ? sqrt(ellipse_r2(gain * opacity) / ellipse_r2(opacity)) : 0;
+    const real growth = !kept ? 0 : outlined ? 1 : sqrt(ellipse_r2(gain * opacity) / ellipse_r2(opacity));
     store2(extents, i, growth * load2(extents, i));
     opacities[i] = kept ? gain * opacity : 0;
 }

@@ -259,7 +259,7 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
                                   __global real *colors
 #if RAYS
                                   ,
-                                  __global real *rays
+                                  __global real *rays, const real gain
 #endif
 ) {
     const size_t i = LANES * get_global_id(0);
@@ -272,12 +272,13 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
     const Activated activated = activate(load_vectors3(log_scales, i, n), load_numbers(logit_opacities, i, n));
     const Footprint f = footprint(&camera, mean, activated.scales, normalized4(quat));
     const reals opacity = activated.opacity * compensation(f.det0, f.det);
-    const reals r2 = ellipse_r2(opacity);
 #if RAYS
+    const reals r2 = ellipse_r2(gain * opacity);
     const Outline outline = ray_outline(&camera, &f, r2);
     const reals2 centre = outline.centre, extent = outline.extent;
     const reals3 conic = outline.conic;
 #else
+    const reals r2 = ellipse_r2(opacity);
     const reals2 centre = lens_centre(&camera, f.p);
     const reals2 extent = {ROOTS(r2 * f.xx), ROOTS(r2 * f.yy)};
     const reals3 conic = vector3(f.yy / f.det, -f.xy / f.det, f.xx / f.det);

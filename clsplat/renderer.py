@@ -15,7 +15,7 @@ from clsplat.constants import GPU_TILE, TILE, WIDE_TILE
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.ranges import check
-from clsplat.scene import Color
+from clsplat.scene import Color, check_color
 from clsplat.stages import AnyGrads, AnySplats, Bins, Dropout, Image, Stages
 
 if TYPE_CHECKING:
@@ -211,7 +211,7 @@ class Renderer:
         camera = self._near(camera)
         behind = np.array([*(self.background if background is None else background), *[0.0] * bool(depth)])
         inverse = depth == "inverse"
-        splats = self.project(gaussians, camera, degree, len(behind), inverse)
+        splats = self.project(gaussians, camera, degree, len(behind), inverse, dropout.gain if dropout else 1.0)
         if dropout:
             self.stages.dropout_fwd(splats, dropout)
         drawn = splats
@@ -249,11 +249,19 @@ class Renderer:
         return camera if near in (None, camera.near) else replace(camera, near=near)
 
     def project(
-        self, gaussians: Gaussians, camera: Camera, sh_degree: int, channels: int = 3, inverse: bool = False
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        sh_degree: int,
+        channels: int = 3,
+        inverse: bool = False,
+        gain: float = 1.0,
     ) -> AnySplats:
-        """Splats of placed Gaussians. A fourth channel is the depth, or with `inverse` its inverse."""
+        """Splats of placed Gaussians, for a dropout of this gain. A fourth channel is the depth, or its inverse."""
         options = {"antialiased": self.config.mode == "antialiased", "rays": along_rays(self.config, camera)}
-        splats = self.stages.project_fwd(gaussians, self._near(camera), sh_degree, channels=channels, **options)
+        splats = self.stages.project_fwd(
+            gaussians, self._near(camera), sh_degree, channels=channels, gain=gain, **options
+        )
         if inverse:
             self.stages.disparity_fwd(splats)
         return splats
@@ -304,16 +312,6 @@ class Renderer:
 def along_rays(config: RenderConfig, camera: Camera) -> bool:
     """Whether Gaussians are evaluated along rays. For an orthographic camera, the affine projection is exact."""
     return config.projection == "ray" and camera.model != "orthographic"
-
-
-def check_color(name: str, color: Any) -> None:
-    """Raise an InputError, which names the argument, if a colour is not three finite numbers."""
-    try:
-        usable = np.shape(color) == (3,) and bool(np.isfinite(np.asarray(color, np.float64)).all())
-    except (TypeError, ValueError):
-        usable = False
-    if not usable:
-        raise InputError(f"{name}: expected three finite numbers, RGB, found {color!r:.60}")
 
 
 def default_device() -> "Device":

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat import display
 from clsplat.camera import Camera, spread_of_positions
+from clsplat.errors import InputError
 
 Color = tuple[float, float, float]
 
@@ -22,6 +23,16 @@ DIGEST_BYTES = 16
 
 THUMBNAILS = 8
 """Approximate number of photos that a notebook shows of a scene."""
+
+
+def check_color(name: str, color: Any) -> None:
+    """Raise an InputError, which names the argument, if a colour is not three finite numbers."""
+    try:
+        usable = np.shape(color) == (3,) and bool(np.isfinite(np.asarray(color, np.float64)).all())
+    except (TypeError, ValueError):
+        usable = False
+    if not usable:
+        raise InputError(f"{name}: expected three finite numbers, RGB, found {color!r:.60}")
 
 
 @dataclass(frozen=True, eq=False)

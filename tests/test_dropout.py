@@ -1,12 +1,17 @@
 """Stage dropout: shares and means of the draws, the kernel against the twin, and gradients through an image."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tolerances import DOUBLE, FLOAT
 
 from clsplat import ops, reference
+from clsplat.camera import Camera
+from clsplat.config import RenderConfig
+from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer, fetch
-from clsplat.stages import Dropout, Image, SplatGrads, Splats
+from clsplat.stages import Dropout, Image, RaySplats, SplatGrads, Splats
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene
 
 
@@ -65,6 +70,42 @@ def test_boxes_are_those_of_the_new_opacity():
     expected = reference.project_fwd(gaussians, camera, 3)
     assert possible.sum() > 100
     np.testing.assert_allclose(found.extents[possible], expected.extents[possible], rtol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "fisheye"])
+def test_images_along_rays_are_those_of_the_new_opacity(device64, model):
+    """Of one Gaussian whose outline is not in proportion to the root of r2, because it is long towards the camera."""
+    viewmat, dropout = np.eye(4), Dropout(0.5, 3, 1)  # which keeps it
+    viewmat[2, 3] = 1
+    camera = Camera(viewmat, 200, 200, 200, 150, 400, 300, model=model, near=0.01)
+    renderer = Renderer(device64, RenderConfig(projection="ray", tile_size=8))
+    for x in (0.1, 0.3, 0.5):
+        images = []
+        for opacity, options in ((0.4, {"dropout": dropout}), (0.8, {})):
+            logit = np.log([opacity / (1 - opacity)])
+            scales = np.log([[0.03, 0.03, 0.28]])
+            one = Gaussians(np.array([[x, 0, 0]]), scales, np.eye(4)[:1], logit, np.ones((1, 1, 3)))
+            run = renderer.forward(one, camera, **options)
+            images.append(run.image.alpha.get())
+        assert images[1].max() > 0.7
+        np.testing.assert_allclose(images[0], images[1], atol=1e-12)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "fisheye"])
+def test_along_rays_matches_twin(any_device, model):
+    gaussians, camera = synthetic_scene(500, width=160, height=120)
+    dropout = Dropout(0.3, 7, 9)
+    splats = reference.project_fwd(gaussians, replace(camera, model=model), 3, rays=True, gain=dropout.gain)
+    found = RaySplats(*(any_device.upload("splats", a) for a in splats))
+    ops.dropout_fwd(any_device, found, dropout)
+    expected = RaySplats(*(a.copy() for a in splats))
+    reference.dropout_fwd(expected, dropout)
+    kept = (expected.extents > 0).all(axis=1)
+    assert 0.6 < kept.sum() / (splats.extents[:, 0] > 0).sum() < 0.8
+    np.testing.assert_array_equal(expected.extents[kept], splats.extents[kept])
+    tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
+    for name in ("extents", "opacities"):
+        assert_matches(name, getattr(found, name).get(), getattr(expected, name), tolerances)
 
 
 def test_each_iteration_and_seed_draws_anew(device):

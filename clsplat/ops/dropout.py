@@ -3,7 +3,7 @@
 import numpy as np
 
 from clsplat.device import Device
-from clsplat.stages import AnyGrads, AnySplats, Dropout
+from clsplat.stages import AnyGrads, AnySplats, Dropout, RaySplats
 
 
 def dropout_fwd(device: Device, splats: AnySplats, dropout: Dropout) -> None:
@@ -11,13 +11,15 @@ def dropout_fwd(device: Device, splats: AnySplats, dropout: Dropout) -> None:
 
     Parameters
     ----------
-    splats : Splats of N >= 1 rows
-        Dropped splats become invisible: their extents and opacities are 0.
+    splats : Splats or RaySplats of N >= 1 rows
+        Dropped splats become invisible: their extents and opacities are 0. Those along rays are projected with the
+        dropout's gain.
     dropout : Dropout
     """
     n = len(splats.opacities)
     key = np.array([dropout.seed & 0xFFFFFFFF, dropout.seed >> 32], np.uint32)
     scalars = [n, key, np.uint32(dropout.iteration), np.uint32(dropout.threshold), dropout.gain]
+    scalars.append(int(isinstance(splats, RaySplats)))
     device.launch("dropout", "dropout_fwd", (n,), [*scalars, splats.extents, splats.opacities])
 
 

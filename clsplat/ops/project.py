@@ -28,6 +28,7 @@ def project_fwd(
     antialiased: bool = False,
     channels: int = 3,
     rays: bool = False,
+    gain: float = 1.0,
 ) -> AnySplats:
     """Project Gaussians into a camera.
 
@@ -44,6 +45,8 @@ def project_fwd(
     rays : bool
         True to evaluate Gaussians along rays instead of by an affine approximation; not for orthographic cameras,
         whose affine projection is exact.
+    gain : float
+        With `rays`, the outlines are those of opacities that are this factor larger, as by `dropout_fwd`.
 
     Returns
     -------
@@ -66,7 +69,7 @@ def project_fwd(
         return splats
     own_charts = camera.model != "pinhole"
     terms = device.empty("rays", (n, 17 if own_charts else 8))
-    _launch(device, "project_fwd", n, [*arguments, terms], defines)
+    _launch(device, "project_fwd", n, [*arguments, terms, float(gain)], defines)
     directions = pixel_rays(camera) if own_charts else np.zeros((1, 1, 3))
     return RaySplats(*splats, terms, device.constant("directions", directions))
 

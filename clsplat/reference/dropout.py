@@ -4,7 +4,7 @@ import numpy as np
 
 from clsplat.constants import ALPHA_MIN, EXTENT_SLACK
 from clsplat.reference.noise import philox
-from clsplat.stages import AnyGrads, AnySplats, Dropout
+from clsplat.stages import AnyGrads, AnySplats, Dropout, RaySplats
 
 
 def dropout_fwd(splats: AnySplats, dropout: Dropout) -> None:
@@ -16,10 +16,13 @@ def dropout_fwd(splats: AnySplats, dropout: Dropout) -> None:
     shown = splats.extents[:, 0] > 0
     before = splats.opacities[shown]
     after = np.where(kept[shown], dropout.gain * before, 0)
+    splats.opacities[shown] = after
+    if isinstance(splats, RaySplats):  # its outline is that of the new opacity
+        splats.extents[shown] *= (after > 0)[:, None]
+        return
     with np.errstate(divide="ignore"):
         squares = (np.log(after / ALPHA_MIN) + EXTENT_SLACK) / (np.log(before / ALPHA_MIN) + EXTENT_SLACK)
     splats.extents[shown] *= np.sqrt(np.maximum(squares, 0))[:, None]
-    splats.opacities[shown] = after
 
 
 def dropout_bwd(v_splats: AnyGrads, dropout: Dropout) -> None:

@@ -87,6 +87,7 @@ def project_fwd(
     antialiased: bool = False,
     channels: int = 3,
     rays: bool = False,
+    gain: float = 1.0,
 ) -> AnySplats:
     """Project Gaussians into a camera. Arguments and result as for `clsplat.ops.project_fwd`."""
     with np.errstate(all="ignore"):  # invalid Gaussians are detected by their results
@@ -94,7 +95,8 @@ def project_fwd(
         opacities = sigmoid(f["g"].logit_opacities)
         if antialiased:
             opacities = opacities * np.sqrt(np.maximum(f["det0"] / f["det"], COMPENSATION_MIN**2))
-        threshold = np.where(opacities > ALPHA_MIN, np.log(opacities / ALPHA_MIN) + EXTENT_SLACK, 0)
+        drawn = gain * opacities if rays else opacities
+        threshold = np.where(drawn > ALPHA_MIN, np.log(drawn / ALPHA_MIN) + EXTENT_SLACK, 0)
         if rays:
             means2d, extents, conics = ray_outlines(f, f, camera, 2 * threshold)
         else:
