@@ -93,8 +93,11 @@ def test_a_panorama_becomes_six_pinhole_views(tmp_path, downscale):
 
 
 def test_masks_become_faces_too(tmp_path):
+    """One of them is black, and left out without a warning."""
     write_dataset(tmp_path, 1, masks=True)
-    for view in load_scene(tmp_path, DataConfig(test_every=0)).train:
+    faces = load_scene(tmp_path, DataConfig(test_every=0)).train
+    assert len(faces) == 5
+    for view in faces:
         x = pixel_directions(view.camera)[..., 0]
         clear = np.abs(x) > 0.03
         np.testing.assert_array_equal(view.mask[clear], (x > 0)[clear])

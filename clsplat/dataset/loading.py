@@ -95,7 +95,7 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
         raise InputError(
             f"{path}: expected photos to train on, found only held-out ones ({len(test)}); see test_every"
         )
-    train, test = _without_hidden(train, test, path)
+    train, test = _without_hidden(train, test, dataset, path)
     for part in (train, test):
         for before, view in pairwise(part):  # sorted by name
             if before.name == view.name:
@@ -114,16 +114,21 @@ def load_photos(path: str | Path, config: DataConfig, names: Container[str], mem
     return load_views(replace(dataset, photos=chosen), config, memory) if chosen else []
 
 
-def _without_hidden(train: list[View], test: list[View], path: Path) -> tuple[list[View], list[View]]:
-    """Leave out photos with black masks: they teach nothing, and have no metrics."""
+def _without_hidden(
+    train: list[View], test: list[View], dataset: Dataset, path: Path
+) -> tuple[list[View], list[View]]:
+    """Leave out photos with black masks: they teach nothing, and have no metrics.
+
+    Faces of panoramas are left out without a warning: some show only what carries the camera.
+    """
+    faces = {photo.name for photo in dataset.photos if photo.face}
     hidden = [view.name for view in train + test if not view.is_used]
-    if not hidden:
-        return train, test
-    warnings.warn(
-        f"{path}: {len(hidden)} of {len(train + test)} photos are left out, because their masks are black "
-        f"({named(hidden)})",
-        stacklevel=3,
-    )
+    if missed := [name for name in hidden if name not in faces]:
+        warnings.warn(
+            f"{path}: {len(missed)} of {len(train + test)} photos are left out, because their masks are black "
+            f"({named(missed)})",
+            stacklevel=3,
+        )
     train, test = ([view for view in part if view.is_used] for part in (train, test))
     if not train:
         raise InputError(f"{path}: expected masks with white pixels, found black ones of all photos to train on")
