@@ -204,7 +204,10 @@ def datasets(folder):
     fisheye = {"camera_angle_x": 1.2, "camera_model": "OPENCV_FISHEYE", "k1": 0.01, "frames": meta["frames"]}
     (root / "transforms.json").unlink()
     (root / "transforms_train.json").write_text(json.dumps(fisheye))
-    (root / "transforms_test.json").write_text(json.dumps(fisheye | {"camera_model": "EQUIRECTANGULAR"}))
+    Image.new("RGB", (16, 8), (9, 100, 200)).save(root / "images" / "c.png")
+    panorama = [meta["frames"][1] | {"file_path": "images/c.png"}]
+    whole = fisheye | {"camera_model": "EQUIRECTANGULAR", "frames": panorama}
+    (root / "transforms_test.json").write_text(json.dumps(whole))
     put("transforms", "split", tree(root))
 
 
