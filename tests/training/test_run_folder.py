@@ -192,7 +192,7 @@ def test_a_refused_resume_changes_nothing(
         (data / "transforms.json").write_text(json.dumps(meta | {"frames": meta["frames"][:6]}))
         found = r"fewer photos \(6.png, 7.png, 8.png\)"
     else:
-        data, more, found = dataset, ("--seed", 7), "other seed"
+        data, more, found = dataset, ("--seed", 7), "--seed 7"
     before = {name: bytes_ for name, bytes_ in content(killed).items() if not name.endswith(".part")}
     message = fails(capsys, "train", data, "-o", killed, *QUICK, *more, "--resume")
     assert re.search(rf"checkpoint\.npz: expected the .* found {found}", message), message
