@@ -2,8 +2,8 @@
 //
 // Mapping: one work-item per run of `width` values. Runs begin `stride` values apart, and values between two runs are
 // not changed. The first `split` values of a run have a separate learning rate. A row of spherical harmonics is a
-// run: it starts with degree 0 and ends with the trained bands. All other arrays are cut into runs of 16 values.
-// Training uses the same update fused with the gradients, in project.cl.
+// run: it starts with degree 0 and ends with the trained bands. All other arrays are cut into runs of 16 values,
+// that of the log_scales into runs of 15. Training uses the same update fused with the gradients, in project.cl.
 //
 // The penalties of the sums of all opacities and scales add o (1 - o) to the gradients of the logits, and the scale
 // to the gradients of its logarithm. The third penalty depends on the effective ranks (adam.h). For it, runs of

@@ -46,7 +46,7 @@ class Camera:
         k1 to k4 of a fisheye; 0 for other models.
     near : float, optional
         Depth (for a fisheye, distance) in world units up to which nothing is drawn; positive. Default: by the
-        scene's points where it is trained, by the Gaussians' `default_near` where they are rendered.
+        scene's points where it is trained; by the Gaussians' `default_near` in `clsplat.render`; else 0.01.
 
     Raises
     ------

@@ -98,6 +98,14 @@ def bin_splats(
     return Bins(gauss_ids, tile_ranges, first_slots, slots if gradients else None, tile_size, width, height)
 
 
+def check_slots(bins: Bins) -> None:
+    """Raise an InputError if lists were made without gradients."""
+    if bins.slots is None:
+        raise InputError(
+            "bins: expected lists made with gradients=True, found lists without slots; bin the splats anew"
+        )
+
+
 def _list(device: Device, m: int) -> Array:
     """A list of m entries. A buffer cannot be empty, so a list without entries has one unused entry."""
     return device.buffers.first(device.empty(LIST, max(m, 1), np.uint32), m)

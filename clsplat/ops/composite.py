@@ -6,7 +6,8 @@ import numpy as np
 
 from clsplat.constants import SEGMENT
 from clsplat.device import Device
-from clsplat.errors import DeviceError, InputError
+from clsplat.errors import DeviceError
+from clsplat.ops.bin import check_slots
 from clsplat.stages import AnyGrads, AnySplats, Bins, Image, RayGrads, RaySplats, SplatGrads
 
 # Number of splats that the GPU variant's forward pass loads at a time, and per batch of its backward pass without
@@ -214,10 +215,7 @@ def composite_bwd(
     InputError
         If the lists were made without gradients.
     """
-    if bins.slots is None:
-        raise InputError(
-            "bins: expected lists made with gradients=True, found lists without slots; bin the splats anew"
-        )
+    check_slots(bins)
     n, channels = splats.colors.shape
     m = bins.gauss_ids.shape[0]
     moments = 10 if isinstance(splats, RaySplats) else 6

@@ -6,7 +6,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from clsplat.device import Device
-from clsplat.errors import InputError
+from clsplat.ops.bin import check_slots
 from clsplat.ops.composite import composite_until, directions_of, gpu_batch, lanes_of, packed, ray_charts, variant
 from clsplat.stages import AnySplats, Bins, Removal
 
@@ -48,10 +48,7 @@ def removal_sums(
     InputError
         If the lists were made without gradients.
     """
-    if bins.slots is None:
-        raise InputError(
-            "bins: expected lists made with gradients=True, found lists without slots; bin the splats anew"
-        )
+    check_slots(bins)
     n, channels = splats.colors.shape
     m, (tiles, _) = bins.gauss_ids.shape[0], bins.tile_ranges.shape
     size = bins.height, bins.width
