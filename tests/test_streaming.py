@@ -83,6 +83,7 @@ def with_depths(scene: Scene) -> Scene:
     return replace(scene, train=[view.with_depth(depth) for view, depth in zip(scene.train, maps, strict=True)])
 
 
+@pytest.mark.filterwarnings("ignore:.*their masks are black")
 @pytest.mark.parametrize("kind", RUNS)
 def test_two_photos_in_memory_make_the_same_bytes_as_all(
     dataset: Path, device: Device, tmp_path: Path, kind: str

@@ -6,13 +6,10 @@ from typing import Annotated
 import tyro
 
 from clsplat.commands.console import Dataset, DeviceName, Out, SceneOrRun, moved, open_device, say
-from clsplat.commands.options import CameraOptions, DrawOptions
+from clsplat.commands.options import COORDINATE_MAX, CameraOptions, DrawOptions
 from clsplat.commands.run_folders import dataset_of, scene_file, with_run
 from clsplat.errors import InputError
 from clsplat.ranges import within
-
-COORDINATE_MAX = 1e18
-"""Largest coordinate of a box: its square is finite in single precision."""
 
 
 @dataclass(frozen=True)

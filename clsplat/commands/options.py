@@ -8,6 +8,9 @@ import tyro
 from clsplat.config import DataConfig, Mode, RenderConfig, SfmConfig
 from clsplat.ranges import within
 
+COORDINATE_MAX = 1e18
+"""Largest coordinate: its square is finite in single precision."""
+
 
 @dataclass(frozen=True)
 class PhotoOptions(DataConfig):
@@ -53,9 +56,9 @@ class PlaceOptions:
 
     scale: Annotated[float, within(above=0)] = 1.0
     """Factor on all lengths, for example to metres."""
-    rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotate: Annotated[tuple[float, float, float], within(least=-360, most=360)] = (0.0, 0.0, 0.0)
     """Angles about the axes x, y and z, degrees; the scene is turned about x first. 180 0 0 turns it upside down."""
-    move: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    move: Annotated[tuple[float, float, float], within(least=-COORDINATE_MAX, most=COORDINATE_MAX)] = (0.0, 0.0, 0.0)
     """Distances along x, y and z, in units of the scaled scene."""
 
 

@@ -8,12 +8,12 @@ import numpy as np
 from PIL import Image
 
 from clsplat.cli import main
-from clsplat.config import DataConfig
 from clsplat.dataset import load_scene
 from clsplat.formats import load_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
+from clsplat.training.presets import load_config
 
 SHORT = ("--iterations", 40, "--eval-every", 0)
 """Options of a training that takes a second."""
@@ -79,7 +79,7 @@ def end(capsys, device, data: Path, out: Path, *options: object, size: str = "fi
     failed = next((line for line in said.splitlines() if line.startswith("training failed: ")), None)
     gaussians = load_gaussians(out / "scene.ply")[0]
     assert all(np.isfinite(array).all() for array in gaussians.arrays().values())
-    gain = gain_over_colors(gaussians, load_scene(data, DataConfig(test_every=0)).train, device)
+    gain = gain_over_colors(gaussians, load_scene(data, load_config(out / "config.json").data).train, device)
     assert failed or gain > 0, "neither a scene nor a sentence"
     return End(failed, False, gaussians, gain, said)
 
