@@ -89,10 +89,13 @@ class Command:
 
     def problems(self, point: Point, fault: str) -> list[str] | None:
         """What is wrong after a call has failed, and after the run that follows; None if the call was not reached."""
-        self._clear()
-        calls = Calls(point, self.faults[point.kind][fault])
-        ended = self._run(calls, fresh=opens_device(point))
-        if not calls.failed:
+        for fresh in sorted({opens_device(point), True}):  # a device that stays open keeps buffers of earlier runs
+            self._clear()
+            calls = Calls(point, self.faults[point.kind][fault])
+            ended = self._run(calls, fresh=fresh)
+            if calls.failed:
+                break
+        else:
             return None
         found = self._wrong_end(ended, point) + self._wrong_files(point) + self._held()
         whole = ended.status == 0
