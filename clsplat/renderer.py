@@ -328,7 +328,7 @@ def default_device() -> "Device":
 
 @cache
 def opened_device() -> "Device":
-    """See `default_device`, which one thread at a time is in."""
+    """The device of `default_device`, which lets in one thread at a time."""
     from clsplat.device import Device
 
     try:
