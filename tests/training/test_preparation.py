@@ -109,6 +109,7 @@ def test_a_run_continues_where_dataset_and_masks_have_moved(tmp_path: Path) -> N
     run("train", masked(tmp_path / "data"), *options)
     moved = (tmp_path / "data").rename(tmp_path / "moved")
     run("train", moved, *options, "--resume")
+    run("eval", tmp_path / "run", moved)
     elsewhere = (moved / "masks").rename(tmp_path / "elsewhere")
     again = (*options[:-3], elsewhere, *options[-2:])
     run("train", moved, *again, "--resume")
