@@ -31,6 +31,22 @@ def test_almost_no_gaussians_are_a_failure(scene, device):
     gaussians = initialize(scene, InitConfig(opacity=0.9), seed=0)
     few = gaussians.take(np.arange(FEWEST_GAUSSIANS - 1))
     assert f"{FEWEST_GAUSSIANS - 1} Gaussians" in failure(few, scene.train, Renderer(device))
+    enough = gaussians.take(np.arange(FEWEST_GAUSSIANS))
+    assert "are left" not in (failure(enough, scene.train, Renderer(device)) or "")
+
+
+def test_the_constant_colour_is_the_mean_of_each_photo(scene, device):
+    """By hand: a quarter of the pixels is white. Black has the error 1/4, 6.0 dB, and grey 3/16, 7.3 dB."""
+    gaussians = initialize(scene, InitConfig(opacity=0.9), seed=0)
+    gaussians.sh[:, 0] = -10
+    photos = []
+    for view in scene.train:
+        image = np.zeros_like(view.image)
+        image[: len(image) // 4] = 255
+        assert len(image) % 4 == 0
+        photos.append(replace(view, image=image))
+    found = failure(gaussians, photos, Renderer(device))
+    assert "its photos have 6.0 dB, where a constant colour for each has 7.3 dB" in found
 
 
 def test_photos_that_show_nothing_are_a_failure_if_all_do(scene, device):
