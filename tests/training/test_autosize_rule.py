@@ -1,6 +1,8 @@
 """The rule of the size in numbers: what a change must earn, when growth and pruning end, how far growth goes."""
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from clsplat.training.autosize.rule import (
     candidate,
     first_pruning,
     growth_ends,
+    most_grown,
     most_with_all,
     prunes,
     sh_bytes,
@@ -126,10 +129,41 @@ def test_each_degree_is_trained_before_one_is_chosen(iterations: int) -> None:
 def test_photos_that_return_bring_gaussians_where_growth_paid() -> None:
     """In proportion to the photos, if the last growth was taken."""
     paid, unpaid, halved = trial(True, [1.0, 1.0]), trial(True, [0.0, 0.0]), trial(False, [-1.0, -1.0])
+    unclear = trial(True, [-1.0, 1.0])
 
     def most(*trials: Trial, config: TrainConfig = CONFIG) -> int:
         return most_with_all(Search(1000, grows=False, trials=list(trials)), 22, 26, config)
 
     assert most(paid) == most(unpaid, paid) == 1182
-    assert most(paid, unpaid) == most(unpaid, halved) == most() == 1000
+    assert most(paid, unpaid) == most(unpaid, halved) == most(unclear) == most() == 1000
     assert most(paid, config=replace(CONFIG, max_gaussians=1100)) == 1100
+
+
+def test_growth_keeps_to_its_pace_until_it_ends() -> None:
+    search = Search(1001, 1.5)
+    assert most_grown(search, CONFIG) == 1502 and most_grown(replace(search, grows=False), CONFIG) == 1001
+    assert most_grown(search, replace(CONFIG, max_gaussians=1200)) == 1200
+
+
+SAVED = {"trials": [trial(True, [0.1, 0.3])], "degrees": [], "validated": [[30.0, 31.0]]}
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"most": 0},
+        {"most": 1.5},
+        {"pace": 0.0},
+        {"grows": 1},
+        {"settled": -1},
+        {"validated": [[30.0]]},  # of one photo, and the trials are of two
+        {"trials": [[1, *trial(True, [0.1, 0.3])[1:]]]},
+        {"degrees": [side(500).candidate._replace(n=-1)]},
+    ],
+)
+def test_a_search_is_restored_unless_it_is_damaged(damage: dict[str, Any]) -> None:
+    search = Search(1000, 1.5, settled=5, **SAVED)  # type: ignore[arg-type]
+    saved = json.loads(json.dumps(asdict(search)))
+    assert Search.restored(saved, None) == search
+    with pytest.raises((TypeError, ValueError)):
+        Search.restored(saved | json.loads(json.dumps(damage)), None)
