@@ -82,6 +82,17 @@ def test_viewpoints_are_between_neighbours_in_free_space() -> None:
     found = np.unique(viewpoints(cameras), axis=0)
     np.testing.assert_allclose(found, [[0, 0, 0], [0.5, 0, 0], [1, 0, 0], [2, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(viewpoints([camera_at(3, None)]), [[3, 0, 0]])
+    # The middle is 1.9 from both, or 2.1.
+    assert len(viewpoints([camera_at(0, 0.6), camera_at(3.8, 0.6)])) == 3
+    assert len(viewpoints([camera_at(0, 0.6), camera_at(4.2, 0.6)])) == 2
+
+
+def test_the_slope_is_that_of_the_widest_corner() -> None:
+    """1 + FRUSTUM_MARGIN is 1.3."""
+    wide, narrow = replace(camera_at(0, 0.1), fy=100), camera_at(0, 0.1)
+    assert steepest_slope([replace(narrow, fx=90, fy=90), wide]) == pytest.approx(1.3 * np.hypot(32 / 50, 24 / 100))
+    fisheye = replace(narrow, model="fisheye")
+    assert steepest_slope([fisheye]) == 1 and steepest_slope([fisheye, wide]) == steepest_slope([wide])
 
 
 @pytest.mark.parametrize("strategy", ["error", "adc"])
