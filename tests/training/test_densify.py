@@ -120,7 +120,7 @@ def test_transparent_gaussians_go_but_never_all() -> None:
 
 
 def test_huge_gaussians_go_only_after_a_reset() -> None:
-    for iteration, remaining in ((100, N), (400, N // 2)):
+    for iteration, remaining in ((100, N), (300, N), (400, N // 2)):
         config = replace(CONFIG, adc=replace(CONFIG.adc, reset_every=300))
         strategy, gaussians = observed(config, rows=slice(0, 0))
         edit = strategy.edit(iteration, gaussians, MOST_GAUSSIANS, survey)
@@ -174,6 +174,10 @@ def test_on_white_the_first_round_resets(background: str) -> None:
         edit = strategy.edit(iteration, gaussians, MOST_GAUSSIANS, survey)
         assert edit.reset_opacities == resets
         assert (edit.gaussians.opacities.max() < 0.02) == resets
+    later = replace(config, adc=replace(config.adc, start=525))  # 150 in a run of 2000, between two rounds
+    strategy, gaussians = observed(later, rows=slice(0, 0))
+    assert not strategy.due(150)
+    assert strategy.edit(200, gaussians, MOST_GAUSSIANS, survey).reset_opacities == (background == "white")
 
 
 def test_nothing_changes_outside_its_time() -> None:

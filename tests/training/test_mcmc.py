@@ -11,7 +11,7 @@ from clsplat.gaussians import Gaussians, logit, sigmoid
 from clsplat.reference.adam import adam_step
 from clsplat.testing import synthetic_scene
 from clsplat.training.densify import Contributions
-from clsplat.training.densify.mcmc import COPIES_MAX, Mcmc, integral, sample, share
+from clsplat.training.densify.mcmc import COPIES_MAX, Mcmc, integral, interval, sample, share
 from clsplat.training.optimizer import adam_settings
 
 N = 300
@@ -141,3 +141,12 @@ def test_noise_does_not_depend_on_the_unit_of_length() -> None:
     assert sizes[1][0] == pytest.approx(sizes[0][0] / 100)
     off = Mcmc(replace(CONFIG, mcmc=McmcConfig(noise_lr=0)), 1.0, N)
     off.perturb(SimpleNamespace(), scene(), 7, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("size", "iterations", "expected"), [("auto", 1500, 50), ("auto", 9000, 100), ("fixed", 1500, 100)]
+)
+def test_rounds_of_a_short_search_are_closer(size: str, iterations: int, expected: int) -> None:
+    """As many as in 3000 iterations; longer runs have more."""
+    assert McmcConfig().every == 100
+    assert interval(replace(CONFIG, size=size, iterations=iterations)) == expected
