@@ -11,7 +11,7 @@ from clsplat.device import Device
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
 from clsplat.training.autosize import rule
-from clsplat.training.dense_start import first_points, neighbours, thinned, with_dense_points
+from clsplat.training.dense_start import Depths, agreed, first_points, neighbours, thinned, with_dense_points
 from clsplat.training.loop import train
 
 WALL = 4.0
@@ -129,6 +129,48 @@ def test_neighbours_see_the_same_from_elsewhere() -> None:
     assert found[0][0] == 1 and 4 not in found[0]
     assert found[4] == []
     assert found[0].index(1) < found[0].index(5), "a camera at the same place tells no depth"
+
+
+def test_angles_below_the_best_one_count_less_than_those_above() -> None:
+    """By hand: 4 degrees below it the weight is exp(-1/2), and 4 above exp(-1/18)."""
+    points = np.random.default_rng(0).uniform(-0.01, 0.01, (60, 3))
+    cameras = [
+        Camera.look_at((5 * np.sin(a), 0, -5 * np.cos(a)), (0, 0, 0), (0, -1, 0), 60, 64, 48)
+        for a in np.radians([0, 4, -12])
+    ]
+    assert neighbours(cameras, points)[0] == [2, 1]
+
+
+def test_points_are_supported_by_sure_depths_of_two_photos() -> None:
+    photos = wall().train
+
+    def depths(camera: Camera, factor: float = 1, score: float = 1) -> Depths:
+        """Where the rays of a camera meet the wall."""
+        x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+        rays = np.stack([(x - 32) / 60, (y - 24) / 60, np.ones_like(x)], axis=-1)
+        away = (WALL - camera.position[2]) / (rays @ camera.viewmat[:3, :3])[:, :, 2]
+        return Depths(factor * away, np.full((48, 64), score))
+
+    def found(own: float = 1, **others: float) -> np.ndarray:
+        maps = [depths(photos[0].camera, score=own), *(depths(photo.camera) for photo in photos[1:])]
+        maps[2:] = [depths(photo.camera, **others) for photo in photos[2:]]
+        return agreed(0, photos, [1, 2, 3], maps)[0]
+
+    points, colors, sizes = agreed(0, photos, [1, 2, 3], [depths(photo.camera) for photo in photos])
+    assert len(points) > 1000
+    np.testing.assert_allclose(points[:, 2], WALL, atol=1e-9)
+    np.testing.assert_allclose(colors, 255 * wall_color(points[:, 0], points[:, 1]), atol=0.5 + 1e-6)
+    expected = (points - photos[0].camera.position) @ photos[0].camera.viewmat[2, :3] / 60
+    np.testing.assert_allclose(sizes, expected, rtol=1e-9)
+    # Of the three others one alone agrees, where the depths of two differ or are unsure.
+    assert not len(found(factor=1.03)) and not len(found(score=0.39)) and not len(found(own=0.59))
+    assert len(found(score=0.41)) == len(found(own=0.61)) == len(points)
+
+
+def test_thinned_points_keep_to_the_number_where_their_sizes_differ() -> None:
+    """Each size has a grid of its own: of four sizes, four cells remain, however large they are."""
+    points = np.random.default_rng(0).uniform(size=(40, 3))
+    assert len(thinned(points, np.repeat(4.0 ** np.arange(4), 10), 2, 0)) == 2
 
 
 def test_thinned_points_are_spread() -> None:
