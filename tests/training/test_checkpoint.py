@@ -45,6 +45,22 @@ def test_a_checkpoint_holds_everything(scene: Scene, tmp_path: Path) -> None:
         np.testing.assert_array_equal(loaded.strategy.statistics[name], array)
 
 
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"iteration": CONFIG.iterations + 1}, f"iteration {CONFIG.iterations + 1} of {CONFIG.iterations}"),
+        ({"seconds": np.nan}, "seconds = nan"),
+        ({"losses": [1.0, np.inf]}, "losses = "),
+    ],
+)
+def test_values_that_no_run_saves_are_damage(
+    scene: Scene, tmp_path: Path, changes: dict[str, Any], found: str
+) -> None:
+    save_state(tmp_path / "checkpoint.npz", replace(random_state(scene), **changes), CONFIG)
+    with pytest.raises(InputError, match=f"found a damaged file: .*{found}"):
+        load_state(tmp_path / "checkpoint.npz", scene.extent, CONFIG)
+
+
 @pytest.mark.parametrize("on_device", [False, True], ids=["on the host", "on the device"])
 @pytest.mark.parametrize("reset", [False, True])
 def test_moments_and_harmonics_follow_an_edit(scene: Scene, device: Device, reset: bool, on_device: bool) -> None:

@@ -68,3 +68,6 @@ def test_only_the_photo_in_question_moves():
     moved = learned.of("b")
     np.testing.assert_allclose(np.abs(moved[:3, 3]), 5e-3, rtol=1e-2)
     np.testing.assert_allclose(np.abs(moved[[2, 0, 1], [1, 2, 0]]), 1e-3, rtol=1e-2)
+    # Also where other photos have taken some before.
+    poses.update(learned, "a", camera, v_viewmat, 1e-3, 5.0, OptimConfig())
+    np.testing.assert_array_equal(learned.of("a"), moved)

@@ -101,10 +101,14 @@ def test_a_thread_holds_a_folder_again_and_another_one_does_not(tmp_path: Path) 
         except InputError as error:
             refused.append(str(error))
 
-    with held(tmp_path), held(tmp_path / ".." / tmp_path.name):
-        thread = threading.Thread(target=other)
-        thread.start()
-        thread.join()
+    part = tmp_path / f".checkpoint.npz.{'a0' * 8}.part"
+    with held(tmp_path):
+        part.write_bytes(b"half")
+        with held(tmp_path / ".." / tmp_path.name):
+            assert part.exists(), "the process itself is writing it"
+            thread = threading.Thread(target=other)
+            thread.start()
+            thread.join()
     assert len(refused) == 1 and f"process {os.getpid()}" in refused[0]
 
 
