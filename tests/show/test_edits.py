@@ -50,6 +50,27 @@ def test_isolated_gaussians_are_those_far_from_others():
     assert np.flatnonzero(edits.selected).tolist() == [3, 70]
 
 
+def test_isolated_means_two_deviations_of_the_logarithms():
+    """Of the mean distance to eight neighbours, by all pairs of points."""
+    gaussians = grid(6)
+    rng = np.random.default_rng(0)
+    gaussians.means[:] = rng.normal(size=(216, 3)) * rng.lognormal(0, 1, (216, 1))
+    points = gaussians.means.astype(np.float64)
+    pairs = np.sort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)
+    logs = np.log(pairs[:, 1:9].mean(axis=1))
+    edits = Edits(gaussians)
+    edits.select_isolated()
+    assert 3 < edits.selected.sum() < 15
+    np.testing.assert_array_equal(edits.selected, logs > logs.mean() + 2 * logs.std())
+
+
+def test_eight_gaussians_have_too_few_neighbours_to_be_isolated():
+    edits = Edits(grid())
+    edits.region = Region("box", (0, 0, 0), (1, 1, 1))
+    edits.select_isolated()
+    assert len(edits) == 8 and not edits.selected.any()
+
+
 def test_deletions_are_undone_in_their_order():
     edits = Edits(grid())
     states = []
@@ -66,6 +87,8 @@ def test_deletions_are_undone_in_their_order():
         )
     edits.undo()
     assert len(edits) == 64 and edits.steps == 0
+    edits.select_none()
+    assert edits.delete() == edits.crop() == edits.steps == 0, "nothing was deleted, and nothing is undone"
 
 
 def test_the_history_is_bounded():
@@ -108,6 +131,10 @@ def test_what_a_region_hides_is_not_selected():
     edits.region = None
     edits.undo()
     assert len(edits) == 64 and edits.selected.sum() == 3 * 4
+    edits.delete()
+    edits.region = Region("box", (3, 0, 0), (0, 9, 9))
+    edits.undo()
+    assert not edits.selected.any(), "what came back is outside the region"
 
 
 @pytest.mark.parametrize(
