@@ -87,6 +87,16 @@ def test_the_path_swings_over_an_arc_and_never_leaves_it():
     assert np.abs(np.diff(angles, append=angles[:1])).max() < 0.1, "no jump, not even where the video loops"
 
 
+@pytest.mark.parametrize(("arc", "full"), [(260, False), (280, True)])
+def test_a_gap_of_a_quarter_of_the_circle_is_not_crossed(arc, full):
+    angles = np.radians(np.linspace(0, arc, 14))
+    path = orbit(ring(angles), 36, 64, 48)
+    arms = np.array([c.position for c in path]) - TARGET
+    found = np.degrees(np.arctan2(arms @ np.cross(UP, EAST), arms @ EAST)) % 360
+    inside = (found < arc + 1e-6) | (found > 360 - 1e-6)  # 0 may be 360, by rounding
+    assert inside.all() != full
+
+
 def test_one_camera_and_one_frame():
     (camera,) = ring([1.0])
     (frame,) = orbit([camera], 1, 640, 480)
@@ -235,10 +245,18 @@ class TestThrough:
         assert max(steps) < 3 * np.median(steps), "no jump"
 
     def test_a_closed_path_returns(self):
-        path = through(self.stops(), 40, closed=True)
-        np.testing.assert_allclose(path[0].viewmat, self.stops()[0].viewmat, atol=1e-9)
-        gap = np.linalg.norm(path[-1].position - path[0].position)
-        assert 0 < gap < 3 * np.linalg.norm(path[1].position - path[0].position)
+        path = through(self.stops(), 400, closed=True)
+        for stop, camera in zip(self.stops(), path[::100], strict=True):
+            np.testing.assert_allclose(camera.viewmat, stop.viewmat, atol=1e-9)
+        first, last = (path[k].position - path[k - 1].position for k in (1, 0))
+        # Of a smooth path, two steps of a quarter of a degree differ by about a hundredth.
+        np.testing.assert_allclose(first, last, atol=0.03 * np.linalg.norm(first))
+
+    def test_a_zoom_alone_is_a_path(self):
+        first = self.stops()[0]
+        path = through([first, replace(first, fx=2 * first.fx, fy=2 * first.fy)], 3)
+        assert [camera.fx for camera in path] == pytest.approx([40, 60, 80])
+        assert [camera.fy for camera in path] == pytest.approx([40, 60, 80])
 
     def test_equal_neighbours_count_once_and_one_camera_is_no_path(self):
         first, second, *_ = self.stops()
