@@ -13,7 +13,7 @@ from clsplat.metrics import to_uint8
 from clsplat.ops import count_pairs
 from clsplat.render import render
 from clsplat.renderer import Renderer
-from clsplat.show.frames import MODES, Look, normals, picture, splash
+from clsplat.show.frames import MODES, Look, colored_normals, normals, picture, scaled_depth, splash
 from clsplat.show.viewer_photos import blended
 from clsplat.show.viewer_recording import encoder
 
@@ -30,6 +30,14 @@ def test_normals_of_planes_point_to_the_camera(normal):
     camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 100, 40, 30)
     found = normals(plane(camera, normal, -5.0), camera)
     np.testing.assert_allclose(found, np.broadcast_to(normal, found.shape), atol=1e-9)
+
+
+def test_colours_of_normals_in_the_world_are_those_of_the_camera():
+    """Red to the right, green up, blue to the camera, which looks along x; black where there is none."""
+    camera = Camera.look_at((0, 0, 0), (1, 0, 0), (0, 0, 1), 100, 4, 1)
+    found = colored_normals(np.array([[[0, -1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, 0]]]), camera)
+    np.testing.assert_array_equal(found, [[[255, 128, 128], [128, 255, 128], [128, 128, 255], [0, 0, 0]]])
+    np.testing.assert_array_equal(scaled_depth(np.array([[0.0, 1.0, 4.0]])), [[0, 16384, 65535]])
 
 
 def test_a_surface_to_the_camera_is_blue(device):
