@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from test_comparisons import read
 
 from clsplat.errors import InputError
@@ -40,6 +41,18 @@ def test_curve_shows_what_is_logged(tmp_path, with_psnr):
     before = chart.read_bytes()
     training_curve(log, chart)
     assert chart.read_bytes() == before
+
+
+def test_the_smooth_loss_is_the_mean_around_each_iteration(tmp_path, monkeypatch):
+    """Of a fiftieth of the lines: 3 of 150. On a straight line, a mean around a point is the point."""
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    lines = [{"iteration": 10 * k, "num_gaussians": 9, "seconds": 1.0, "loss": 1 - k / 200} for k in range(1, 151)]
+    write_log(tmp_path / "log.jsonl", lines)
+    training_curve(tmp_path / "log.jsonl", tmp_path / "chart.png")
+    raw, smooth = (line.get_xydata() for line in drawn[0].axes[0].lines)
+    assert len(raw) == 150
+    np.testing.assert_allclose(smooth, raw[1:-1], rtol=1e-12)
 
 
 def test_curve_of_a_run_that_is_still_writing(tmp_path):
