@@ -81,6 +81,19 @@ def test_parts_of_a_ply(gaussians, tmp_path):
     }
 
 
+def test_places_and_ranges_by_hand(tmp_path, capsys):
+    """101 Gaussians from 0 to 100; a negative zero is none; a value between two ranges is in the upper one."""
+    found = synthetic_scene(101, seed=2)[0].astype(np.float32)
+    found.means[:] = 0
+    found.means[:, 0], found.means[:, 1] = np.arange(101), -0.0
+    found.logit_opacities[:] = 0
+    save_gaussians(tmp_path / "a.ply", found)
+    rows, _ = info(tmp_path / "a.ply", capsys)
+    assert rows["bounds"] == "(0, 0, 0) to (100, 0, 0)" and rows["middle"] == "(50, 0, 0)"
+    assert rows["98 % within"] == "(1, 0, 0) to (99, 0, 0)"
+    assert rows["0.5 to 0.6"].split("  ") == ["100.0 %", "#" * 40]
+
+
 def test_histograms_count_every_gaussian(gaussians, tmp_path, capsys):
     gaussians.logit_opacities[:100] = 10
     gaussians.logit_opacities[100:] = -10
@@ -111,8 +124,11 @@ def test_an_unpacked_sog(gaussians, tmp_path, capsys):
 def test_a_run(gaussians, tmp_path, capsys):
     record = {"iteration": 30, "num_gaussians": 123, "seconds": 4.2, "loss": 0.1, "psnr": 21.5}
     (tmp_path / "log.jsonl").write_text(json.dumps(record) + "\n")
-    (tmp_path / "config.json").write_text(json.dumps({"iterations": 40}))
+    (tmp_path / "config.json").write_text(json.dumps({"iterations": 40, "data_path": str(tmp_path / "data")}))
+    assert info(tmp_path, capsys)[0]["dataset"] == f"{tmp_path / 'data'}, missing"
+    (tmp_path / "data").mkdir()
     rows, _ = info(tmp_path, capsys)
+    assert rows["dataset"] == f"{tmp_path / 'data'}"
     assert rows["iterations"] == "30 of 40" and rows["held-out PSNR"] == "21.50 dB" and rows["Gaussians"] == "123"
     assert "--resume" in rows["scene.ply"]
     save_gaussians(tmp_path / "scene.ply", gaussians)
