@@ -33,10 +33,12 @@ TEXTURE = NUMBERS.uniform(0, 255, (64, 96))
 
 
 def frames():
-    """Twelve grey frames, darker to brighter, all but two of them blurred."""
+    """Twelve grey frames, darker to brighter, all but two of them blurred, and the later half with less contrast."""
     for k in range(12):
         pattern = TEXTURE if k in SHARP else gaussian_filter(TEXTURE, 2)
-        yield np.repeat(np.clip(pattern * 0.4 + 10 * k, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+        yield np.repeat(
+            np.clip(pattern * (0.4 if k < 6 else 0.3) + 10 * k, 0, 255).astype(np.uint8)[..., None], 3, axis=2
+        )
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,7 @@ def test_the_sharpest_frame_of_each_interval_is_taken(video, tmp_path):
         pixels = read_photo(tmp_path / "out" / name, (0, 0, 0), False).astype(float)
         errors = [np.abs(pixels - frame).mean() for frame in wanted]
         assert np.argmin(errors) == k and errors[k] < 10, errors
+    assert (tmp_path / "out").stat().st_mode & 0o055 == 0o055, "others may read the frames"
     assert extract_frames(video, tmp_path / "three", 1.5) == 3
     assert extract_frames(video, tmp_path / "all", 1000) == 12
 
