@@ -12,6 +12,7 @@ from PIL import Image
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians, quantisation, save_gaussians
 from clsplat.formats.sog import load_sog, save_sog
+from clsplat.formats.validity import LOGIT_MAX
 
 N = 2
 
@@ -106,6 +107,11 @@ def test_version_1_unpacked_by_hand(tmp_path):
         np.testing.assert_allclose(found.logit_opacities, [-3, -5])
         np.testing.assert_allclose(found.sh[0, 1], [-2 + 0.02 * 195, -2, 3.1], rtol=1e-5)
         assert mode == "classic"
+    wide = meta1()
+    wide["sh0"] |= {"mins": [-1, -2, -3, -99], "maxs": [1, 2, 3, 99]}
+    (folder / "meta.json").write_text(json.dumps(wide))
+    found = load_gaussians(folder)[0]
+    np.testing.assert_array_equal(found.logit_opacities, np.float32([-LOGIT_MAX, -LOGIT_MAX]))
 
 
 def test_what_is_written(tmp_path):

@@ -71,6 +71,9 @@ def test_version_2_by_hand(tmp_path):
     np.testing.assert_allclose(gaussians.quats, [[0.52914, 0.6, -0.00392, 0.6]], atol=1e-5)
     np.testing.assert_allclose(gaussians.means, [[1.5, 2, -0.25]])
     assert mode == "classic"
+    longer = bytes([255, 255, 255])  # than a unit vector: w is 0
+    path.write_bytes(gzip.compress(header(2) + POSITION + OPACITY + COLORS + SCALES + longer + REST))
+    np.testing.assert_allclose(np.abs(load_spz(path)[0].quats), [[0, 3**-0.5, 3**-0.5, 3**-0.5]], atol=1e-6)
 
 
 def test_version_4_by_hand(tmp_path):
@@ -125,6 +128,8 @@ def test_shared_bands_are_precise_and_small(tmp_path):
         assert sorted(at) == list(range(3000))
         worst = np.abs(found.sh[:, 1:] - scene.sh[at, 1:]).max()
         assert 0.9 * error < worst <= error * (1 + 1e-5)
+        bands = found.sh[:, 1:].reshape(3000, -1)
+        assert (np.diff(bands, axis=0) != 0).any(axis=1).sum() == kinds - 1, "equal bands are not in one place"
     assert sizes[1] < 0.5 * sizes[0]
 
 
@@ -308,6 +313,9 @@ def room(up):
 def test_axes_are_guessed_from_level_surfaces(tmp_path):
     path = tmp_path / "a.spz"
     assert guessed_axes(room(1)) == "rub" and guessed_axes(room(-1)) == "rdf"
+    background = room(1)  # one huge Gaussian, level and above the others
+    background.means[-1], background.log_scales[-1], background.quats[-1] = (0, 2, 0), (4, -6, 4), (1, 0, 0, 0)
+    assert guessed_axes(background) == "rub"
     tilted = room(1)
     tilted.means[:, [0, 1]] = tilted.means[:, [1, 0]]
     assert guessed_axes(tilted) is None and guessed_axes(room(1).take(np.arange(3))) is None
