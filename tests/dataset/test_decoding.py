@@ -127,6 +127,12 @@ def test_intrinsics_follow_the_files_size_per_axis(tmp_path):
     )
 
 
+def test_rounding_costs_no_pixel(tmp_path):
+    """23 (13/23) is 12.999999999999998 in double precision."""
+    (view,) = load(posed(save(tmp_path / "a.png", noise(13, 13)), Intrinsics("PINHOLE", (50.0, 60, 11, 11), 23, 23)))
+    assert view.image.shape == (13, 13, 3) and (view.camera.width, view.camera.height) == (13, 13)
+
+
 def test_reduction_averages_squares_of_pixels(tmp_path):
     pixels = noise(66, 49)
     declared = Intrinsics("PINHOLE", (50.0, 60.0, 30.0, 25.0), 66, 49)
