@@ -1,6 +1,7 @@
 """Depth maps: files of all kinds, the pixels of their photos, and their scales by the points that the photos see."""
 
 import io
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -246,6 +247,29 @@ def test_errors_of_the_map_are_averaged_out() -> None:
         exact = (70 / z + 9) * view.depth.scale + view.depth.shift
         # Noise of the values lowers the slope by their share of the variance, most visible at the far edge.
         np.testing.assert_allclose(1 / exact, z, rtol=0.05)
+
+
+@pytest.mark.parametrize("kind", ["depths", "inverse depths"])
+def test_the_error_that_is_told_is_one_of_the_depth(kind: str) -> None:
+    scene, truth = slanted_wall()
+    rng = np.random.default_rng(0)
+    told: list[str] = []
+    aligned(
+        with_maps(scene, lambda i, z: MAPS[kind](i, z * (1 + rng.choice([-0.03, 0.03], z.shape))), truth), told.append
+    )
+    found = re.search(r"differ from the points by (\d\.\d)% of the depth", told[0])
+    # A point is up to half a pixel beside the centre of its pixel, and a fit to such errors changes some of them.
+    assert found and float(found[1]) == pytest.approx(3, abs=0.3)
+
+
+def test_what_maps_hold_is_decided_by_the_number_of_points() -> None:
+    """One whole map of inverse depths against two parts of depths."""
+    scene, truth = slanted_wall()
+    column = np.arange(80)[None]
+    mixed = with_maps(scene, lambda i, z: 1 / z if i == 0 else np.where(abs(column - 40) < 5, z, np.nan), truth)
+    with pytest.warns(UserWarning, match="2 of 3 depth maps do not agree"):
+        found = aligned(mixed)
+    assert found.train[0].depth is not None and found.train[0].depth.inverse
 
 
 def test_the_unit_of_the_world_does_not_matter() -> None:
