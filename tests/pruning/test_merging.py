@@ -7,7 +7,7 @@ from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians, logit
 from clsplat.metrics import to_uint8
 from clsplat.pruning.merging import _areas, _depths, covariances, merge_costs, merged, merged_as_seen, neighbours
-from clsplat.pruning.prices import price
+from clsplat.pruning.prices import Prices, price
 from clsplat.render import render
 from clsplat.renderer import Renderer
 from clsplat.scene import View
@@ -110,6 +110,43 @@ def test_what_is_hidden_counts_less():
     one = np.array([[0, 1]])
     seen, plain = merged_as_seen(pair, one, prices), merged(pair, one)
     assert abs(seen.means[0, 0] - pair.means[0, 0]) < 0.9 * abs(plain.means[0, 0] - pair.means[0, 0])
+
+
+def prices_of(weights, grains):
+    """Of Gaussians with these sums of weights, and squared sizes of their pixels."""
+    n = len(weights)
+    zeros = np.zeros(n)
+    return Prices(zeros, zeros, np.array(weights), np.ones(n), np.zeros((n, 3)), np.array(grains), np.zeros((n, 1)))
+
+
+def unlike_spheres():
+    """Of standard deviations 1 and 0.1 at x = 0 and 1, with the same optical depth times area."""
+    depths = np.array([0.01, 1.0])
+    return Gaussians(
+        np.array([[0.0, 0, 0], [1, 0, 0]]),
+        np.log([[1.0] * 3, [0.1] * 3]),
+        np.tile([1.0, 0, 0, 0], (2, 1)),
+        logit(-np.expm1(-depths)),
+        np.zeros((2, 1, 3)),
+    )
+
+
+def test_the_blur_of_a_pixel_hides_nothing():
+    """Unobstructed, a Gaussian has its opacity times its area with the blur, 0.3 pixels squared (BLUR)."""
+    spheres, one = unlike_spheres(), np.array([[0, 1]])
+    grains = [0.5, 0.2]
+    areas = np.array([1 + 0.3 * grains[0], 0.01 + 0.3 * grains[1]])
+    found = merged_as_seen(spheres, one, prices_of(spheres.opacities * areas, grains))
+    assert_same(found, merged(spheres, one))
+
+
+@pytest.mark.parametrize(("shown", "x"), [([1, 0], 0.001 / 1.001), ([0, 1], 1 / 1.001), ([0, 0], 0.5)])
+def test_what_no_view_shows_has_a_thousandth_of_its_mass(shown, x):
+    """VISIBLE_MIN; if no view shows either, both have their whole mass."""
+    spheres, one = unlike_spheres(), np.array([[0, 1]])
+    weights = shown * spheres.opacities * np.array([1, 0.01])
+    found = merged_as_seen(spheres, one, prices_of(weights, [0.0, 0.0]))
+    np.testing.assert_allclose(found.means, [[x, 0, 0]], rtol=1e-9)
 
 
 def test_pairs_are_neighbours_once():
