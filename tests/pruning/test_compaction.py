@@ -13,8 +13,9 @@ from clsplat.dataset import load_scene
 from clsplat.formats import FORMATS, load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, to_uint8
-from clsplat.pruning import viewpoints
-from clsplat.pruning.compaction import ASSUMED_PSNR, LossMeter
+from clsplat.pruning import compaction, viewpoints
+from clsplat.pruning.compaction import ASSUMED_PSNR, Limits, LossMeter, _Search, choices_of
+from clsplat.pruning.reductions import Reduction
 from clsplat.pruning.viewpoints import automatic_cameras, own_views
 from clsplat.render import render
 from clsplat.renderer import Renderer
@@ -55,6 +56,35 @@ def test_loss_against_photos_is_the_difference_of_psnr(device, bloated):
     loss = LossMeter(good, views, True, Renderer(device))
     assert loss(bad) == pytest.approx(mean_psnr(good) - mean_psnr(bad), abs=0.1)  # but for the rounding of the photos
     assert loss(bad) > 1
+
+
+@pytest.mark.parametrize(
+    ("limits", "enough", "more"),
+    [
+        (Limits(gaussians=20), 20, 21),
+        (Limits(bytes=300), 30, 31),  # a tenth of the file for each tenth of the Gaussians
+        (Limits(gaussians=20, bytes=300), 20, 21),
+        (Limits(loss=0.705, gaussians=1), 29, 30),
+    ],
+)
+def test_the_reduction_goes_as_far_as_the_limits(limits, enough, more):
+    """Of 100 Gaussians in 1000 bytes, each of which loses 0.01 dB."""
+    scene = synthetic_scene(100)[0]
+    search = _Search(scene, lambda left: 0.01 * (100 - len(left)), limits, lambda version: (version, 1000))
+    assert search.far_enough(scene.take(np.arange(enough)))
+    assert not search.far_enough(scene.take(np.arange(more)))
+
+
+def test_what_has_merged_has_the_curvature_of_both(monkeypatch):
+    scene = synthetic_scene(3, sh_degree=1)[0]
+    own, seen = np.float32([[1, 2], [10, 20], [100, 200]]), []
+    monkeypatch.setattr(compaction, "curvatures", lambda *_: own)
+    monkeypatch.setattr(compaction, "fitted_degree", lambda *_: None)
+    monkeypatch.setattr(compaction, "with_shared_bands", lambda pool, curvature, size: seen.append(curvature))
+    pool = Gaussians.concatenate([scene, scene.take(np.arange(2))])
+    reduction = Reduction(pool, np.array([[0, 1], [3, 2]]), np.zeros(5), np.ones(5))
+    choices_of(scene, reduction, [], 1, True, None)
+    np.testing.assert_array_equal(seen[0], [*own, [11, 22], [111, 222]])
 
 
 def compacted(bloated, out, *arguments, flag="--photos"):
