@@ -21,13 +21,6 @@ KILLS = 40
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    write_dataset(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def whole(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The scene that a run without faults ends in."""
     out = tmp_path_factory.mktemp("whole")

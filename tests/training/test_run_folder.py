@@ -131,13 +131,6 @@ def test_a_folder_that_cannot_be_locked_is_named(tmp_path: Path) -> None:
         pass
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    write_dataset(folder)
-    return folder
-
-
 def test_two_trainings_into_one_folder(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, long = tmp_path / "out", (*QUICK, "--iterations", 1_000_000)
     command = [sys.executable, "-m", "clsplat", "train", dataset, "-o", out, *long]
