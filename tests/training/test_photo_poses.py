@@ -11,6 +11,7 @@ from clsplat.renderer import Renderer
 from clsplat.scene import View
 from clsplat.testing import synthetic_scene
 from clsplat.training import photo_poses as poses
+from clsplat.training.photo_parameters import PerPhoto
 
 
 def generator(twist):
@@ -71,3 +72,21 @@ def test_only_the_photo_in_question_moves():
     # Also where other photos have taken some before.
     poses.update(learned, "a", camera, v_viewmat, 1e-3, 5.0, OptimConfig())
     np.testing.assert_array_equal(learned.of("a"), moved)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"steps": np.array([1, -1])},
+        {"steps": np.array([1.0, 1.0])},
+        {"values": np.full((2, 4, 4), np.nan)},
+        {"first": np.zeros((2, 7))},
+    ],
+)
+def test_parameters_are_restored_unless_they_are_damaged(damage):
+    learned = poses.start(["a", "b"])
+    learned.steps[:] = 1, 2
+    found = PerPhoto.restored(learned.arrays(), poses.start)
+    assert found.names == ["a", "b"] and found.steps.tolist() == [1, 2]
+    with pytest.raises(ValueError, match=r"of type|not finite, or negative steps"):
+        PerPhoto.restored(learned.arrays() | damage, poses.start)
