@@ -66,9 +66,13 @@ def images_of(field: "Field", views: "list[View]", config: TrainConfig) -> Itera
 def train_and_evaluate(
     data: Path, method: str, config: TrainConfig, device: "Device", out: Path, resume: bool
 ) -> None:
-    """Train a field with a progress bar, and write its file, log, and evaluation to `out`."""
+    """Train a field with a progress bar, and write its file, log, and evaluation to `out`.
+
+    Ctrl-C and SIGTERM end the training after an iteration, with a checkpoint.
+    """
     from tqdm import tqdm
 
+    from clsplat.commands.progress import Stop
     from clsplat.dataset import load_scene
     from clsplat.evaluate import evaluate_images, mean_metrics_of
     from clsplat.fields import METHODS
@@ -90,11 +94,13 @@ def train_and_evaluate(
             return {}
         return mean_metrics_of(images_of(field, scene.test, config), scene.test)
 
-    with tqdm(total=config.iterations, unit="it", dynamic_ncols=True) as bar:
+    stop = Stop(out)
+    with stop.awaited(), tqdm(total=config.iterations, unit="it", dynamic_ncols=True) as bar:
 
         def progress(record: dict[str, Any]) -> None:
             bar.update(record["iteration"] - bar.n)
             bar.set_postfix_str(f"loss={record['loss']:.4f}, rays={record['rays']}", refresh=False)
+            stop.after(record["iteration"])
 
         field = train_field(
             scene,

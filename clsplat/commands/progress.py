@@ -28,6 +28,49 @@ PAUSE = 1.0
 paused, or kernels were compiled for the first frame."""
 
 
+class Stop:
+    """Ctrl-C and SIGTERM, which batch systems send: they end a training after an iteration, not within it.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the run.
+
+    Attributes
+    ----------
+    asked : threading.Event
+        Set when a signal has come.
+    """
+
+    def __init__(self, out: Path):
+        self._out, self._terminated, self.asked = out, False, threading.Event()
+
+    @contextmanager
+    def awaited(self) -> Iterator[None]:
+        """Keep the first signal for `after` in the block; a second one does not wait."""
+        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+        def interrupt(number: int, _: object) -> None:
+            self._terminated |= number == signal.SIGTERM
+            self.asked.set()
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGTERM, before[signal.SIGTERM])
+
+        for number in before:
+            signal.signal(number, interrupt)
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def after(self, iteration: int) -> None:
+        """Raise KeyboardInterrupt if a signal has come; it is `Terminated` for SIGTERM."""
+        if self.asked.is_set():
+            warn(f"{self._out}: stopped after iteration {iteration}")
+            raise Terminated if self._terminated else KeyboardInterrupt
+
+
 class Progress:
     """The bar, the viewer's panel, and Ctrl-C and SIGTERM of one training.
 
@@ -52,13 +95,12 @@ class Progress:
         viewer: "Viewer | None",
         began: Callable[[], None],
     ):
-        self._scene, self._config, self._renderer, self._out, self._viewer = scene, config, renderer, out, viewer
+        self._scene, self._config, self._renderer, self._viewer = scene, config, renderer, viewer
         self._began, self._shown = began, False
         self._bar: tqdm[Any] | None = None
         self._begun = threading.Event()
         self._waits = threading.Thread(target=self._wait, daemon=True)
-        self._interrupted = threading.Event()
-        self._terminated = False
+        self._stop = Stop(out)
         self._facts: dict[str, str] = {}  # lines of the viewer's panel
         self._psnr: float | None = None
 
@@ -66,26 +108,15 @@ class Progress:
     def watching(self) -> Iterator[None]:
         """Show in the block what the training waits for and then its progress.
 
-        Ctrl-C and SIGTERM, which batch systems send, end it after an iteration.
+        Ctrl-C and SIGTERM end it after an iteration.
         """
         if self._viewer:
             self._viewer.wait(WAITING)
         self._waits.start()
-        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-        def interrupt(number: int, _: object) -> None:
-            self._terminated |= number == signal.SIGTERM
-            self._interrupted.set()
-            signal.signal(signal.SIGINT, signal.default_int_handler)  # a second signal does not wait
-            signal.signal(signal.SIGTERM, before[signal.SIGTERM])
-
-        for number in before:
-            signal.signal(number, interrupt)
         try:
-            yield
+            with self._stop.awaited():
+                yield
         finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
             self._end_wait()
             if self._bar is not None:
                 self._bar.close()
@@ -120,12 +151,10 @@ class Progress:
             self._viewer.record(record["iteration"], record["num_gaussians"], self._psnr)
             self._psnr = None
             started = time.perf_counter()
-            self._viewer.follow(record["gaussians"], self._interrupted.is_set)
+            self._viewer.follow(record["gaussians"], self._stop.asked.is_set)
             if time.perf_counter() - started > PAUSE:
                 self._bar.unpause()
-        if self._interrupted.is_set():
-            warn(f"{self._out}: stopped after iteration {record['iteration']}")
-            raise Terminated if self._terminated else KeyboardInterrupt
+        self._stop.after(record["iteration"])
 
     def _start(self, record: dict[str, Any]) -> None:
         """Replace what the training waited for by a bar, whose estimate does not contain the wait."""

@@ -54,7 +54,7 @@ def train_field(
         Called with the field after every iteration. Its result, if any, is logged; the times in the log exclude it.
     progress : callable
         Called after every iteration with iteration, iterations, loss and rays. If it raises KeyboardInterrupt, a
-        checkpoint is written.
+        checkpoint is written. An interrupt at another time, within an iteration, leaves the last checkpoint.
 
     Returns
     -------
@@ -77,18 +77,18 @@ def train_field(
         field = method(Space.of(scene.train), device, config.seed)
     pixels, clock = Pixels(scene.train, field.space, BACKGROUNDS[config.data.background]), _Clock(seconds)
     log = _Lines(out / LOG, field.iteration)
-    try:
-        while field.iteration < config.iterations:
-            loss = _advance(field, pixels, config)
-            with clock.stopped():
-                now = {"iteration": field.iteration, "seconds": clock.seconds, "loss": loss}
-                log.record(now, evaluate(field), last=field.iteration == config.iterations)
+    while field.iteration < config.iterations:
+        loss = _advance(field, pixels, config)
+        with clock.stopped():
+            now = {"iteration": field.iteration, "seconds": clock.seconds, "loss": loss}
+            log.record(now, evaluate(field), last=field.iteration == config.iterations)
+            try:
                 progress(now | {"iterations": config.iterations, "rays": field.rays})
-                if field.iteration % config.checkpoint_every == 0 and field.iteration < config.iterations:
-                    save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
-    except KeyboardInterrupt:
-        save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
-        raise
+            except KeyboardInterrupt:
+                save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
+                raise
+            if field.iteration % config.checkpoint_every == 0 and field.iteration < config.iterations:
+                save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
     save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
     field.finish()
     save_field(out / MODEL, field)

@@ -1,7 +1,9 @@
 """`clsplat train --method` and `clsplat bench quality --methods` with radiance fields, on a tiny dataset."""
 
 import json
+import os
 import shutil
+import signal
 
 import numpy as np
 import pytest
@@ -50,6 +52,28 @@ def test_a_run_is_not_overwritten_but_resumes(dataset, tmp_path, capsys):
     assert "holds a run already" in fails(capsys, "train", dataset, "-o", tmp_path, "--method", "ingp-base")
     train(dataset, tmp_path, "--resume")
     assert (tmp_path / "field.npz").read_bytes() == before
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_a_field_after_a_step(number, status, dataset, tmp_path, monkeypatch, capsys, device):
+    """With a checkpoint from which it resumes to the same bits."""
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    train(dataset, whole)
+    evaluated, sent = SmallIngp._evaluate, []
+
+    def send_once(self, *arguments):
+        if self.iteration == 2 and not sent:
+            sent.append(number)
+            os.kill(os.getpid(), number)
+        return evaluated(self, *arguments)
+
+    monkeypatch.setattr(SmallIngp, "_evaluate", send_once)
+    with pytest.raises(SystemExit) as exit_:
+        train(dataset, stopped)
+    assert exit_.value.code == status
+    assert f"{stopped}: stopped after iteration 2\n" in capsys.readouterr().err
+    train(dataset, stopped, "--resume")
+    assert (stopped / "field.npz").read_bytes() == (whole / "field.npz").read_bytes()
 
 
 def test_info_tells_the_method_and_what_was_found(dataset, tmp_path, capsys):

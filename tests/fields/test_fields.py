@@ -101,6 +101,29 @@ def test_runs_repeat_and_resume_to_the_bit(device, method, room, tmp_path):
     ]  # fmt: skip
 
 
+@EACH
+def test_an_interrupt_within_a_step_leaves_the_last_checkpoint(device, scene, method, tmp_path, monkeypatch):
+    """Half of a step is no state from which a run could go on to the same bits."""
+    config = replace(CONFIG, iterations=12, checkpoint_every=5)
+    (tmp_path / "whole").mkdir()
+    whole = train_field(scene, method, config, tmp_path / "whole", device)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    def evaluate(field):
+        if field.iteration == 6:
+            field.stages.rays_bwd = interrupted
+        return {}
+
+    with pytest.raises(KeyboardInterrupt):
+        train_field(scene, method, config, tmp_path, device, evaluate=evaluate)
+    assert load_checkpoint(tmp_path / CHECKPOINT, method, config, device)[0].iteration == 5
+    resumed = train_field(scene, method, config, tmp_path, device, resume=True)
+    for name, array in whole.model().items():
+        np.testing.assert_array_equal(resumed.model()[name], array)
+
+
 @ALL
 def test_the_file_renders_what_was_trained(device, method, room, tmp_path):
     scene = ball(room=room)
