@@ -102,13 +102,14 @@ class Field(ABC):
     def image(self, camera: Camera, background: Color) -> NDArray[np.float32]:
         """Render an image (H, W, 3)."""
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
-        rgb = np.empty((len(u), 3), np.float32)
+        rgb = np.tile(np.array(background, np.float32), (len(u), 1))
         for begin in range(0, len(u), RENDERED_RAYS):
             part = slice(begin, begin + RENDERED_RAYS)
             at = camera, u[part] + 0.5, v[part] + 0.5
             origins, directions = self.space.rays(*at)
-            seen = np.isfinite(directions).all(axis=1, keepdims=True)
-            arrays = origins, np.nan_to_num(directions), self.space.radii(*at)
-            colors = self.colors(Rays(*(self.device.upload("rays", array) for array in arrays)), background).get()
-            rgb[part] = np.where(seen, colors, background)
+            seen = np.isfinite(directions).all(axis=1)  # a fisheye sees nothing in its corners
+            if seen.any():
+                arrays = (array[seen] for array in (origins, directions, self.space.radii(*at)))
+                rays = Rays(*(self.device.upload("rays", array) for array in arrays))
+                rgb[part][seen] = self.colors(rays, background).get()
         return rgb.reshape(camera.height, camera.width, 3)

@@ -8,6 +8,7 @@ import pytest
 from ball_photos import ball
 from small_fields import SmallIngp, SmallMipNerf360, SmallNerf, SmallPlenoxels
 
+from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.dataset.near_planes import NEAR_SHARE
 from clsplat.errors import InputError
@@ -153,6 +154,21 @@ def test_rays_without_samples_see_the_background(device, scene, monkeypatch):
     field._grid.place(occupied, np.zeros((8, 28)))
     image = field.image(scene.test[0].camera, WHITE)
     np.testing.assert_array_equal(image, np.ones_like(image))
+
+
+@EACH
+def test_a_fisheye_within_the_cube_shows_the_background_in_its_corners(device, scene, method):
+    """Pixels that see nothing have no rays: one without a direction would have samples without end."""
+    field = method(Space.of(scene.train), device, 0)
+    centre, scale = field.space.centre, field.space.scale
+    camera = Camera.look_at(centre + scale * np.array([0.2, 0.1, 0]), centre, (0, 0, 1), 3.0, 16, 16)
+    camera = replace(camera, model="fisheye")
+    v, u = np.divmod(np.arange(256), 16)
+    blind = np.isnan(camera.rays(u + 0.5, v + 0.5)).any(axis=1).reshape(16, 16)
+    image = field.image(camera, (0.25, 0.5, 1.0))
+    assert 0 < blind.sum() < 50 and np.isfinite(image).all()
+    np.testing.assert_array_equal(image[blind], np.tile([0.25, 0.5, 1.0], (blind.sum(), 1)))
+    assert (image[~blind] != image[blind][0]).any(axis=1).all()
 
 
 def test_cells_are_refined_while_pixels_are_smaller(device, scene):
