@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+import zlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 
 MODEL = "field.npz"
 """Name of the file of the model in the folder of a run."""
+
+DAMAGES = AttributeError, EOFError, KeyError, OSError, RuntimeError, TypeError, ValueError
+"""What reading a damaged file raises, beside the errors of archives. RuntimeError: for an encryption or compression
+that Python does not know."""
 
 
 def save_field(path: Path, field: Field) -> None:
@@ -88,6 +93,6 @@ def _read(path: Path, methods: dict[str, type[Field]], device: "Device") -> tupl
         field.restore(arrays)
     except FileNotFoundError as error:
         raise InputError(f"{path}: expected a field, found no file") from error
-    except (AttributeError, EOFError, KeyError, OSError, TypeError, ValueError, zipfile.BadZipFile) as error:
+    except (*DAMAGES, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: expected a field of clsplat, found a damaged file: {error!r}") from error
     return field, about

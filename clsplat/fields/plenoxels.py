@@ -218,7 +218,7 @@ class Plenoxels(Field):
         for start, part in self._parts().items():
             part.restore(*(arrays[start + name] for name in ("table", "cells", "occupied")))
             if f"{start}squares" in arrays:
-                part.squares = self.device.upload("squares", arrays[f"{start}squares"])
+                part.squares.set(arrays[f"{start}squares"].astype(self.device.real).reshape(part.squares.shape))
         if "counters" in arrays:
             self._rays, self._events = map(int, arrays["counters"])
 

@@ -147,8 +147,18 @@ class SparseGrid:
         return {"table": self.table.get(), "cells": cells, "occupied": np.packbits(self.occupied)}
 
     def restore(self, table: Array, cells: Array, occupied: Array) -> None:
-        """Set the arrays of `model`."""
-        self.place(np.unpackbits(occupied)[: cells.prod()].reshape(cells), table)
+        """Set the arrays of `model`.
+
+        Raises
+        ------
+        ValueError
+            If they do not belong together: kernels would read beyond the end of the table or of the cells.
+        """
+        grid = np.unpackbits(occupied)[: cells.prod()].reshape(cells)
+        shape = int(corners_of(grid, closed=self._closed).sum()), self.table.shape[1]
+        if table.shape != shape or np.ptp(cells / self.occupied.shape) > 0:  # all axes are divided as often
+            raise ValueError(f"a table of shape {table.shape} for {shape[0]} corners of {cells} cells")
+        self.place(grid, table)
 
     def round(self) -> None:
         """Round the table to half precision."""

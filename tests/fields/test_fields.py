@@ -13,7 +13,7 @@ from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.dataset.near_planes import NEAR_SHARE
 from clsplat.errors import InputError
 from clsplat.fields import METHODS, plenoxels
-from clsplat.fields.field_files import MODEL, load_checkpoint, load_field
+from clsplat.fields.field_files import MODEL, load_checkpoint, load_field, save_checkpoint, save_field
 from clsplat.fields.field_training import train_field
 from clsplat.fields.occupancy import FULL_UPDATES, SHARE, THRESHOLD, Occupancy
 from clsplat.fields.pixels import Pixels
@@ -226,6 +226,37 @@ def test_damaged_files_are_refused(device, tmp_path):
     np.savez(path, about=json.dumps({"method": "nerd"}))
     with pytest.raises(InputError, match="expected a field of nerf, nerf-small, plenoxels"):
         load_field(path, METHODS, device)
+
+
+@pytest.mark.parametrize("byte", [8, 10], ids=["encrypted", "compression"])
+def test_archives_that_python_cannot_read_are_damaged(byte, device, scene, tmp_path):
+    """Bits of the flags, and the method, in the first entry of the archive's directory."""
+    path = tmp_path / MODEL
+    save_field(path, SmallNerf(Space.of(scene.train), device, 0))
+    archive = bytearray(path.read_bytes())
+    archive[archive.index(b"PK\x01\x02") + byte] |= 0x41
+    path.write_bytes(archive)
+    with pytest.raises(InputError, match="damaged"):
+        load_field(path, {SmallNerf.name: SmallNerf}, device)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("table", lambda a: a[:-1]),
+        ("table", lambda a: a[:, :4]),
+        ("cells", lambda a: np.array([512, 1, 1])),
+        ("squares", lambda a: a[:-1]),
+    ],
+)
+def test_a_grid_whose_arrays_do_not_fit_is_refused(device, scene, tmp_path, name, change):
+    """Kernels would read beyond the end of the arrays."""
+    path, config = tmp_path / CHECKPOINT, replace(CONFIG, iterations=1)
+    save_checkpoint(path, SmallPlenoxels(Space.of(scene.train), device, 0), config, 0.0)
+    arrays = dict(np.load(path))
+    np.savez(path, **arrays | {name: change(arrays[name])})
+    with pytest.raises(InputError, match="damaged"):
+        load_checkpoint(path, SmallPlenoxels, config, device)
 
 
 def test_pixels_are_those_of_the_photos(scene):
