@@ -65,3 +65,13 @@ def test_gradients_by_central_differences(device64):
         return float(by_kernel(device64, sigmas, deltas, v_weights, 0 * sigmas)[0] @ v_weights)
 
     gradcheck(total, {"sigmas": sigmas}, {"sigmas": v_sigmas})
+
+
+def test_an_opaque_sample_hides_all_others(any_device):
+    """Its depth is so large that adding those before it, and subtracting it again, would leave nothing of them."""
+    given = np.full(COUNT, 2.0), np.full(COUNT, 0.05), np.ones(COUNT), np.zeros(COUNT)
+    given[0][5] = 1e25
+    for run in (by_twin, lambda *a: by_kernel(any_device, *a)):
+        weights = run(*given)[0]
+        np.testing.assert_allclose(weights[5], np.exp(-0.5), rtol=1e-5)
+        assert weights.sum() == pytest.approx(1, rel=1e-5) and not weights[6:].any()

@@ -11,7 +11,8 @@ Array = NDArray[Any]
 def weights_fwd(sigmas: Array, deltas: Array, count: int) -> Array:
     """Weights of samples. Arguments and result as for `clsplat.ops.weights_fwd`."""
     depths = (sigmas * deltas).reshape(-1, count)
-    before = np.cumsum(depths, axis=1) - depths
+    # Not the sum with a sample less the sample: behind an opaque one nothing would be left of what is before it.
+    before = np.cumsum(np.pad(depths[:, :-1], ((0, 0), (1, 0))), axis=1)
     return (np.exp(-before) * -np.expm1(-depths)).ravel()
 
 
@@ -19,5 +20,5 @@ def weights_bwd(sigmas: Array, deltas: Array, count: int, weights: Array, v_weig
     """Add the gradient. Arguments as for `clsplat.ops.weights_bwd`."""
     through = np.exp(-np.cumsum((sigmas * deltas).reshape(-1, count), axis=1))
     v, pulls = v_weights.reshape(-1, count), (weights * v_weights).reshape(-1, count)
-    behind = np.cumsum(pulls[:, ::-1], axis=1)[:, ::-1] - pulls
+    behind = np.cumsum(np.pad(pulls[:, :0:-1], ((0, 0), (1, 0))), axis=1)[:, ::-1]
     v_sigmas += deltas * (through * v - behind).ravel()
