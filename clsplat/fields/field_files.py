@@ -35,9 +35,9 @@ def save_field(path: Path, field: Field) -> None:
     _write(path, arrays | {"about": np.array(json.dumps(_about(field)))})
 
 
-def save_checkpoint(path: Path, field: Field, config: TrainConfig, seconds: float) -> None:
-    """Write everything that further training depends on, whole or not at all."""
-    about = _about(field) | {"config": _compared(config), "seconds": seconds}
+def save_checkpoint(path: Path, field: Field, config: TrainConfig, seconds: float, losses: list[float]) -> None:
+    """Write everything that further training depends on, whole or not at all; `losses` are those not yet logged."""
+    about = _about(field) | {"config": _compared(config), "seconds": seconds, "losses": losses}
     _write(path, field.model() | field.optimiser() | {"about": np.array(json.dumps(about))})
 
 
@@ -66,8 +66,10 @@ def load_field(path: Path, methods: dict[str, type[Field]], device: "Device") ->
     return _read(path, methods, device)[0]
 
 
-def load_checkpoint(path: Path, method: type[Field], config: TrainConfig, device: "Device") -> tuple[Field, float]:
-    """Read what `save_checkpoint` wrote: the field and its training time in seconds.
+def load_checkpoint(
+    path: Path, method: type[Field], config: TrainConfig, device: "Device"
+) -> tuple[Field, float, list[float]]:
+    """Read what `save_checkpoint` wrote: the field, its training time in seconds, and the losses not yet logged.
 
     Raises
     ------
@@ -77,7 +79,7 @@ def load_checkpoint(path: Path, method: type[Field], config: TrainConfig, device
     field, about = _read(path, {method.name: method}, device)
     if about.get("config") != _compared(config):
         raise InputError(f"{path}: expected the configuration it was made with, found another one")
-    return field, float(about["seconds"])
+    return field, float(about["seconds"]), list(about.get("losses", []))  # earlier versions had none
 
 
 def _read(path: Path, methods: dict[str, type[Field]], device: "Device") -> tuple[Field, dict[str, Any]]:

@@ -70,13 +70,18 @@ def train_field(
     ClsplatError
         If the loss stops being finite.
     """
-    config, seconds = replace(config, iterations=config.iterations or method.iterations), 0.0
+    config = replace(config, iterations=config.iterations or method.iterations)
+    seconds, losses = 0.0, list[float]()
     if resume:
-        field, seconds = load_checkpoint(out / CHECKPOINT, method, config, device)
+        field, seconds, losses = load_checkpoint(out / CHECKPOINT, method, config, device)
     else:
         field = method(Space.of(scene.train), device, config.seed)
     pixels, clock = Pixels(scene.train, field.space, BACKGROUNDS[config.data.background]), _Clock(seconds)
-    log = _Lines(out / LOG, field.iteration)
+    log = _Lines(out / LOG, field.iteration, losses)
+
+    def save() -> None:
+        save_checkpoint(out / CHECKPOINT, field, config, clock.seconds, losses)
+
     while field.iteration < config.iterations:
         loss = _advance(field, pixels, config)
         with clock.stopped():
@@ -85,11 +90,11 @@ def train_field(
             try:
                 progress(now | {"iterations": config.iterations, "rays": field.rays})
             except KeyboardInterrupt:
-                save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
+                save()
                 raise
             if field.iteration % config.checkpoint_every == 0 and field.iteration < config.iterations:
-                save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
-    save_checkpoint(out / CHECKPOINT, field, config, clock.seconds)
+                save()
+    save()
     field.finish()
     save_field(out / MODEL, field)
     return field
@@ -125,11 +130,13 @@ class _Clock:
 
 
 class _Lines:
-    """The lines of the log: the mean loss since the last one, and what was found."""
+    """The lines of the log: the mean loss since the last one, and what was found.
 
-    def __init__(self, path: Path, iteration: int):
-        self._append = log_file(path, iteration)
-        self._losses: list[float] = []
+    `losses` are those since the last line; `record` adds to the list, and clears it after a line.
+    """
+
+    def __init__(self, path: Path, iteration: int, losses: list[float]):
+        self._append, self._losses = log_file(path, iteration), losses
 
     def record(self, now: dict[str, Any], found: dict[str, Any], last: bool) -> None:
         """Write a line every `LOG_EVERY` iterations, after an evaluation and at the end."""
