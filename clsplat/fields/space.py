@@ -28,7 +28,7 @@ ray."""
 
 FAR = 100.0
 """Distance at which rays end where there is a background, in distances of the farthest camera from the centre. The
-contraction maps it to 1.99 of 2."""
+contraction maps it to 1.99 of 2. Where rays begin farther away, the distances are in those at which they begin."""
 
 CUBE_EDGE = 3.0
 """Edge of the cube in the units of NeRF's synthetic scenes (Mildenhall et al. 2020)."""
@@ -64,12 +64,15 @@ class Space:
         cameras = [view.camera for view in views]
         centre = focus_point(cameras)
         distances = [float(np.linalg.norm(camera.position - centre)) for camera in cameras]
+        is_object = any(view.clear is not None for view in views)
+        near = 0.0 if is_object else NEAR_FACTOR * min(camera.near_depth for camera in cameras)
+        if near >= FAR * max(distances):  # cameras in one place, as on a tripod: rays would end before they begin
+            distances = [near] * len(cameras)
         pixel = float(np.median([d * _spacing(camera) for camera, d in zip(cameras, distances, strict=True)]))
-        if any(view.clear is not None for view in views):
+        if is_object:
             scale = 2 * BOX_SHARE * float(np.mean(distances))
             return cls(centre, scale, False, 0.0, pixel / scale)
         scale = max(distances)
-        near = NEAR_FACTOR * min(camera.near_depth for camera in cameras)
         return cls(centre, scale, True, near / scale, pixel / scale)
 
     @property

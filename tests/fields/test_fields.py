@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ball_photos import ball
+from ball_photos import EDGE, ball
 from small_fields import SmallIngp, SmallMipNerf360, SmallNerf, SmallPlenoxels
 
 from clsplat.camera import Camera
@@ -21,6 +21,7 @@ from clsplat.fields.space import FAR, Space
 from clsplat.metrics import psnr, to_uint8
 from clsplat.randomness import stream
 from clsplat.resuming import CHECKPOINT, FREE
+from clsplat.scene import Scene, View
 
 WHITE = BACKGROUNDS["white"]
 CONFIG = TrainConfig(iterations=250, data=DataConfig(background="white"))
@@ -297,6 +298,25 @@ def test_rays_begin_before_the_nearest_points(scene):
     space = Space.of(views)
     assert space.near * space.scale == pytest.approx(0.8 * 2.0)
     assert space.marching.near == space.span.near == space.near
+
+
+@EACH
+def test_a_tripod_has_rays(device, tmp_path, method):
+    """Cameras that turn in one place, up to a thousandth of the distance of what they see."""
+    views = []
+    for k, off in enumerate(np.random.default_rng(0).normal(size=(12, 3)) * 1e-3):
+        ahead = (np.cos(k * np.pi / 6), np.sin(k * np.pi / 6), 0)
+        camera = replace(Camera.look_at(off, off + ahead, (0, 0, 1), EDGE, EDGE, EDGE), near=0.3)
+        v, u = np.divmod(np.arange(EDGE**2), EDGE)
+        directions = camera.rays(u + 0.5, v + 0.5) @ camera.viewmat[:3, :3]
+        colors = 0.5 + 0.5 * np.sin(3 * directions + 1)
+        views.append(View(f"{k}", camera, np.rint(255 * colors).astype(np.uint8).reshape(EDGE, EDGE, 3)))
+    space = Space.of(views)
+    assert space.near == 1 and space.scale == pytest.approx(0.8) and space.pixel == pytest.approx(1 / EDGE, rel=0.1)
+    scene = Scene(views, [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    train_field(scene, method, replace(CONFIG, iterations=60), tmp_path, device)
+    losses = [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert losses[-1] < 0.5 * losses[0]
 
 
 def test_occupancy_forgets_and_finds():
