@@ -40,7 +40,7 @@ def check_photos(data: Path, scene: "Scene", config: TrainConfig) -> None:
     from clsplat.training.memory import bytes_text
     from clsplat.training.preparation import photo_memory
 
-    need = sum(3 * view.camera.width * view.camera.height for view in scene.train + scene.test)
+    need = sum(_bytes_of(view) for view in scene.train + scene.test)
     budget = photo_budget(photo_memory(config))
     if budget is None or need <= budget:
         return
@@ -53,6 +53,12 @@ def check_photos(data: Path, scene: "Scene", config: TrainConfig) -> None:
         f"{data}: expected photos that fit {bytes_text(budget)}, half of this machine, as a field trains on all "
         f"pixels at once, found {bytes_text(need)}; use a higher --downscale"
     )
+
+
+def _bytes_of(view: "View") -> int:
+    """Bytes of a photo, and of the places of its pixels that count if it has a mask (`clsplat.fields.pixels`)."""
+    each = 3 + (view.clear is not None) + 5 * (view.mask is not None)
+    return each * view.camera.width * view.camera.height
 
 
 def images_of(field: "Field", views: "list[View]", config: TrainConfig) -> Iterator[NDArray[np.uint8]]:

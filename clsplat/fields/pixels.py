@@ -26,7 +26,7 @@ class Batch(NamedTuple):
 
 
 class Pixels:
-    """The pixels of photos that are used, in one array.
+    """The pixels of photos that are used. The photos stay as they are: a copy would take as much memory again.
 
     Parameters
     ----------
@@ -37,35 +37,38 @@ class Pixels:
     """
 
     def __init__(self, views: list[View], space: Space, loaded_on: Color):
-        self._views, self._space, self._loaded_on = views, space, np.asarray(loaded_on)
-        self._first = np.cumsum([0] + [view.image.shape[0] * view.image.shape[1] for view in views])
-        self._colors = np.concatenate([view.image.reshape(-1, 3) for view in views])
-        self.transparent = any(view.clear is not None for view in views)
-        if self.transparent:
-            self._clear = np.concatenate([_clear(view).ravel() for view in views])
-        used = np.concatenate([view.counts.ravel() for view in views])
-        self._used = None if used.all() else np.flatnonzero(used)
+        self._views = [view.loaded() for view in views]
+        self._space, self._loaded_on = space, np.asarray(loaded_on)
+        self._used = [_used(view) for view in self._views]
+        pairs = zip(self._views, self._used, strict=True)
+        counts = [view.camera.width * view.camera.height if used is None else len(used) for view, used in pairs]
+        self._first = np.cumsum([0, *counts])
+        self.transparent = any(view.clear is not None for view in self._views)
 
     def draw(self, rng: np.random.Generator, count: int) -> Batch:
         """Draw pixels, each with the same chance; transparent photos are shown on a random background."""
         background = rng.uniform(size=3) if self.transparent else self._loaded_on
-        chosen = rng.integers(self._first[-1] if self._used is None else len(self._used), size=count)
-        pixels = np.sort(chosen if self._used is None else self._used[chosen])
-        starts = np.searchsorted(pixels, self._first)
+        chosen = np.sort(rng.integers(self._first[-1], size=count))
+        starts = np.searchsorted(chosen, self._first)
         origins, directions, radii = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
-        for view, first, begin, end in zip(self._views, self._first, starts, starts[1:], strict=False):
+        colors = np.empty((count, 3))
+        for view, used, first, begin, end in zip(
+            self._views, self._used, self._first, starts, starts[1:], strict=False
+        ):
             if begin < end:
-                v, u = np.divmod(pixels[begin:end] - first, view.camera.width)
+                own = chosen[begin:end] - first
+                v, u = np.divmod(own if used is None else used[own], view.camera.width)
                 at = view.camera, u + 0.5, v + 0.5
                 origins[begin:end], directions[begin:end] = self._space.rays(*at)
                 radii[begin:end] = self._space.radii(*at)
-        colors = self._colors[pixels] / 255
-        if self.transparent:
-            colors += self._clear[pixels, None] / 255 * (background - self._loaded_on)
+                colors[begin:end] = view.image[v, u] / 255
+                if view.clear is not None:
+                    colors[begin:end] += view.clear[v, u, None] / 255 * (background - self._loaded_on)
         seen = np.isfinite(directions).all(axis=1)  # a fisheye sees nothing in its corners
         light = (float(background[0]), float(background[1]), float(background[2]))
         return Batch(origins[seen], directions[seen], radii[seen], np.clip(colors[seen], 0, 1), light)
 
 
-def _clear(view: View) -> NDArray[np.uint8]:
-    return np.zeros(view.image.shape[:2], np.uint8) if view.clear is None else view.clear
+def _used(view: View) -> NDArray[np.uint32] | None:
+    """Places of the pixels that count in the flat photo; None if all do."""
+    return None if view.mask is None or view.mask.all() else np.flatnonzero(view.mask).astype(np.uint32)

@@ -8,6 +8,7 @@ import signal
 import numpy as np
 import pytest
 from cli_runs import fails, read_image, run
+from PIL import Image
 from small_fields import SmallIngp
 from test_info import info
 
@@ -147,6 +148,19 @@ def test_the_limit_of_memory_holds_for_the_photos(dataset, tmp_path, capsys, mon
     )
     monkeypatch.setattr("clsplat.streaming.physical_memory", lambda: 2 * enough)
     assert f"clsplat: {dataset}: expected photos that fit 0.0 MB, half of this machine" in fails(capsys, *flags)
+
+
+def test_masks_count_in_the_memory_of_photos(dataset, tmp_path, capsys, monkeypatch):
+    """A byte for a pixel, and four for the place of each that counts."""
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for photo in dataset.glob("*.png"):
+        Image.new("L", (40, 32), 255).save(masks / f"{photo.stem}.png")
+    monkeypatch.setattr("clsplat.streaming.physical_memory", lambda: 2 * 9 * 7 * 40 * 32)
+    flags = ["train", dataset, "-o", tmp_path / "run", "--method", "ingp-base", "--masks", masks]
+    assert "expected photos that fit 0.1 MB, half of this machine" in fails(capsys, *flags)
+    monkeypatch.setattr("clsplat.streaming.physical_memory", lambda: 2 * 9 * 8 * 40 * 32)
+    train(dataset, tmp_path / "run", "--masks", masks)
 
 
 def test_settings_of_gaussians_are_refused(dataset, tmp_path, capsys):

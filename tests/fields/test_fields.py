@@ -1,6 +1,7 @@
 """Radiance fields: a ball is learned, runs repeat and resume to the bit, and files hold what renders."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -278,6 +279,23 @@ def test_masked_pixels_are_not_drawn(scene):
     views[3].mask[5, 7] = True
     batch = Pixels(views, Space.of(views), WHITE).draw(stream(0, "pixels of a batch"), 20)
     np.testing.assert_array_equal(batch.directions, np.tile(batch.directions[0], (20, 1)))
+
+
+def test_photos_are_not_copied(scene):
+    """What they take besides: 4 bytes for each pixel that a mask leaves."""
+    views = [replace(v, mask=np.arange(EDGE**2).reshape(EDGE, EDGE) % 4 == 0) for v in scene.train]
+    large = [replace(v, **{name: np.tile(getattr(v, name), (40, 1, 1)[: getattr(v, name).ndim])
+                           for name in ("image", "mask", "clear")},
+                     camera=replace(v.camera, height=40 * EDGE)) for v in views]  # fmt: skip
+    space, bytes_used = Space.of(views), []
+    for part in (large, [replace(v, mask=None) for v in large]):
+        tracemalloc.start()
+        pixels = Pixels(part, space, WHITE)
+        bytes_used.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+        assert pixels.transparent
+    total = len(large) * 40 * EDGE**2
+    assert bytes_used[0] < 4 * total / 4 + 20_000 and bytes_used[1] < 20_000
 
 
 def test_photos_without_transparency_have_a_contracted_space(scene):
