@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera, focus_point
+from clsplat.errors import InputError
 from clsplat.field_stages import Marching, Span
 from clsplat.scene import View
 
@@ -101,7 +102,14 @@ class Space:
         """Origins and directions (R, 3) of the rays through points of an image, in px, in the field's coordinates.
 
         A direction is NaN where a fisheye sees nothing.
+
+        Raises
+        ------
+        InputError
+            If the camera is orthographic: its rays have no origin in common.
         """
+        if camera.model == "orthographic":
+            raise InputError("camera: expected a perspective one for a field, found an orthographic one")
         directions = camera.rays(u, v) @ camera.viewmat[:3, :3]
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)  # poses may be printed with few digits
         origin = (camera.position - self.centre) / self.scale + (0.0 if self.contracted else 0.5)

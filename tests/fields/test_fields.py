@@ -172,6 +172,13 @@ def test_a_fisheye_within_the_cube_shows_the_background_in_its_corners(device, s
     assert (image[~blind] != image[blind][0]).any(axis=1).all()
 
 
+def test_an_orthographic_camera_is_refused(device, scene):
+    """All its rays would begin in one point, and the image have a single colour."""
+    field = SmallNerf(Space.of(scene.train), device, 0)
+    with pytest.raises(InputError, match="expected a perspective one for a field, found an orthographic one"):
+        field.image(replace(scene.test[0].camera, model="orthographic"), WHITE)
+
+
 def test_cells_are_refined_while_pixels_are_smaller(device, scene):
     """A pixel of these photos is 1/40 of the cube wide in its middle: 16 cells are allowed, 32 are not."""
     field = SmallPlenoxels(Space.of(scene.train), device, 0)
