@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.commands import console
 from clsplat.commands.console import say, say_scores, write_json
 from clsplat.commands.run_folders import CONFIG, extracted
 from clsplat.config import BACKGROUNDS, TrainConfig
@@ -89,7 +90,8 @@ def train_and_evaluate(
     kind = METHODS[method]
     config = replace(config, iterations=config.iterations or kind.iterations)
     photos = replace(config.data, random_background=True)
-    scene = load_scene(extracted(data, out), photos, memory=photo_memory(config))
+    verbose = console.loudness == "verbose"
+    scene = load_scene(extracted(data, out), photos, verbose, photo_memory(config))
     check_photos(data, scene, config)
     if not resume:
         write_json(out / CONFIG, {DATA_PATH: str(data.resolve()), METHOD: method, **asdict(config)})

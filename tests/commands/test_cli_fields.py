@@ -17,6 +17,7 @@ from clsplat.bench.results import read_records
 from clsplat.commands.run_folders import read_run
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene
+from clsplat.errors import InputError
 from clsplat.fields import METHODS
 from clsplat.fields.field_files import load_field
 from clsplat.metrics import to_uint8
@@ -148,6 +149,22 @@ def test_the_limit_of_memory_holds_for_the_photos(dataset, tmp_path, capsys, mon
     )
     monkeypatch.setattr("clsplat.streaming.physical_memory", lambda: 2 * enough)
     assert f"clsplat: {dataset}: expected photos that fit 0.0 MB, half of this machine" in fails(capsys, *flags)
+
+
+@pytest.mark.parametrize("flags", [(), ("--verbose",)])
+def test_verbose_shows_the_messages_of_colmap(flags, dataset, tmp_path, capsys, monkeypatch):
+    """As it does for Gaussians: `load_scene` is told."""
+
+    def load_scene(*arguments, **_):
+        raise InputError(f"verbose: {arguments[2]}")
+
+    monkeypatch.setattr("clsplat.dataset.load_scene", load_scene)
+    monkeypatch.setattr("clsplat.commands.console.loudness", "normal")  # both are changed by the flag
+    monkeypatch.setenv("PYOPENCL_COMPILER_OUTPUT", "")
+    flags = ("train", dataset, "-o", tmp_path / "run", "--method", "ingp-base", *flags)
+    with pytest.raises(SystemExit):
+        run(*flags)
+    assert f"clsplat: verbose: {'--verbose' in flags}\n" in capsys.readouterr().err
 
 
 def test_masks_count_in_the_memory_of_photos(dataset, tmp_path, capsys, monkeypatch):
