@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from clsplat.bench.cells import Cell, Source
-from clsplat.bench.measures import TRAINING_PHOTOS, Masks, facts_of, quality_of, sample_iterations
+from clsplat.bench.measures import TRAINING_PHOTOS, Masks, facts_of, finite, quality_of, sample_iterations
 from clsplat.bench.results import Record
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.device import Device
@@ -55,7 +55,8 @@ def run_field(
     device, background = Device(evaluator.cl_device, memory_limit=limit), BACKGROUNDS[config.data.background]
     facts, at = facts_of(scene, rare), sample_iterations(config.iterations)[::-SAMPLE_EVERY]
     clocks = time.perf_counter, time.process_time
-    evaluating, best = np.zeros(2), -np.inf
+    evaluating = np.zeros(2)
+    best: float | None = None
     with tempfile.TemporaryDirectory() as folder, tqdm(total=config.iterations, leave=False) as bar:
         out = Path(folder)
         train_field(scene, method, replace(config, iterations=1), out, Device(evaluator.cl_device))  # builds kernels
@@ -69,7 +70,8 @@ def run_field(
             memory = device.memory_peak
             save_field(out / MODEL, field)
             values |= quality_of(_images(field, scene.test, background), scene.test, rare)
-            best = max(best, values["psnr"] or best)
+            if values["psnr"] is not None:
+                best = values["psnr"] if best is None else max(best, values["psnr"])
             values |= {"num_gaussians": None, "spz_bytes": (out / MODEL).stat().st_size, "best": best}
             evaluating += np.array([clock() for clock in clocks]) - now
             return values | {"memory_bytes": memory}
@@ -85,7 +87,7 @@ def run_field(
         field = train_field(scene, method, config, out, device, evaluate=evaluate, progress=progress)
         values = sample(field)
     views = evenly_spaced(scene.train, TRAINING_PHOTOS)
-    values |= {"train_psnr": mean_metrics_of(_images(field, views, background), views, (psnr,))["psnr"]}
+    values |= finite({"train_psnr": mean_metrics_of(_images(field, views, background), views, (psnr,))["psnr"]})
     values |= {"fps": _frames_per_second(field, scene.test, background)}
     record(values)
     return values

@@ -85,7 +85,7 @@ def quality_of(images: Iterable[NDArray[np.uint8]], views: list[View], rare: Mas
     figures = {"psnr": _mean(psnrs), "ssim": _mean(ssims), "flip": _mean(flips), "worst": min(psnrs)}
     error, number = sum(errors), sum(numbers)
     figures["rare_psnr"] = -10 * math.log10(error / number) if error else None
-    return _finite(figures)
+    return finite(figures)
 
 
 def _mean(values: tuple[float | None, ...]) -> float | None:
@@ -93,7 +93,7 @@ def _mean(values: tuple[float | None, ...]) -> float | None:
     return float(np.mean(known)) if len(known) == len(values) else None
 
 
-def _finite(figures: dict[str, float | None]) -> Record:
+def finite(figures: dict[str, float | None]) -> Record:
     """The figures, with None in place of infinity, which JSON does not have."""
     return {name: value if value is not None and math.isfinite(value) else None for name, value in figures.items()}
 
@@ -123,7 +123,7 @@ def rare_share(views: list[View], rare: Masks | None) -> float | None:
 def training_psnr(gaussians: Gaussians | Stored, views: list[View], renderer: Renderer) -> Record:
     """Mean PSNR of at most `TRAINING_PHOTOS` training photos, evenly spaced, as the entry `train_psnr`."""
     figures = mean_metrics(gaussians, evenly_spaced(views, TRAINING_PHOTOS), renderer, metrics=(psnr,))
-    return _finite({"train_psnr": figures["psnr"]})
+    return finite({"train_psnr": figures["psnr"]})
 
 
 def frames_per_second(gaussians: Gaussians, views: list[View], renderer: Renderer) -> float:

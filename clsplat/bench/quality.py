@@ -24,6 +24,7 @@ from clsplat.bench.measures import (
     sample_iterations,
     training_psnr,
 )
+from clsplat.bench.quality_summary import METRICS
 from clsplat.bench.results import KEYS, Record, append_record, read_records, write_records
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.dataset import load_scene
@@ -92,8 +93,9 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
             flips = "" if last["flip"] is None else f", FLIP {last['flip']:.3f}"
             count = last["num_gaussians"]
             size = f"{last['spz_bytes'] / 1e6:.3g} MB" if count is None else f"{count:,} Gaussians"
+            psnr = METRICS["psnr"].written(last["psnr"]) or "no error"
             say(
-                f"    {last['psnr']:.2f} dB, SSIM {last['ssim']:.3f}{flips}; {last['seconds']:.0f} s, {size}, "
+                f"    {psnr}, SSIM {last['ssim']:.3f}{flips}; {last['seconds']:.0f} s, {size}, "
                 f"{last['fps']:.1f} frames/s"
             )
         except Exception as error:  # any error is the result of this cell

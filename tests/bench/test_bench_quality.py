@@ -1,12 +1,15 @@
 """`clsplat bench quality`: trainings, their records, interruptions and failures."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cli_runs import fails, run, write_dataset
+from cli_runs import SIZE, fails, run, write_dataset
+from PIL import Image
 from small_cells import ITERATIONS, cells_of
+from small_fields import SmallNerf
 
 from clsplat.bench import measures, quality
 from clsplat.bench.cells import make_cells
@@ -17,6 +20,7 @@ from clsplat.bench.results import append_record, read_records, write_records
 from clsplat.config import AdcConfig
 from clsplat.dataset import load_scene
 from clsplat.errors import InputError
+from clsplat.fields import METHODS
 from clsplat.formats import save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr
@@ -215,6 +219,23 @@ class TestBench:
         run_cells(cells, device, tmp_path / "results.jsonl", lambda _: None)
         (record,) = read_records(tmp_path / "results.jsonl")
         assert "--memory-limit" in record["failed"]
+
+    def test_images_without_error_are_results(self, device, tmp_path, monkeypatch):
+        """Black photos are learned exactly: an infinite PSNR is null, and the training has not failed."""
+        write_dataset(tmp_path / "black")
+        for photo in (tmp_path / "black").glob("*.png"):
+            Image.new("RGB", SIZE).save(photo)
+        fast = {"optim": {"sh0_lr": 0.5}, "init": {"random_points": 20, "sh_degree": 0}}
+        (tmp_path / "fast.json").write_text(json.dumps(fast))
+        monkeypatch.setitem(METHODS, SmallNerf.name, SmallNerf)
+        cells = make_cells([str(tmp_path / "black")], [str(tmp_path / "fast.json"), SmallNerf.name], ["own"], [60])
+        path, said = tmp_path / "results.jsonl", []
+        run_cells(cells, device, path, said.append)
+        records = read_records(path)
+        assert not [r["failed"] for r in records if "failed" in r]
+        for last in (r for r in records if "fps" in r):
+            assert (last["psnr"], last["ssim"], last["train_psnr"]) == (None, 1, None)
+        assert sum("    no error, SSIM 1.000" in text for text in said) == 2
 
     def test_a_failure_is_tried_again(self, data, device, tmp_path, monkeypatch):
         path = tmp_path / "results.jsonl"
