@@ -182,7 +182,7 @@ def _limits(axes: "Axes", ends: list[tuple[float, float]], below: float, less_is
         return
     xs, ys = zip(*ends, strict=True)
     low, high = min(ys), max(ys)
-    spread = max(high - low, 1e-3 * abs(high))
+    spread = max(high - low, 1e-3 * abs(high)) or 1e-3  # the FLIP of images without error is 0
     bottom, top = (high + below + 0.4 * spread, low) if less_is_better else (low - below - 0.4 * spread, high)
     axes.set_ylim(bottom, top + 0.12 * (top - bottom))
     shown = [x for line in axes.lines for x, y in np.asarray(line.get_xydata()) if (y - bottom) * (top - bottom) > 0]

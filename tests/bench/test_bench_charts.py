@@ -214,6 +214,15 @@ def test_one_value_everywhere_is_drawn():
     readable(figure, figure.axes[0], ["x · 8 it", "y · 8 it"])
 
 
+def test_images_without_error_are_drawn():
+    perfect = {"psnr": None, "ssim": 1.0, "flip": 0.0}
+    found = runs([r | perfect for name in "xy" for r in training("a", name, None, 10, 20)])
+    for metric in measured_metrics(found):
+        figure = quality_chart(found, "num_gaussians", metric)
+        readable(figure, figure.axes[0], ["x · 8 it", "y · 8 it"])
+    assert table(found, "seconds")[1][1] == "10 s: 1.000 / 0.000"
+
+
 def test_published_figures():
     data = read_published()
     assert list(data["datasets"]) == ["Mip-NeRF360", "Tanks&Temples", "Deep Blending"]
