@@ -34,6 +34,14 @@ def short(value: float) -> str:
     return f"{value:.3g}"
 
 
+def exact(value: int) -> str:
+    """Text of a number with all of its digits: 840, 13.589k, 1.2M."""
+    for factor, suffix in ((1e6, "M"), (1e3, "k")):
+        if value >= factor:
+            return f"{value / factor:.15g}{suffix}"
+    return str(value)
+
+
 def _megabytes(value: float) -> str:
     return f"{value / 1e6:.3g}" if value < 999.5e6 else f"{value / 1e6:.0f}"
 
@@ -79,9 +87,9 @@ class Run:
 
     @property
     def setting(self) -> str:
-        """Method, cap, and number of iterations if it is not chosen by the photos."""
-        cap = "" if self.max_gaussians is None else f" · ≤{short(self.max_gaussians)}"
-        return f"{self.method}{cap} · {short(self.iterations)} it" if self.iterations else self.method + cap
+        """Method, cap, and number of iterations if it is not chosen by the photos; no other setting has this text."""
+        cap = "" if self.max_gaussians is None else f" · ≤{exact(self.max_gaussians)}"
+        return f"{self.method}{cap} · {exact(self.iterations)} it" if self.iterations else self.method + cap
 
     @property
     def last(self) -> Record:

@@ -106,6 +106,16 @@ def test_names_of_methods_include_the_device(records):
     assert {"fast (here)", "fast (there)"} <= {run.method for run in runs(records)}
 
 
+def test_settings_that_are_nearly_equal_are_not_seeds_of_one():
+    found = training("a", "m", 40_010, 1, 20, iterations=1001) + training("a", "m", 40_010, 1, 30, iterations=1002)
+    found += training("a", "m", 40_020, 1, 25, iterations=1001)
+    assert {run.setting: run.last["psnr"] for run in runs(found)} == {
+        "m · ≤40.01k · 1.001k it": 20,
+        "m · ≤40.01k · 1.002k it": 30,
+        "m · ≤40.02k · 1.001k it": 25,
+    }
+
+
 def test_means_are_over_settings_that_all_scenes_have(records):
     found = runs([*records, *training(SCENES[0], "fast", 99, 1, 20)])
     by_setting = {run.setting: run for run in means(found)}
