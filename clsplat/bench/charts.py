@@ -24,7 +24,7 @@ from clsplat.bench.quality_summary import (
     panels,
     scene_names,
     short,
-    title,
+    titles,
 )
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def quality_chart(finished: list[Run], cost: str, metric: str) -> "Figure":
     from matplotlib.figure import Figure
 
     columns = panels(finished)
-    colors = method_colors(finished)
+    colors, names = method_colors(finished), titles(columns)
     scenes = len(scene_names(finished))
     rows = 0 if scenes < 2 else ceil(scenes / 2)
     figure = Figure(figsize=(8.6, 4.8 + 3.1 * rows), dpi=130, layout="constrained")
@@ -78,7 +78,7 @@ def quality_chart(finished: list[Run], cost: str, metric: str) -> "Figure":
     labels = {}
     for (name, of_panel), axes in zip(columns.items(), places, strict=True):
         labels[axes] = _panel(axes, of_panel, cost, metric, colors)
-        count = f"mean of {scenes} scenes" if name == MEAN else title(name)
+        count = f"mean of {scenes} scenes" if name == MEAN else names[name]
         axes.set_title(count, fontsize=11 if axes is places[0] else 9, color=INK, loc="left", fontweight="bold")
     better = "less" if COSTS[cost].less_is_better else "more"
     figure.suptitle(

@@ -1,6 +1,6 @@
 """Summaries of the results of `clsplat bench quality`: trainings, means over scenes, Pareto fronts and tables."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -143,9 +143,10 @@ def scene_names(finished: Iterable[Run]) -> list[str]:
     return list(dict.fromkeys(run.scene for run in finished))
 
 
-def title(scene: str) -> str:
-    """Name of a scene without the options for reading its photos."""
-    return scene.split(":")[0]
+def titles(scenes: Collection[str]) -> dict[str, str]:
+    """Titles of scenes: their names without the options, which stay where scenes differ only by these."""
+    short_names = [scene.split(":")[0] for scene in scenes]
+    return {s: s if short_names.count(name) > 1 else name for s, name in zip(scenes, short_names, strict=True)}
 
 
 def panels(finished: list[Run]) -> dict[str, list[Run]]:
@@ -223,7 +224,7 @@ def table(finished: list[Run], cost: str) -> list[list[str]]:
     columns = panels(finished)
     settings = list(dict.fromkeys(run.setting for run in finished))
     head = f"{COSTS[cost].name}: {', '.join(METRICS[name].name for name in metrics)}"
-    rows = [[head, *map(title, columns)]]
+    rows = [[head, *titles(columns).values()]]
     for setting in settings:
         row = [setting]
         for of_panel in columns.values():
@@ -240,8 +241,9 @@ def table(finished: list[Run], cost: str) -> list[list[str]]:
 def verdict(finished: list[Run], cost: str, metric: str) -> list[str]:
     """Sentences that name the settings on the Pareto front, one per panel."""
     quantity, goal = COSTS[cost], METRICS[metric].name
-    sentences = []
-    for panel, of_panel in panels(finished).items():
+    sentences, columns = [], panels(finished)
+    names_of = titles(columns)
+    for panel, of_panel in columns.items():
         best = best_settings(of_panel, cost, metric)
         if not best:
             continue
@@ -249,7 +251,7 @@ def verdict(finished: list[Run], cost: str, metric: str) -> list[str]:
         # What was not measured, such as the Gaussians of a radiance field, is not compared.
         placed = [run for run in of_panel if coordinates(run.last, cost, metric) is not None]
         beaten = [run.setting for run in placed if run not in best]
-        where = "Mean over scenes" if panel == MEAN else title(panel)
+        where = "Mean over scenes" if panel == MEAN else names_of[panel]
         others = f"; dominated: {', '.join(beaten)}" if beaten else "; none is dominated"
         sentences.append(f"{where}, on the Pareto front of {quantity.name} and {goal}: {names}{others}.")
     return sentences

@@ -167,6 +167,16 @@ def test_the_table_has_every_figure(records):
     assert measured_metrics(runs(records)) == ["psnr", "ssim"]
 
 
+def test_variants_of_a_scene_have_titles_that_differ():
+    scenes = ["fox:downscale=4", "fox:downscale=4:thin=4", "lego:background=white"]
+    found = runs([r for scene in scenes for r in training(scene, "m", None, 10, 20)])
+    expected = ["fox:downscale=4", "fox:downscale=4:thin=4", "lego"]
+    assert table(found, "seconds")[0][1:] == ["mean", *expected]
+    assert [sentence.split(",")[0] for sentence in verdict(found, "seconds", "psnr")[1:]] == expected
+    drawn = quality_chart(found, "seconds", "psnr").axes
+    assert [axes.get_title(loc="left") for axes in drawn] == ["mean of 3 scenes", *expected]
+
+
 def test_origins(records):
     later = [r | {"date": "2026-11-22T01", "load": 2.0} for r in records]
     (line,) = origins(records + later)
