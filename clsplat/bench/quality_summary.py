@@ -8,8 +8,8 @@ import numpy as np
 
 from clsplat.bench.results import KEYS, Record
 
-MEAN = "mean"
-"""Name of the panel with the means over scenes."""
+MEAN = "mean/"
+"""Name of the panel with the means over scenes; no folder has this name."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def scene_names(finished: Iterable[Run]) -> list[str]:
 
 def titles(scenes: Collection[str]) -> dict[str, str]:
     """Titles of scenes: their names without the options, which stay where scenes differ only by these."""
-    short_names = [scene.split(":")[0] for scene in scenes]
+    short_names = [scene.split(":")[0].rstrip("/") for scene in scenes]
     return {s: s if short_names.count(name) > 1 else name for s, name in zip(scenes, short_names, strict=True)}
 
 

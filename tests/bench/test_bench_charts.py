@@ -167,6 +167,12 @@ def test_the_table_has_every_figure(records):
     assert measured_metrics(runs(records)) == ["psnr", "ssim"]
 
 
+def test_a_scene_may_be_called_mean():
+    found = runs(training("mean", "m", None, 10, 20) + training("b", "m", None, 10, 30))
+    assert [of_panel[0].last["psnr"] for of_panel in panels(found).values()] == [25, 20, 30]
+    assert len(set(table(found, "seconds")[0])) == 4
+
+
 def test_variants_of_a_scene_have_titles_that_differ():
     scenes = ["fox:downscale=4", "fox:downscale=4:thin=4", "lego:background=white"]
     found = runs([r for scene in scenes for r in training(scene, "m", None, 10, 20)])
