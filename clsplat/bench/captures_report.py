@@ -72,11 +72,15 @@ class Results:
             self._figures.setdefault((run.scene, run.setting), []).append(figures(run))
         self.captures = list(dict.fromkeys(capture for capture, _ in self._figures))
         self.methods = list(dict.fromkeys(method for _, method in self._figures))
-        self.common = [c for c in self.captures if all((c, method) in self._figures for method in self.methods)]
+        self.common = [c for c in self.captures if all(self.finished(c, method) for method in self.methods)]
         """Captures that all methods finished. Means are over these, so that they can be compared."""
         every = [found for of_key in self._figures.values() for found in of_key]
         self.quantities = {n: q for n, q in QUANTITIES.items() if any(found[n] is not None for found in every)}
         """Quantities that were measured at least once."""
+
+    def finished(self, capture: str, method: str) -> bool:
+        """Whether a method finished on a capture."""
+        return (capture, method) in self._figures
 
     def values(self, capture: str, method: str, name: str) -> list[float]:
         """A quantity for each seed."""
@@ -166,7 +170,7 @@ def captures_text(results: Results) -> str:
         [capture, method, *_cells(results, [capture], method)]
         for capture in results.captures
         for method in results.methods
-        if results.values(capture, method, "num_gaussians")
+        if results.finished(capture, method)
     ]
     return _table(["capture", "method", *_columns(results)], rows)
 

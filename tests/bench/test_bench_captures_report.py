@@ -222,6 +222,13 @@ def test_rare_pixels_count_where_they_are_known():
     assert [row[column] for row in rows[1:]] == ["10.00", ""]
 
 
+def test_fields_have_rows_without_gaussians():
+    found = training("a", "m", 20) + training("a", "ingp-base", 21, num_gaussians=None)
+    (rows,) = tables(details(found))
+    assert [row[1] for row in rows[1:]] == [M, "ingp-base · 8 it"]
+    assert [row[rows[0].index("Gaussians")] for row in rows[1:]] == ["1k", ""]
+
+
 def test_each_reason_of_a_failure_is_told_once():
     failed = [record("a:thin=8", method, failed="too few") for method in ("m", "n")]
     text = summary(seeded(SCORES) + failed)
