@@ -259,20 +259,20 @@ def verdict(finished: list[Run], cost: str, metric: str) -> list[str]:
 
 def origins(records: Iterable[Record]) -> list[str]:
     """Lines that name each device, driver and commit of the measurements, with their dates and load."""
-    groups: dict[tuple[str, ...], list[Record]] = {}
+    groups: dict[tuple[Any, ...], list[Record]] = {}
     for record in records:
-        key = (record["device"], str(record["driver"]), str(record["version"]), record["commit"] or "unknown")
-        groups.setdefault(key, []).append(record)
+        names = ("device", "compute_units", "driver", "version", "commit")
+        groups.setdefault(tuple(record[name] for name in names), []).append(record)
     lines = []
-    for (device, driver, version, commit), of_key in groups.items():
+    for (device, units, driver, version, commit), of_key in groups.items():
         dates = sorted(record["date"][:10] for record in of_key)
         when = dates[0] if dates[0] == dates[-1] else f"{dates[0]} to {dates[-1]}"
         loads = [record["load"] for record in of_key if record["load"] is not None]
         busy = f", load average of the machine before it {max(loads):.1f}" if loads else ""
-        units = of_key[0]["compute_units"]
         if loads and max(loads) > units:
             busy += ": it was busy with other work, so the times are not valid"
         lines.append(
-            f"{device}, {units} compute units, driver {driver}; clsplat {version}, commit {commit}; {when}{busy}"
+            f"{device}, {units} compute units, driver {driver}; clsplat {version}, commit {commit or 'unknown'}; "
+            f"{when}{busy}"
         )
     return lines

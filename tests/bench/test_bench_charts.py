@@ -190,6 +190,8 @@ def test_origins(records):
     assert line.endswith(" 2.0")
     assert "times are not valid" in origins([records[0] | {"load": 2.1}])[0]
     assert len(origins([*records, records[0] | {"commit": "def"}])) == 2
+    fewer = origins([*records, records[0] | {"compute_units": 1}])
+    assert [line.split(", driver")[0] for line in fewer] == ["here, 2 compute units", "here, 1 compute units"]
 
 
 def test_short_numbers():
