@@ -244,6 +244,7 @@ class Captures:
         from clsplat.atomic import replacing
         from clsplat.bench.captures_report import details, summary
         from clsplat.bench.cells import OWN, make_cells, standard_variants
+        from clsplat.bench.quality_summary import origins
         from clsplat.bench.results import FILE, read_records
 
         data = [variant for text in self.data for variant in standard_variants(text)]
@@ -253,7 +254,7 @@ class Captures:
             self.out,
         )
         records = read_records(self.out / FILE)
-        text = summary(records)
+        text = "\n".join(f"- {line}" for line in origins(records)) + f"\n\n{summary(records)}"
         with replacing(self.out / "captures.md") as file:
             file.write(f"{text}\n\n{details(records)}\n".encode())
         say(f"all captures: {self.out / 'captures.md'}")

@@ -238,6 +238,7 @@ def test_the_command(data, tmp_path, capsys, monkeypatch):
     assert {r["scene"] for r in records} == expected
     text = (tmp_path / "out" / "captures.md").read_text()
     assert said.out.strip() in text and "| one:thin=4 | plain · 2 it | 3.00 | 0.500 |" in text
+    assert text.startswith(f"- {records[0]['device']}, ") and f"clsplat {records[0]['version']}, commit" in text
     assert "requires two scenes" in said.out, "both are of the same scene"
     finished = [r for r in records if "failed" not in r]
     run(*arguments, "--seeds", 3, "-o", tmp_path / "out")
