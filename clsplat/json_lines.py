@@ -14,8 +14,8 @@ NUMBER = (float, int)
 KNOWN = (*NUMBER, NoneType)
 """The same for one that may be unknown."""
 
-INTEGER_MAX = 2**63
-"""Magnitude of integers in these files. Larger ones come from damage, and overflow where they become floats."""
+INTEGER_MAX = 2**64 - 1
+"""Magnitude of integers in these files: that of seeds. Larger ones come from damage, and overflow as floats."""
 
 
 def read_json_lines(
