@@ -145,7 +145,8 @@ class Reader:
 def _reason(error: Exception, path: Path) -> str:
     """Reason of a failure, without the folders that contain the dataset, so that it is valid on other machines."""
     text = str(error) if isinstance(error, ClsplatError) else f"{type(error).__name__}: {error}"
-    return text.replace(str(path.resolve()), path.name).replace(str(path), path.name)
+    text = text.replace(str(path.resolve()), path.resolve().name)
+    return text.replace(str(path), path.name) if path.name else text  # "." has no name
 
 
 def _finished(cell: Cell, records: list[Record], device: str) -> bool:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -219,6 +220,15 @@ class TestBench:
         run_cells(cells, device, tmp_path / "results.jsonl", lambda _: None)
         (record,) = read_records(tmp_path / "results.jsonl")
         assert "--memory-limit" in record["failed"]
+
+    def test_a_reason_does_not_name_the_folders_around_the_dataset(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        error = InputError(f"3.png: 0.5 MB in {tmp_path / 'a'}, not in a/3.png. See x/a.")
+        assert quality._reason(error, Path("x/a")) == f"3.png: 0.5 MB in {tmp_path / 'a'}, not in a/3.png. See a."
+        assert quality._reason(error, Path("a")) == "3.png: 0.5 MB in a, not in a/3.png. See x/a."
+        assert quality._reason(InputError(f"3.png: 0.5 MB in {tmp_path}."), Path(".")) == (
+            f"3.png: 0.5 MB in {tmp_path.name}."
+        )
 
     def test_images_without_error_are_results(self, device, tmp_path, monkeypatch):
         """Black photos are learned exactly: an infinite PSNR is null, and the training has not failed."""
