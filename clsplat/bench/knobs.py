@@ -68,8 +68,10 @@ def settings(base: RenderConfig, sh_degree: int, device: Device) -> Iterator[Set
     hints = get_type_hints(RenderConfig)
     for knob in RENDER_KNOBS:
         for value in get_args(hints[knob]):
-            if value not in (getattr(base, knob), "auto"):
-                yield Setting(knob, str(value), replace(base, **{knob: value}))
+            render = replace(base, **{knob: value})
+            refused = render.projection == "ray" and render.sort == "pixel"
+            if value not in (getattr(base, knob), "auto") and not refused:
+                yield Setting(knob, str(value), render)
     for name, values, default in (
         ("ALPHA_MIN", ALPHA_MINS, ALPHA_MIN),
         ("TRANSMITTANCE_MIN", TRANSMITTANCE_MINS, TRANSMITTANCE_MIN),

@@ -25,6 +25,7 @@ from clsplat.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.render import render
+from clsplat.renderer import Renderer
 from clsplat.testing import synthetic_scene
 
 WORKLOAD = "300-40x32"
@@ -94,6 +95,12 @@ class TestSettings:
         for name, hint in get_type_hints(RenderConfig).items():
             for choice in get_args(hint) if get_origin(hint) is Literal else ():
                 assert ((name, str(choice)) in turned) == (choice not in (getattr(base, name), "auto"))
+
+    @pytest.mark.parametrize("base", [RenderConfig(projection="ray"), RenderConfig(sort="pixel")])
+    def test_settings_that_exclude_each_other_are_left_out(self, device, base):
+        """The renderer refuses the sort by pixel for the projection along rays: it ended the whole bench."""
+        for setting in settings(base, 3, device):
+            Renderer(device, setting.render)
 
     def test_degrees_below_the_stored_one(self, device):
         degrees = [s.sh_degree for s in settings(RenderConfig(), 2, device) if s.knob == "SH degree"]
