@@ -163,7 +163,8 @@ def bench_fields(
 
 
 def _share(rate: float, roof: float) -> str:
-    return f"{100 * rate / roof:.2g} %"
+    percent = 100 * rate / roof
+    return f"{percent:.2g} %" if percent < 99.5 else f"{percent:.0f} %"
 
 
 def fields_text(results: Results) -> str:
