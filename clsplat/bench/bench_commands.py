@@ -83,6 +83,8 @@ class Kernels:
         if self.scene is not None and self.scaling is not None:
             raise InputError("--scaling: expected synthetic workloads, found --scene; leave one of them out")
         names = [*self.workloads, *(scaling_names() if self.scaling is not None else ())]
+        if not names and self.scene is None:
+            raise InputError("--workloads: expected at least one, found none")
         return _of_files(self.scene, self.cameras, self.views, self.downscale) or [
             synthetic(name) for name in dict.fromkeys(names)
         ]

@@ -167,7 +167,7 @@ def make_cells(
     Raises
     ------
     InputError
-        If an argument is invalid, or two datasets or two methods have the same name.
+        If an argument is invalid or empty, or two datasets or two methods have the same name.
     """
     iterations, cells = list(iterations), []
     named_sources = _distinct([parse_source(text) for text in dict.fromkeys(sources)], lambda s: s.name, "data")
@@ -187,6 +187,8 @@ def make_cells(
                 memory_limit=memory_limit,
             )
             cells.append(Cell(source, method, config))
+    if not cells:
+        raise InputError("data, --methods and --budgets: expected at least one of each, found none of one of them")
     return list(dict.fromkeys(cells))
 
 

@@ -92,6 +92,11 @@ class TestCells:
         with pytest.raises(InputError, match="--methods: expected different names, found m 2 times"):
             make_cells(["a"], [str(tmp_path / "a" / "m.json"), str(tmp_path / "b" / "m.json")], ["own"], [])
 
+    def test_nothing_to_train_is_refused(self):
+        for sources, methods, budgets in (([], ["mcmc"], ["own"]), (["a"], [], ["own"]), (["a"], ["mcmc"], [])):
+            with pytest.raises(InputError, match="expected at least one of each"):
+                make_cells(sources, methods, budgets, [])
+
     def test_settings_are_those_that_differ_from_the_defaults(self):
         config = TrainConfig(seed=3, adc=AdcConfig(every=7), init=InitConfig(opacity=0.5))
         assert differences(config) == {"seed": 3, "adc": {"every": 7}, "init": {"opacity": 0.5}}

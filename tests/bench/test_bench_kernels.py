@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_runs import fails
 from matplotlib.figure import Figure
 
 import clsplat
@@ -319,3 +320,7 @@ class TestPage:
             formula = formula.replace("27 per pixel", "27 13")
             by_hand[stage] = eval(re.sub(r"(?<=[\w)]) (?=[\w(])", "*", formula), values)
         assert by_hand == stage_bytes(7, 3, 13, 11)
+
+
+def test_no_workload_is_refused(capsys):
+    assert "--workloads: expected at least one" in fails(capsys, "bench", "kernels", "--workloads")
