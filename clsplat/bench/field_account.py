@@ -198,5 +198,9 @@ def fields_text(results: Results) -> str:
         largest = sorted(spent, key=lambda name: -spent[name])
         texts = [f"{name} {_share(spent[name], whole)}" for name in largest if spent[name] > 0.02 * whole]
         shares.append((found["method"], ", ".join(texts)))
-    facts = "\n".join(f"- {fact}" for fact in origin(results))
+    settings = results["settings"]
+    trained = f"after {settings['iterations']:,} iterations" + (
+        f" on {settings['scene']}" if "scene" in settings else ""
+    )
+    facts = "\n".join(f"- {fact}" for fact in [*origin(results), trained])
     return f"{facts}\n\n{table(rows)}\n\n{table(shares)}"

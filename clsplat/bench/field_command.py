@@ -47,5 +47,6 @@ class Fields:
         say(f"device: {device.label}")
         methods = [METHODS[name] for name in self.methods]
         results = bench_fields(methods, scene, data, device, self.iterations, self.repeats, say)
+        results["settings"]["scene"] = source.name
         write_results(self.out, results)
         print(fields_text(results))

@@ -73,7 +73,7 @@ def test_shares_are_written_without_exponents():
         "software": {"clsplat": "1", "commit": None},
         "date": "",
         "load": None,
-        "settings": {"repeats": 1},
+        "settings": {"repeats": 1, "iterations": 9},
         "roof": {"fma_gflops": 2.0, "copy_gbs": 4.0},
         "methods": [{"method": "m", "step": own, "image": own}],
     }
@@ -88,5 +88,7 @@ def test_the_command_prints_and_writes_the_same(data, tmp_path, capsys, monkeypa
     results = json.loads(out.read_text())
     assert results["benchmark"] == "fields" and results["methods"][0]["method"] == "nerf-small"
     assert np.isfinite(results["methods"][0]["step"]["seconds"])
-    assert "| nerf-small " in capsys.readouterr().out
+    assert results["settings"] == {"iterations": 1, "repeats": 1, "scene": "one"}
+    text = capsys.readouterr().out
+    assert "| nerf-small " in text and "\n- after 1 iterations on one\n" in text
     assert "expected some of nerf" in fails(capsys, "bench", "fields", data / "one", "--methods", "nerd")
