@@ -25,10 +25,7 @@ SHORT_RUN = 7000
 """Iterations of the paper's shorter setting (table 1, "7K"). In shorter runs its intervals are shortened in
 proportion; otherwise a run of 700 iterations would have neither densification nor view dependence."""
 
-BACKGROUNDS: dict[Background, tuple[float, float, float]] = {
-    "black": (0.0, 0.0, 0.0),
-    "white": (1.0, 1.0, 1.0),
-}
+BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -115,6 +112,8 @@ class InitConfig:
     """Triangulate points from the photos if the dataset has poses but no points; otherwise the start is random."""
     dense: bool = True
     """Add points where neighbouring photos agree on a depth, if there are few sparse points for the photos' size."""
+    sky: bool = True
+    """Start with Gaussians far behind the scene where photos show a smooth region without points above it."""
     random_points: Annotated[int | None, within(least=1, most=UINT32_MAX)] = None
     """Number of Gaussians of a random start, if there are no points. Default: 100 000 (original), or 10 000 with
     --size auto, which adds more where they are needed."""

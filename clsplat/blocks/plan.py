@@ -160,6 +160,7 @@ def coarse_config(config: TrainConfig, scene: Scene, device: "Device") -> TrainC
         iterations=max(1, round(COARSE_LENGTH * config.iterations)),
         max_gaussians=max(1, min(most, wanted)),
         coarse=CoarseConfig(factor=COARSE_FACTOR, until=1.0),
+        init=replace(config.init, sky=False),  # no block would contain the sky
         eval_every=0,
     )
 
@@ -173,11 +174,10 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
     """
     photos = max(1, round(block.visits))
     alone = with_length(replace(config, iterations=0), replace(scene, train=scene.train[:photos])).iterations
-    visits = round(config.iterations * photos / len(scene.train))
     return replace(
         config,
         blocks=1,
-        iterations=min(config.iterations, max(alone, visits)),
+        iterations=min(config.iterations, max(alone, round(config.iterations * photos / len(scene.train)))),
         max_gaussians=None if config.max_gaussians is None else block.gaussians,
         optim=replace(config.optim, sh_degree_every=1),
         coarse=CoarseConfig(factor=1),

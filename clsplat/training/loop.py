@@ -28,6 +28,7 @@ from clsplat.training.recorder import Recorder
 from clsplat.training.run_folder import held
 from clsplat.training.run_length import with_length
 from clsplat.training.session import Training
+from clsplat.training.sky_start import beyond, with_sky
 from clsplat.training.state import initial_state, start_config
 
 if TYPE_CHECKING:
@@ -102,6 +103,7 @@ def train(
             started = time.perf_counter()
             start = first_points(scene, config, device)
             gaussians = initialize(start, start_config(config), config.seed, config.max_gaussians)
+            gaussians = with_sky(gaussians, start, config)
             state = replace(initial_state(scene, config, gaussians), inputs=inputs)
             state.seconds = time.perf_counter() - started
         state.inputs.demand(scene)
@@ -170,5 +172,7 @@ def finish(training: Training, out: Path) -> Gaussians:
     if state.strategy.leaves_room and training.renderer.backdrop is None:  # other photos may show those of a block
         cameras = [view.camera for view in state.corrected(scene.train)]
         shown = shown_by_any(gaussians, cameras, training.renderer)
+        if training.config.init.sky:
+            shown |= beyond(gaussians, scene)
         gaussians = gaussians.take(shown) if shown.any() else gaussians
     return without_invisible(gaussians)

@@ -49,7 +49,7 @@ def test_the_papers_presets_are_its_strategy_and_iterations():
         beta2=0.999,
         sh_degree_every=1000,
     )
-    start, few = InitConfig(triangulate=False, dense=False), FewViewsConfig(below=0)
+    start, few = InitConfig(triangulate=False, dense=False, sky=False), FewViewsConfig(below=0)
     paper = TrainConfig(strategy="adc", size="fixed", init=start, few=few, optim=rates)
     assert load_preset("paper-7k") == replace(paper, iterations=7000)
     assert load_preset("paper-30k") == replace(paper, iterations=30_000)
