@@ -14,6 +14,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.render import renderings
 from clsplat.renderer import Renderer
+from clsplat.surface import scene_depth
 
 Array = NDArray[np.float64]
 
@@ -102,10 +103,11 @@ def make_mesh(
 
 
 def _box(views: list[_View]) -> tuple[Array, Array]:
-    """The box of the surface points that the views see, a fiftieth on each side left out, and a margin."""
+    """The box of the surface points that the views see, without the sky and a fiftieth on each side, and a margin."""
     points = []
+    limit = scene_depth(np.concatenate([depth[depth > 0] for _, _, depth in views])) if views else 0.0
     for camera, _, depth in views:
-        v, u = np.nonzero(depth)
+        v, u = np.nonzero((depth > 0) & (depth <= limit))
         z = depth[v, u][:, None]
         at = np.stack([(u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy, np.ones(len(u))], axis=1)
         points.append((at * z - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])

@@ -11,6 +11,10 @@ from clsplat.reference.project import rotations
 
 Array = NDArray[np.float64]
 
+FARTHEST = 10.0
+"""Depth up to which a pixel shows the scene, as a factor on the depth that a quarter of the pixels do not reach. The
+sky is farther, also where it fills most of the image."""
+
 
 class Surface(NamedTuple):
     """The surface in an image of H x W pixels, by the Gaussian at which the transmittance falls to 1/2.
@@ -29,6 +33,17 @@ class Surface(NamedTuple):
     ids: NDArray[np.int32]
     depth: Array
     normals: Array
+
+
+def scene_depth(depths: NDArray[np.floating]) -> float:
+    """Largest depth that belongs to the scene and not to the sky; 0 for no depths.
+
+    Parameters
+    ----------
+    depths : (P,)
+        Depths of all pixels that have one.
+    """
+    return FARTHEST * float(np.quantile(depths, 0.25)) if len(depths) else 0.0
 
 
 def surface_of(gaussians: Gaussians, camera: Camera, ids: NDArray[np.int32]) -> Surface:

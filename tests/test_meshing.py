@@ -97,3 +97,11 @@ def test_a_mesh_far_from_the_origin_keeps_its_shape(tmp_path):
     save_mesh(tmp_path / "far.ply", Mesh(vertices, np.array([[0, 1, 2]]), np.zeros((3, 3), np.uint8)))
     ply = PlyData.read(tmp_path / "far.ply")["vertex"]
     np.testing.assert_array_equal(np.stack([ply[name] for name in "xyz"], axis=1), vertices)
+
+
+def test_the_sky_does_not_enlarge_the_box(device):
+    sky = replace(ball(400), log_scales=np.full((400, 3), np.log(10), np.float32))
+    sky = replace(sky, means=100 * sky.means)
+    alone = make_mesh(ball(), around(), Renderer(device), resolution=32)
+    mesh = make_mesh(Gaussians.concatenate([ball(), sky]), around(), Renderer(device), resolution=32)
+    assert abs(mesh.vertices).max() == pytest.approx(abs(alone.vertices).max(), rel=0.05)

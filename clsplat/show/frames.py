@@ -10,6 +10,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.renderer import Renderer, download
 from clsplat.scene import Color
+from clsplat.surface import scene_depth
 
 MODES = ("render", "depth", "normals", "alpha", "count")
 """Contents of a frame: colours, the expected depth, the normals of its surface, 1 - transmittance, or the number of
@@ -80,7 +81,7 @@ def picture(
             return np.where(solid[:, :, None], frame, 0).astype(np.uint8), (
                 "red to the right, green up, blue to the camera"
             )
-        near, far = np.percentile(depth[solid], [2, 98])
+        near, far = np.percentile(depth[solid & (depth <= scene_depth(depth[solid]))], [2, 98])
         frame = _colored(1 - (depth - near) / max(far - near, 1e-12))
         return np.where(solid[:, :, None], frame, 0).astype(np.uint8), f"bright {near:.3g}, dark {far:.3g} units away"
     return to_uint8(image), ""

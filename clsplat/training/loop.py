@@ -28,7 +28,7 @@ from clsplat.training.recorder import Recorder
 from clsplat.training.run_folder import held
 from clsplat.training.run_length import with_length
 from clsplat.training.session import Training
-from clsplat.training.sky_start import beyond, with_sky
+from clsplat.training.sky_start import beyond, may_have_sky, with_sky
 from clsplat.training.state import initial_state, start_config
 
 if TYPE_CHECKING:
@@ -172,7 +172,7 @@ def finish(training: Training, out: Path) -> Gaussians:
     if state.strategy.leaves_room and training.renderer.backdrop is None:  # other photos may show those of a block
         cameras = [view.camera for view in state.corrected(scene.train)]
         shown = shown_by_any(gaussians, cameras, training.renderer)
-        if training.config.init.sky:
+        if may_have_sky(scene, training.config):
             shown |= beyond(gaussians, scene)
         gaussians = gaussians.take(shown) if shown.any() else gaussians
     return without_invisible(gaussians)

@@ -14,7 +14,7 @@ from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset.coverage import projected
 from clsplat.gaussians import Gaussians
-from clsplat.scene import Scene, View, evenly_spaced, in_turn
+from clsplat.scene import Scene, View, in_turn
 from clsplat.training.initialize import from_points
 
 Array = NDArray[np.float64]
@@ -63,8 +63,9 @@ UNSEEN = 0.5
 DIFFERENCE = 0.02
 """Largest difference of a colour from the background's, from 0 to 1, with which the background is the sky."""
 
-MOST_PHOTOS = 100
-"""Largest number of photos that are searched for the sky, evenly spaced, which bounds the time."""
+MOST_PHOTOS = 50
+"""Largest number of training photos with which there is a sky. More photos show each place from enough sides to
+correct haze, and a sky at one distance then costs quality (measured: docs/experiments/strategies.md)."""
 
 
 def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussians:
@@ -85,15 +86,20 @@ def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussia
     -------
     Gaussians
         The first ones, and those of the sky behind them. The same object if there is no sky: photos without a smooth
-        region above the horizon, a scene without points, photos without a common horizon.
+        region above the horizon or without a common horizon, more than `MOST_PHOTOS`, a scene without points.
     """
-    if not config.init.sky or not len(scene.points):
+    if not may_have_sky(scene, config):
         return gaussians
     sky, most = sky_gaussians(scene, config), config.max_gaussians
     if sky is None or (most is not None and 2 * len(sky) > most):
         return gaussians
     others = len(gaussians) if most is None else min(len(gaussians), most - len(sky))
     return Gaussians.concatenate([gaussians.take(np.arange(others)), sky])
+
+
+def may_have_sky(scene: Scene, config: TrainConfig) -> bool:
+    """Whether a training looks for the sky."""
+    return config.init.sky and len(scene.points) > 0 and len(scene.train) <= MOST_PHOTOS
 
 
 def beyond(gaussians: Gaussians, scene: Scene) -> NDArray[np.bool_]:
@@ -110,8 +116,7 @@ def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
     """
     from scipy.spatial import cKDTree
 
-    views = evenly_spaced(scene.train, MOST_PHOTOS)
-    up = vertical([view.camera for view in views])
+    up = vertical([view.camera for view in scene.train])
     if up is None:
         return None
     directions = sphere(round(4 * np.pi / SPACING**2))
@@ -120,7 +125,7 @@ def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
     distance = max(DISTANCE * scene.extent, reach)
     means = centre + distance * directions
     colors, shown, as_sky = np.zeros_like(means), np.zeros(len(means), int), np.zeros(len(means), int)
-    for view in in_turn(views):
+    for view in in_turn(scene.train):
         cells, averages, edge = sky_cells(view, scene.points, up)
         places, _, inside = projected(view.camera, means)
         rows = np.flatnonzero(inside)
