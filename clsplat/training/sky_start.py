@@ -71,8 +71,7 @@ correct haze, and a sky at one distance then costs quality (measured: docs/exper
 def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussians:
     """Add Gaussians of the sky to the first ones of a training, if the configuration asks for them.
 
-    They replace the last of the others where there may be no more than `config.max_gaussians`, of which they may be
-    half.
+    Where there may be no more than `config.max_gaussians`, they replace others, evenly spaced, and are at most half.
 
     Parameters
     ----------
@@ -94,7 +93,8 @@ def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussia
     if sky is None or (most is not None and 2 * len(sky) > most):
         return gaussians
     others = len(gaussians) if most is None else min(len(gaussians), most - len(sky))
-    return Gaussians.concatenate([gaussians.take(np.arange(others)), sky])
+    rows = np.linspace(0, len(gaussians) - 1, others).round().astype(int)
+    return Gaussians.concatenate([gaussians.take(rows), sky])
 
 
 def may_have_sky(scene: Scene, config: TrainConfig) -> bool:

@@ -209,6 +209,7 @@ def test_the_sky_counts_among_the_most_gaussians() -> None:
     limited = with_sky(many, scene, replace(CONFIG, max_gaussians=2 * count))
     assert len(limited) == 2 * count
     np.testing.assert_array_equal(limited.means[count:], whole.means[-count:])
+    np.testing.assert_array_equal(limited.means[[0, count - 1]], many.means[[0, -1]])
     assert with_sky(first, scene, replace(CONFIG, max_gaussians=2 * count - 1)) is first
 
 
