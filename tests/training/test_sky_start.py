@@ -15,6 +15,8 @@ from clsplat.training.loop import train
 from clsplat.training.sky_start import (
     DISTANCE,
     MOST_PHOTOS,
+    OPACITY,
+    SIZE,
     SPACING,
     UNSEEN,
     beyond,
@@ -110,6 +112,13 @@ def test_what_is_smooth_below_the_horizon_is_no_sky() -> None:
     assert cells[:8].all() and not cells[8:].any()
 
 
+def test_what_is_smooth_at_the_horizon_only_is_no_sky() -> None:
+    view = outdoors(camera())
+    view.image[:28] = view.image[32:].copy()
+    view.image[28:32] = BLUE
+    assert not cells_of(view)[0].any()
+
+
 def test_cells_with_points_or_masked_pixels_or_a_background_are_no_sky() -> None:
     view = outdoors(camera())
     point = np.array([[0.0, -0.4, 1.0]])  # in the pixel (40, 10)
@@ -143,6 +152,8 @@ def test_the_sky_of_a_square_is_above_and_blue() -> None:
     np.testing.assert_allclose(np.linalg.norm(sky.means, axis=1), DISTANCE * scene.extent, rtol=1e-5)
     np.testing.assert_allclose(0.5 + 0.28209479 * sky.sh[:, 0], np.broadcast_to(BLUE / 255, (len(sky), 3)), atol=1e-6)
     assert not sky.sh[:, 1:].any()
+    np.testing.assert_allclose(sky.opacities, OPACITY, rtol=1e-5)
+    np.testing.assert_allclose(np.exp(sky.log_scales), SIZE * SPACING * DISTANCE * scene.extent, rtol=1e-5)
     again = sky_gaussians(scene, CONFIG)
     assert all(np.array_equal(a, b) for a, b in zip(sky.arrays().values(), again.arrays().values(), strict=True))
 
@@ -156,9 +167,8 @@ def test_the_sky_is_behind_all_points() -> None:
 
 def test_no_sky_where_one_photo_shows_something_else() -> None:
     views = ring()
-    wall = replace(views[0], name="wall.png")
-    wall.image[:] = np.random.default_rng(9).integers(0, 256, wall.image.shape)
-    clear, blocked = sky_gaussians(square(views[1:]), CONFIG), sky_gaussians(square([*views[1:], wall]), CONFIG)
+    wall = replace(views[0], name="wall.png", image=np.random.default_rng(9).integers(0, 256, (60, 80, 3), np.uint8))
+    clear, blocked = sky_gaussians(square(views), CONFIG), sky_gaussians(square([*views, wall]), CONFIG)
     ahead = np.array([1.0, -0.2, 0.0]) / np.sqrt(1.04)
     for sky, some in (clear, True), (blocked, False):
         directions = sky.means / np.linalg.norm(sky.means, axis=1, keepdims=True)
@@ -173,6 +183,8 @@ def test_the_sky_continues_a_little_where_no_photo_looks() -> None:
     reach = np.arctan(np.hypot(WIDTH, HEIGHT) / 2 / 50) + UNSEEN
     assert np.arccos(directions @ forward).max() < reach
     assert np.arccos(directions @ forward).max() > reach - 0.3
+    beside = np.abs(directions @ view.camera.viewmat[0, :3]) > 0.8 * (directions @ forward)  # outside of the photo
+    assert beside.sum() > 20 and (directions[beside] @ UP).min() > 0
 
 
 def test_the_background_needs_no_sky() -> None:
