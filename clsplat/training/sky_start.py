@@ -71,7 +71,8 @@ correct haze, and a sky at one distance then costs quality (measured: docs/exper
 def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussians:
     """Add Gaussians of the sky to the first ones of a training, if the configuration asks for them.
 
-    Where there may be no more than `config.max_gaussians`, they replace others, evenly spaced, and are at most half.
+    Where there may be no more than `config.max_gaussians`, they replace others, evenly spaced. They are at most half:
+    with fewer points the sky would be most of the scene.
 
     Parameters
     ----------
@@ -85,15 +86,19 @@ def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussia
     -------
     Gaussians
         The first ones, and those of the sky behind them. The same object if there is no sky: photos without a smooth
-        region above the horizon or without a common horizon, more than `MOST_PHOTOS`, a scene without points.
+        region above the horizon or without a common horizon, more than `MOST_PHOTOS`, a scene without or with few
+        points.
     """
     if not may_have_sky(scene, config):
         return gaussians
-    sky, most = sky_gaussians(scene, config), config.max_gaussians
-    if sky is None or (most is not None and 2 * len(sky) > most):
+    sky = sky_gaussians(scene, config)
+    if sky is None:
         return gaussians
-    others = len(gaussians) if most is None else min(len(gaussians), most - len(sky))
-    rows = np.linspace(0, len(gaussians) - 1, others).round().astype(int)
+    both = len(gaussians) + len(sky)
+    most = both if config.max_gaussians is None else min(both, config.max_gaussians)
+    if 2 * len(sky) > most:
+        return gaussians
+    rows = np.linspace(0, len(gaussians) - 1, most - len(sky)).round().astype(int)
     return Gaussians.concatenate([gaussians.take(rows), sky])
 
 

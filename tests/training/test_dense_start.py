@@ -192,7 +192,7 @@ def test_configuration_and_memory_leave_dense_points_out(device: Device) -> None
 
 
 def test_training_starts_with_dense_points(device: Device, tmp_path) -> None:
-    config = TrainConfig(iterations=1, size="fixed", max_gaussians=800, eval_every=0)
+    config = TrainConfig(iterations=1, size="fixed", max_gaussians=800, eval_every=0, init=InitConfig(sky=False))
     counts = []
     train(wall(), config, tmp_path, device, progress=lambda now: counts.append(now["num_gaussians"]))
     assert 300 < counts[0] <= 400
