@@ -16,7 +16,6 @@ from clsplat.errors import InputError
 from clsplat.fields import METHODS, plenoxels
 from clsplat.fields.field_files import MODEL, load_checkpoint, load_field, save_checkpoint, save_field
 from clsplat.fields.field_training import train_field
-from clsplat.fields.occupancy import FULL_UPDATES, SHARE, THRESHOLD, Occupancy
 from clsplat.fields.pixels import Pixels
 from clsplat.fields.space import FAR, Space
 from clsplat.metrics import psnr, to_uint8
@@ -342,19 +341,3 @@ def test_a_tripod_has_rays(device, tmp_path, method):
     train_field(scene, method, replace(CONFIG, iterations=60), tmp_path, device)
     losses = [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert losses[-1] < 0.5 * losses[0]
-
-
-def test_occupancy_forgets_and_finds():
-    """A cell that is empty when it is visited fades; one that is not is occupied at once."""
-    grid = Occupancy(np.full((8, 8, 8), THRESHOLD, np.float32))
-    assert grid.occupied.all()
-    rng = np.random.default_rng(0)
-    inside = lambda p: np.where(np.abs(p - 0.5).max(axis=1) < 0.25, 1.0, 0.0)  # noqa: E731
-    for number in range(FULL_UPDATES):
-        grid.update(number, rng, inside)
-    expected = np.zeros((8, 8, 8))
-    expected[2:6, 2:6, 2:6] = 1
-    np.testing.assert_array_equal(grid.occupied, expected)
-    for number in range(FULL_UPDATES, FULL_UPDATES + 20 * SHARE):
-        grid.update(number, rng, lambda p: np.where(p[:, 0] < 0.125, 1.0, 0.0))
-    assert grid.occupied[:, :, 0].all() and not grid.occupied[:, :, 1:].any()

@@ -9,6 +9,7 @@ from small_scenes import cameras
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.ops import count_pairs
 from clsplat.render import render
@@ -49,6 +50,17 @@ def test_a_surface_to_the_camera_is_blue(device):
     middle = frame[100:140, 140:180].reshape(-1, 3).mean(axis=0)
     assert middle[2] > 200 and "blue to the camera" in legend
     assert normals(np.ones((1, 5)), camera).shape == (1, 5, 3)
+
+
+def test_the_sky_does_not_take_the_colours_of_depths(device):
+    gaussians, (camera, *_) = cameras()
+    gaussians.logit_opacities[:] = 5
+    sky = gaussians.take(np.zeros(1, int))
+    sky.means[0] = camera.position + 3000 * camera.viewmat[2, :3]
+    sky.log_scales[:] = np.log(3000)
+    scene = Gaussians.concatenate([gaussians, sky])
+    legend = picture(Renderer(device), scene, camera, Look("depth"))[1]
+    assert float(legend.split()[3]) < 100
 
 
 def test_background_and_degree_change_the_render(device):
