@@ -60,7 +60,7 @@ class Compact:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.dataset import load_scene
+        from clsplat.dataset import load_scene_with_points
         from clsplat.formats import FORMATS, load_gaussians, save_gaussians, suffix_of
         from clsplat.pruning.compaction import ASSUMED_PSNR, LossMeter, compact
         from clsplat.renderer import Renderer
@@ -80,7 +80,7 @@ class Compact:
         scene = None
         dataset = self.photos or self.cameras
         if dataset is not None:
-            scene = load_scene(dataset, self.data_config)
+            scene = load_scene_with_points(dataset, self.data_config)
             gaussians, offset = moved(gaussians, offset - scene.offset), scene.offset
         pricing, evaluation = self._views(gaussians, scene, renderer)
         say(f"views: {len(pricing)} to price the Gaussians, {len(evaluation)} to measure the loss")

@@ -205,7 +205,7 @@ class Export:
 
     def _photos(self) -> "tuple[Scene | None, TrainConfig]":
         """The dataset of the run that is exported, and its settings; None without held-out photos."""
-        from clsplat.dataset import load_scene
+        from clsplat.dataset import load_scene, with_points
         from clsplat.training.preparation import photo_memory
 
         if not is_run(self.scene) or self.data is None:
@@ -215,7 +215,7 @@ class Export:
         if not scene.test:
             say("levels: not refined, as no held-out photo can show whether that pays")
             return None, config
-        return scene, config
+        return with_points(scene, self.data, config.data) if config.init.triangulate else scene, config
 
     def _page(self, out: Path, gaussians: "Gaussians", mode: Mode, offset: Any) -> None:
         from clsplat.dataset import load_scene

@@ -40,7 +40,7 @@ class Mesh:
         """Run the command."""
         from tqdm import tqdm
 
-        from clsplat.dataset import load_scene
+        from clsplat.dataset import load_scene_with_points
         from clsplat.formats import load_gaussians
         from clsplat.meshing import make_mesh, save_mesh
         from clsplat.renderer import Renderer
@@ -52,7 +52,7 @@ class Mesh:
         data = dataset_of("mesh", self.data)
         gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
-        scene = load_scene(data, self.data_config)
+        scene = load_scene_with_points(data, self.data_config)
         gaussians = moved(gaussians, offset - scene.offset)
         box = (self.box[:3] - scene.offset, self.box[3:] - scene.offset) if self.box else None
         cameras = [view.camera for view in scene.train]

@@ -58,7 +58,7 @@ class Eval:
 
     def run(self) -> None:
         """Run the command."""
-        from clsplat.dataset import load_scene
+        from clsplat.dataset import load_scene_with_points
         from clsplat.evaluate import METRICS, evaluate
         from clsplat.formats import load_gaussians
         from clsplat.metrics import lpips, lpips_network
@@ -70,7 +70,7 @@ class Eval:
         try_folder(out)
         gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
-        scene = load_scene(data, self.data_config)
+        scene = load_scene_with_points(data, self.data_config)
         if not scene.test:
             raise InputError(f"{data}: expected held-out photos to compare with, found none; see --test-every")
         gaussians = moved(gaussians, offset - scene.offset)
@@ -113,7 +113,7 @@ class Render:
         """Run the command."""
         from tqdm import tqdm
 
-        from clsplat.dataset import load_scene
+        from clsplat.dataset import load_scene_with_points
         from clsplat.dataset.finding import without_suffix
         from clsplat.formats import load_gaussians
         from clsplat.render import renderings
@@ -125,7 +125,7 @@ class Render:
         try_folder(out)
         gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
-        scene = load_scene(data, self.data_config)
+        scene = load_scene_with_points(data, self.data_config)
         gaussians = moved(gaussians, offset - scene.offset)
         views = scene.test or scene.train
         if self.path == "test":

@@ -198,7 +198,6 @@ class Train:
             data,
             self.settings,
             device,
-            resume=self.resume and self.settings.blocks == 1,  # jobs of blocks depend on points
             verbose=console.loudness == "verbose",
             tell=tell,
         )

@@ -5,6 +5,20 @@ structure from motion, depth maps, what of a photo other photos show. Does not b
 files of Gaussians (`clsplat.formats`).
 """
 
-from clsplat.dataset.loading import load_photos, load_scene, read_depth_maps, with_depth_maps, with_points
+from clsplat.dataset.loading import (
+    load_photos,
+    load_scene,
+    load_scene_with_points,
+    read_depth_maps,
+    with_depth_maps,
+    with_points,
+)
 
-__all__ = ["load_photos", "load_scene", "read_depth_maps", "with_depth_maps", "with_points"]
+__all__ = [
+    "load_photos",
+    "load_scene",
+    "load_scene_with_points",
+    "read_depth_maps",
+    "with_depth_maps",
+    "with_points",
+]

@@ -103,6 +103,13 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
     return with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
 
 
+def load_scene_with_points(path: str | Path, config: DataConfig) -> Scene:
+    """Load a dataset, and triangulate points if it has poses without points, so that its near planes are those of
+    training. Parameters and errors are those of `load_scene`.
+    """
+    return with_points(load_scene(path, config), path, config)
+
+
 def load_photos(path: str | Path, config: DataConfig, names: Container[str], memory: int | None = None) -> list[View]:
     """Decode some photos of a dataset, by name, in the dataset's coordinates.
 
@@ -154,7 +161,8 @@ def _split(views: list[View], dataset: Dataset, test_every: int) -> tuple[list[V
 def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: bool = False) -> Scene:
     """Triangulate points from the training photos, if the scene has none, and add points between them.
 
-    Without points, training starts from random ones. The cost is measured in docs/stability.md.
+    Near planes then follow these points. Without points, training starts from random ones, and nothing tells how near
+    the scene is. The cost is measured in docs/stability.md.
 
     Parameters
     ----------
@@ -185,9 +193,11 @@ def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: boo
     views = (load_view(photo, dataset, config) for photo in photos)
     moved = (replace(view, camera=view.camera.translated(scene.offset)) for view in views)
     points, colors = triangulate(moved, verbose)
-    if len(points):
-        points, colors = filled(points, colors)
-    return replace(scene, points=points, colors=colors)
+    if not len(points):
+        return scene
+    points, colors = filled(points, colors)
+    train, test = ([v.with_camera(replace(v.camera, near=None)) for v in part] for part in (scene.train, scene.test))
+    return with_near_planes(replace(scene, train=train, test=test, points=points, colors=colors))
 
 
 def with_depth_maps(scene: Scene, path: str | Path, config: DataConfig, tell: Callable[[str], None]) -> Scene:

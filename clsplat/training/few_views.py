@@ -20,11 +20,6 @@ FEWEST_SEARCHED = 24
 training without these costs more than the search gains (measured: docs/experiments/size.md)."""
 
 
-def applies(config: TrainConfig, scene: Scene) -> bool:
-    """Whether `adapted` changes a configuration, for which it needs the scene's points."""
-    return _fewest(config, scene) or (config.size == "auto" and not _searched(config, scene))
-
-
 def _fewest(config: TrainConfig, scene: Scene) -> bool:
     return len(scene.train) < config.few.below
 
@@ -42,9 +37,9 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     pixel, and for large ones by what a search may reach if this is more (measured: docs/experiments/strategies.md). A
     fixed number that the configuration names is kept. Otherwise the configuration is returned as it is.
     """
-    if not applies(config, scene):
-        return config
     few, init, first, fewest = config.few, config.init, len(scene.points), _fewest(config, scene)
+    if not fewest and (config.size != "auto" or _searched(config, scene)):
+        return config
     named = config.size == "fixed" and config.max_gaussians is not None
     if config.size == "auto":
         if not first:

@@ -75,8 +75,7 @@ class Inputs:
         Parameters
         ----------
         now : Inputs
-            Those that are there now. A scene without points does not differ in them: only the start needed them, and
-            a run that continues does not triangulate them again.
+            Those that are there now.
         path : Path
             The checkpoint, for the message.
 
@@ -105,7 +104,7 @@ class Inputs:
             {n: photo if photo.pixels or n not in old else old[n] for n, photo in part.items()}
             for part, old in ((now.train, self.train), (now.test, self.test))
         )
-        return replace(now, train=train, test=test, points=now.points or self.points)
+        return replace(now, train=train, test=test)
 
     def demand(self, scene: Scene) -> None:
         """Demand that the photos of a scene that have not been read have these digests, where they are known."""
@@ -140,7 +139,7 @@ class Inputs:
         if self.train.keys() == now.train.keys():  # near planes follow the set of training photos
             differing["other cameras"] = [n for n in both if not _same_camera(old[n].camera, new[n].camera)]
         found = [f"{what} ({named(names)})" for what, names in differing.items() if names]
-        return found + ["other points"] * bool(now.points and now.points != self.points)
+        return found + ["other points"] * (now.points != self.points)
 
 
 def photos_of(views: list[View], offset: NDArray[np.float64]) -> dict[str, Photo]:

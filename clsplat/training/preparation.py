@@ -15,7 +15,7 @@ from clsplat.ranges import check, parse_bytes
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
 from clsplat.training.densify import STRATEGIES
-from clsplat.training.few_views import adapted, applies
+from clsplat.training.few_views import adapted
 from clsplat.training.initialize import start_count
 from clsplat.training.memory import Footprint
 from clsplat.training.run_length import with_length
@@ -31,7 +31,6 @@ def prepare(
     device: "Device | None" = None,
     *,
     scene: Scene | None = None,
-    resume: bool = False,
     verbose: bool = False,
     tell: Callable[[str], None] = lambda text: None,
 ) -> tuple[Scene, TrainConfig]:
@@ -51,8 +50,6 @@ def prepare(
         Device that will train; default: the one that `config` describes.
     scene : Scene, optional
         The dataset, if `load_scene` has read it already with `config.data`.
-    resume : bool
-        Whether the result continues a run. Points that only its start needed are then not triangulated again.
     verbose : bool
         Show COLMAP's own messages.
     tell : callable
@@ -80,9 +77,7 @@ def prepare(
         scene = load_scene(path, config.data, verbose, photo_memory(config))
     scene = with_near_planes(scene)
     tell(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
-    # The points of few photos limit the number of Gaussians, and depth maps are scaled to points.
-    always = applies(config, scene) or config.data.depth is not None
-    if config.init.triangulate and not len(scene.points) and (always or not resume):
+    if config.init.triangulate and not len(scene.points):
         scene = with_points(scene, path, config.data, verbose)
         found = f"{len(scene.points)} points, from photos and poses" if len(scene.points) else "random"
         tell(f"start: {found} (--init.no-triangulate: random)")

@@ -12,6 +12,7 @@ from clsplat.camera import Camera
 from clsplat.cli import main
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene, with_points
+from clsplat.dataset.near_planes import near_plane
 from clsplat.dataset.sfm.triangulation import NEIGHBOURS, POINTS_TARGET, TRIANGULATED_MIN, filled, pairs, triangulate
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
@@ -156,7 +157,11 @@ def test_a_dataset_of_poses_gets_points_from_photos_of_full_size(posed, tmp_path
     assert len(points) < POINTS_TARGET == len(found.points) == len(found.colors)
     np.testing.assert_array_equal(found.points[: len(points)], points)
     np.testing.assert_array_equal(found.colors[: len(points)], colors)
-    assert found.train == scene.train
+    assert [view.name for view in found.train] == [view.name for view in scene.train]
+    nears = [view.camera.near for view in found.train]
+    expected = [near_plane(view.camera, found.points) for view in scene.train]
+    np.testing.assert_allclose(nears, expected, rtol=0.01)  # of a part of the points
+    assert min(nears) > 10 * max(view.camera.near for view in scene.train)
     assert with_points(found, tmp_path / "not read again", config) is found
 
 
@@ -185,7 +190,8 @@ def test_panoramas_that_train_whole_make_points_by_their_faces(tmp_path, monkeyp
     scene = load_scene(path, config)
     assert [view.name for view in scene.train] == ["1.png", "2.png", "3.png"]
     found = with_points(scene, path, config)
-    assert used == sorted(f"{k}_{face}.png" for k in (1, 2, 3) for face in FACES) and found.train == scene.train
+    assert used == sorted(f"{k}_{face}.png" for k in (1, 2, 3) for face in FACES)
+    assert [view.name for view in found.train] == [view.name for view in scene.train]
     size_of_a_pixel = 3.2 / spheres[0].fx
     assert len(found.points) == POINTS_TARGET and np.median(off_the_corner(found.points)) < size_of_a_pixel
 

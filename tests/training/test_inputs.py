@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_run import CONFIG, SIZE, same
+from small_run import CONFIG, SIZE
 
 from clsplat.device import Device
 from clsplat.errors import InputError
@@ -83,6 +83,7 @@ DIFFERENCES: dict[str, tuple[Callable[[Scene], Scene], str]] = {
         r"other cameras \(\S+, \S+, \S+ and \d+ more\)",
     ),
     "points": (other_points, "other points"),
+    "no points": (lambda s: replace(s, points=s.points[:0], colors=s.colors[:0]), "other points"),
     "colours": (lambda s: replace(s, colors=s.colors + np.uint8(1)), "other points"),
     "two at once": (lambda s: other_points(with_view(s, 0, one_pixel)), r"other pixels \(\S+\), and other points"),
 }
@@ -116,21 +117,6 @@ def test_the_same_inputs_from_another_place_go_on(scene: Scene, device: Device, 
     again = replace(scene, train=[loaded_again(v) for v in scene.train])
     resumed = train(again, SHORT, tmp_path / "cut", device, resume=True)
     assert len(resumed) == len(expected)
-
-
-def test_a_run_that_goes_on_needs_no_points_and_remembers_them(scene: Scene, device: Device, tmp_path: Path) -> None:
-    def interrupt(record: dict[str, Any]) -> None:
-        raise KeyboardInterrupt
-
-    expected = train(scene, SHORT, tmp_path / "whole", device)
-    without = replace(scene, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8))
-    with pytest.raises(KeyboardInterrupt):
-        train(scene, SHORT, tmp_path / "cut", device, progress=interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        train(without, SHORT, tmp_path / "cut", device, resume=True, progress=interrupt)
-    with pytest.raises(InputError, match="found other points;"):
-        train(other_points(scene), SHORT, tmp_path / "cut", device, resume=True)
-    assert same(train(scene, SHORT, tmp_path / "cut", device, resume=True), expected)
 
 
 def test_another_device_or_driver_warns_and_goes_on(

@@ -1,6 +1,7 @@
 """One meaning of a configuration: Python's three lines and `clsplat train` write the same bytes."""
 
 # ruff: noqa: F811 (fixtures are imported and then named as arguments)
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,29 +45,29 @@ def test_poses_without_points(posed: list[View], tmp_path: Path) -> None:
     run("train", path, "-o", tmp_path / "command", *options)
     config = TrainConfig(iterations=5, max_gaussians=500, data=DataConfig(test_every=0))
     assert from_python(path, config, tmp_path / "python") == (tmp_path / "command" / "scene.ply").read_bytes()
-    # The points of few photos are triangulated again when a run resumes, and must be the same.
+    # The points are triangulated again when a run resumes, and must be the same.
     run("train", path, "-o", tmp_path / "command", *options, "--resume")
     told: list[str] = []
     scene, _ = prepare(path, config, tell=told.append)
     assert len(scene.points) == POINTS_TARGET and f"start: {POINTS_TARGET} points, from photos and poses" in told[1]
 
 
-def test_a_resumed_run_of_many_photos_needs_no_points(posed: list[View], tmp_path: Path) -> None:
-    config = TrainConfig(data=DataConfig(test_every=0))
-    many = replace(config, few=replace(config.few, below=0), size="fixed", max_gaussians=300)
-    path = write_transforms(tmp_path, posed)
-    assert not len(prepare(path, many, resume=True)[0].points)
-
-
 @pytest.mark.parametrize("below", [17, 3])
-def test_the_points_of_few_photos_limit_the_gaussians_of_a_resumed_run(
-    below: int, posed: list[View], tmp_path: Path
-) -> None:
+def test_the_points_of_few_photos_limit_the_gaussians(below: int, posed: list[View], tmp_path: Path) -> None:
     """The size is not searched with as few photos, whether or not the settings for fewer still apply."""
     config = TrainConfig(data=DataConfig(test_every=0), few=FewViewsConfig(below=below))
+    few = prepare(write_transforms(tmp_path, posed), config)[1]
+    assert few.size == "fixed" and few.max_gaussians is not None
+
+
+def test_poses_without_points_are_evaluated_as_they_were_trained(posed: list[View], tmp_path: Path) -> None:
+    """The near planes of held-out photos follow the points that training triangulates, in later commands, too."""
     path = write_transforms(tmp_path, posed)
-    few, again = (prepare(path, config, resume=resume)[1] for resume in (False, True))
-    assert few == again and few.size == "fixed" and few.max_gaussians is not None
+    out = tmp_path / "run"
+    run("train", path, "-o", out, "--iterations", 5, "--test-every", 4, "--max-gaussians", 500)
+    run("eval", out, "-o", tmp_path / "eval")
+    trained, again = (json.loads((d / "metrics.json").read_text()) for d in (out / "eval", tmp_path / "eval"))
+    assert trained["mean"]["psnr"] == again["mean"]["psnr"]
 
 
 def test_masks_are_found_in_the_dataset_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
