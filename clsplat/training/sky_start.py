@@ -6,6 +6,7 @@ representation", is a similar start. Measured: docs/experiments/strategies.md.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,8 @@ from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset.coverage import projected
 from clsplat.gaussians import Gaussians
-from clsplat.scene import Scene, View, in_turn
+from clsplat.scene import Scene, View, evenly_spaced, in_turn
+from clsplat.training.dense_start import MOST_PHOTOS
 from clsplat.training.initialize import from_points
 
 Array = NDArray[np.float64]
@@ -63,10 +65,6 @@ UNSEEN = 0.5
 DIFFERENCE = 0.02
 """Largest difference of a colour from the background's, from 0 to 1, with which the background is the sky."""
 
-MOST_PHOTOS = 50
-"""Largest number of training photos with which there is a sky. More photos show each place from enough sides to
-correct haze, and a sky at one distance then costs quality (measured: docs/experiments/strategies.md)."""
-
 
 def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussians:
     """Add Gaussians of the sky to the first ones of a training, if the configuration asks for them.
@@ -86,8 +84,7 @@ def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussia
     -------
     Gaussians
         The first ones, and those of the sky behind them. The same object if there is no sky: photos without a smooth
-        region above the horizon or without a common horizon, more than `MOST_PHOTOS`, a scene without or with few
-        points.
+        region above the horizon or without a common horizon, a scene without or with few points.
     """
     if not may_have_sky(scene, config):
         return gaussians
@@ -104,7 +101,7 @@ def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussia
 
 def may_have_sky(scene: Scene, config: TrainConfig) -> bool:
     """Whether a training looks for the sky."""
-    return config.init.sky and len(scene.points) > 0 and len(scene.train) <= MOST_PHOTOS
+    return config.init.sky and len(scene.points) > 0
 
 
 def beyond(gaussians: Gaussians, scene: Scene) -> NDArray[np.bool_]:
@@ -116,8 +113,8 @@ def beyond(gaussians: Gaussians, scene: Scene) -> NDArray[np.bool_]:
 def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
     """Make the Gaussians of the sky; None if the photos show no sky.
 
-    They lie on a sphere around the cameras, in all directions that are sky in each photo that looks there, and in
-    directions nearby into which no photo looks.
+    They lie on a sphere around the cameras, in all directions that are sky in each photo that looks there, of at most
+    `MOST_PHOTOS`, and in directions nearby into which no photo looks.
     """
     from scipy.spatial import cKDTree
 
@@ -130,7 +127,7 @@ def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
     distance = max(DISTANCE * scene.extent, reach)
     means = centre + distance * directions
     colors, shown, as_sky = np.zeros_like(means), np.zeros(len(means), int), np.zeros(len(means), int)
-    for view in in_turn(scene.train):
+    for view in in_turn(evenly_spaced(scene.train, MOST_PHOTOS)):
         cells, averages, edge = sky_cells(view, scene.points, up)
         places, _, inside = projected(view.camera, means)
         rows = np.flatnonzero(inside)
@@ -201,9 +198,11 @@ def sky_cells(view: View, points: Array, up: Array) -> tuple[NDArray[np.bool_], 
     edge = max(CELL_MIN, round(CELL * float(np.hypot(camera.width, camera.height))))
     rows, columns = -(-camera.height // edge), -(-camera.width // edge)
     padding = (0, rows * edge - camera.height), (0, columns * edge - camera.width)
-    image = np.pad(view.image, (*padding, (0, 0)), mode="edge").reshape(rows, edge, columns, edge, 3)
-    averages = image.mean(axis=(1, 3)) / 255
-    deviation = image.mean(axis=4).std(axis=(1, 3)) / 255
+    image = np.pad(view.image, (*padding, (0, 0)), mode="edge")
+    averages = _cell_sums(image, edge) / (255 * edge**2)
+    grey = image[:, :, :1] + image[:, :, 1:2].astype(np.int64) + image[:, :, 2:]
+    sums, squares = (_cell_sums(values, edge)[:, :, 0] for values in (grey, grey**2))
+    deviation = np.sqrt(edge**2 * squares - sums**2) / (3 * 255 * edge**2)
     counts = view.counts if view.clear is None else view.counts & (view.clear == 0)
     whole = np.pad(counts, padding, mode="edge").reshape(rows, edge, columns, edge).all(axis=(1, 3))
 
@@ -219,3 +218,10 @@ def sky_cells(view: View, points: Array, up: Array) -> tuple[NDArray[np.bool_], 
     rim[1:-1, 1:-1] = False
     labels, _ = label(free)
     return np.isin(labels, np.unique(labels[rim])) & free, averages, edge
+
+
+def _cell_sums(values: NDArray[Any], edge: int) -> NDArray[np.int64]:
+    """Sums (R, C, K) over the square cells of integers (R edge, C edge, K)."""
+    rows = len(values) // edge
+    strips = values.reshape(rows, edge, -1).sum(axis=1, dtype=np.int64)
+    return strips.reshape(rows, -1, edge, values.shape[2]).sum(axis=2)
