@@ -23,7 +23,7 @@ EXPOSURE_GAIN = 1.0
 
 
 def generalisation(
-    gaussians: "Gaussians | Stored", scene: "Scene", report: dict[str, Any], renderer: "Renderer"
+    gaussians: "Gaussians | Stored", scene: "Scene", report: dict[str, Any], renderer: "Renderer", exposure: bool
 ) -> str:
     """Say how well a scene holds in its held-out photos.
 
@@ -35,6 +35,8 @@ def generalisation(
     report : dict
         The result of `clsplat.evaluate.evaluate` on the held-out photos.
     renderer : Renderer
+    exposure : bool
+        Whether training learned the exposures of its photos.
 
     Returns
     -------
@@ -52,7 +54,10 @@ def generalisation(
     worst = min(report["views"], key=lambda view: np.inf if view["psnr"] is None else view["psnr"])
     text += f"The weakest is {worst['name']}, {worst['psnr']:.1f} dB: {_reason(scene, worst['name'])}"
     if fitted is not None and fitted - held > EXPOSURE_GAIN:
-        text += f". After a fit of colours it would be {fitted:.1f} dB: where exposures differ, try --exposure"
+        advice = (
+            "compare this figure of runs with --exposure" if exposure else "where exposures differ, try --exposure"
+        )
+        text += f". After a fit of colours it would be {fitted:.1f} dB: {advice}"
     return text
 
 

@@ -318,4 +318,4 @@ def evaluate_held_out(
         posed = [aligned(gaussians, view, scene.extent, config.optim, renderer) for view in scene.test]
         report = evaluate(gaussians, posed, out / "eval_aligned", renderer)
         say_scores(report, out / "eval_aligned")
-    say(f"generalisation: {generalisation(gaussians, scene, report, renderer)}")
+    say(f"generalisation: {generalisation(gaussians, scene, report, renderer, config.exposure)}")

@@ -40,18 +40,20 @@ def report(seen, beyond, fitted=20.0):
 def test_the_reason_is_the_part_that_few_photos_show(scene, device):
     gaussians, photos = scene
     renderer = Renderer(device)
-    text = generalisation(gaussians, photos, report(25.0, 15.0), renderer)
+    text = generalisation(gaussians, photos, report(25.0, 15.0), renderer, False)
     assert text.startswith("2 held-out photos have 20.0 dB, training photos ")
     assert "weakest is beyond, 15.0 dB" in text and "mostly on the right, is in the frame of fewer than 3" in text
     assert "exposure" not in text
-    text = generalisation(gaussians, photos, report(15.0, 25.0), renderer)
+    text = generalisation(gaussians, photos, report(15.0, 25.0), renderer, False)
     assert "weakest is seen, 15.0 dB: 3 or more training photos have each part of it" in text
 
 
 def test_exposures_are_named_where_a_fit_of_colours_gains(scene, device):
-    text = generalisation(*scene, report(25.0, 15.0, fitted=21.1), Renderer(device))
+    text = generalisation(*scene, report(25.0, 15.0, fitted=21.1), Renderer(device), False)
     assert "After a fit of colours it would be 21.1 dB" in text and "--exposure" in text
-    assert "--exposure" not in generalisation(*scene, report(25.0, 15.0, fitted=20.9), Renderer(device))
+    again = generalisation(*scene, report(25.0, 15.0, fitted=21.1), Renderer(device), True)
+    assert "try --exposure" not in again and "21.1 dB: compare this figure" in again
+    assert "--exposure" not in generalisation(*scene, report(25.0, 15.0, fitted=20.9), Renderer(device), False)
 
 
 @pytest.mark.parametrize(
@@ -63,21 +65,23 @@ def test_the_part_is_named_by_its_side(scene, device, pixels, side):
     seen = photos.test[0]
     shifted = replace(seen.camera, cx=seen.camera.cx + pixels[0], cy=seen.camera.cy + pixels[1])
     beyond = View("beyond", shifted, seen.image)
-    text = generalisation(gaussians, replace(photos, test=[seen, beyond]), report(25.0, 15.0), Renderer(device))
+    text = generalisation(
+        gaussians, replace(photos, test=[seen, beyond]), report(25.0, 15.0), Renderer(device), False
+    )
     assert f"mostly {side}, is in the frame of fewer than 3" in text
 
 
 def test_a_photo_without_errors_is_not_the_weakest(scene, device):
     perfect = report(25.0, 15.0)
     perfect["views"][0]["psnr"] = None
-    assert "weakest is beyond, 15.0 dB" in generalisation(*scene, perfect, Renderer(device))
+    assert "weakest is beyond, 15.0 dB" in generalisation(*scene, perfect, Renderer(device), False)
 
 
 def test_without_points_or_errors(scene, device):
     gaussians, photos = scene
     bare = Scene(photos.train, photos.test, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     assert "more photos from there would help most" in generalisation(
-        gaussians, bare, report(25.0, 15.0), Renderer(device)
+        gaussians, bare, report(25.0, 15.0), Renderer(device), False
     )
     perfect = {"mean": {"psnr": None, "psnr_fitted": None}, "views": []}
-    assert "without errors" in generalisation(gaussians, photos, perfect, Renderer(device))
+    assert "without errors" in generalisation(gaussians, photos, perfect, Renderer(device), False)

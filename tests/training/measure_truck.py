@@ -6,6 +6,7 @@ clsplat bench quality OUT:downscale=2 OUT:downscale=2:thin=2 OUT:downscale=2:thi
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,10 @@ RINGS = ((0.0, 1.0), (0.12, 1.0), (0.3, 0.9))
 """Heights and radii of the rings of cameras, in distances of the given views from the point that they look at."""
 
 PER_RING = 20
+
+NEAR = 0.25
+"""Depth of the photos' near plane, in distances of the given views from the point that they look at. Nearer are faint
+Gaussians of the scene alone, which no photo of the truck shows."""
 
 
 def main(scene: str, views: str, out: Path) -> None:
@@ -46,6 +51,7 @@ def main(scene: str, views: str, out: Path) -> None:
             position = centre + arm + height * radius * up
             target = centre + rng.normal(0, 0.04 * radius, 3)
             camera = Camera.look_at(position, target, up, FOCAL, WIDTH, HEIGHT)
+            camera = replace(camera, near=NEAR * radius)
             image = np.asarray(render(gaussians, camera, background=SKY, gradients=False).rgb)
             image = np.clip(image + rng.normal(0, NOISE, image.shape), 0, 1)
             name = f"images/{len(frames):04d}.png"
