@@ -10,7 +10,7 @@ from test_run_length import with_photos
 from clsplat.config import FewViewsConfig, InitConfig, TrainConfig
 from clsplat.scene import Scene
 from clsplat.training.autosize.rule import RANDOM_START
-from clsplat.training.few_views import adapted, applies
+from clsplat.training.few_views import adapted
 
 SMALL = (40, 30)  # 1200 pixels
 
@@ -37,13 +37,12 @@ def test_numbers_by_hand(photos: int, size: tuple[int, int], points: int, most: 
     scene = scene_of(photos, size, points)
     config = adapted(TrainConfig(), scene)
     assert config == replace(TrainConfig(), size="fixed", max_gaussians=most, dropout=dropout)
-    assert applies(TrainConfig(), scene)
 
 
 @pytest.mark.parametrize(("below", "photos"), [(17, 24), (0, 8)])
 def test_with_enough_photos_the_size_is_searched(below: int, photos: int) -> None:
     config = TrainConfig(few=FewViewsConfig(below=below))
-    assert adapted(config, scene_of(photos)) is config and not applies(config, scene_of(photos))
+    assert adapted(config, scene_of(photos)) is config
     found = adapted(config, scene_of(photos - 1))
     assert (found.size, found.max_gaussians, found.dropout) == ("fixed", 3000, 0.0)
 
