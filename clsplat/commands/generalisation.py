@@ -55,7 +55,7 @@ def generalisation(
     text += f"The weakest is {worst['name']}, {worst['psnr']:.1f} dB: {_reason(scene, worst['name'])}"
     if fitted is not None and fitted - held > EXPOSURE_GAIN:
         advice = (
-            "compare this figure of runs with --exposure" if exposure else "where exposures differ, try --exposure"
+            "compare runs with --exposure by this figure" if exposure else "where exposures differ, try --exposure"
         )
         text += f". After a fit of colours it would be {fitted:.1f} dB: {advice}"
     return text

@@ -104,8 +104,9 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
 
 
 def load_scene_with_points(path: str | Path, config: DataConfig) -> Scene:
-    """Load a dataset, and triangulate points if it has poses without points, so that its near planes are those of
-    training. Parameters and errors are those of `load_scene`.
+    """Load a dataset, and triangulate points where it has poses alone.
+
+    Near planes are then those of training. Parameters and errors are those of `load_scene`.
     """
     return with_points(load_scene(path, config), path, config)
 

@@ -52,7 +52,7 @@ def test_exposures_are_named_where_a_fit_of_colours_gains(scene, device):
     text = generalisation(*scene, report(25.0, 15.0, fitted=21.1), Renderer(device), False)
     assert "After a fit of colours it would be 21.1 dB" in text and "--exposure" in text
     again = generalisation(*scene, report(25.0, 15.0, fitted=21.1), Renderer(device), True)
-    assert "try --exposure" not in again and "21.1 dB: compare this figure" in again
+    assert "try --exposure" not in again and "21.1 dB: compare runs" in again
     assert "--exposure" not in generalisation(*scene, report(25.0, 15.0, fitted=20.9), Renderer(device), False)
 
 

@@ -237,3 +237,17 @@ def test_a_training_keeps_the_sky_that_no_photo_shows(device: Device, tmp_path) 
     found = trained[True].means[beyond(trained[True], scene)]
     assert (found @ UP / np.linalg.norm(found, axis=1)).max() > 0.8  # photos reach to 0.51
     assert not beyond(trained[False], scene).any()
+
+
+def test_of_many_photos_some_decide(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_at = []
+
+    def noted(view: View, *others: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+        looked_at.append(view.name)
+        return sky_cells(view, *others)
+
+    monkeypatch.setattr("clsplat.training.sky_start.sky_cells", noted)
+    monkeypatch.setattr("clsplat.training.sky_start.MOST_PHOTOS", 3)
+    scene = square(ring(9))
+    assert sky_gaussians(scene, CONFIG) is not None
+    assert looked_at == [scene.train[k].name for k in (0, 4, 8)]
