@@ -276,7 +276,8 @@ class FewViewsConfig:
     below: Annotated[int, within(least=0)] = 17
     """Number of training photos below which the settings for few photos apply (0: never)."""
     dropout: PartialFraction = 0.2
-    """Fraction of the splats left out of each image at the end of the training (DropGaussian)."""
+    """Fraction of the splats left out of each image at the end of the training (DropGaussian); half of it with more
+    photos, up to 23."""
     growth: Positive = 8.0
     """Largest number of Gaussians, as a multiple of the number of the scene's points. Photos of fewer pixels than
     this lower it to their number, at most by half; photos of more than 90 000 pixels may raise it."""

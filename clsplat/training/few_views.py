@@ -1,8 +1,8 @@
 """Adaptation of a configuration to few photos, which many arrangements of Gaussians fit equally well.
 
 With few photos none is held back to choose the number of Gaussians by: each shows what no other does, and two or
-three do not decide. With fewer still, splats are left out at random, so that none is indispensable, which generalises
-better to other viewpoints (Park et al. 2025, "DropGaussian").
+three do not decide. Splats are left out at random, so that none is indispensable, which generalises better to other
+viewpoints (Park et al. 2025, "DropGaussian").
 """
 
 from dataclasses import replace
@@ -19,6 +19,10 @@ FEWEST_SEARCHED = 24
 """Fewest training photos with which the number of Gaussians is searched. Of fewer, three at most would be held back;
 training without these costs more than the search gains (measured: docs/experiments/size.md)."""
 
+SOME_DROPOUT = 1 / 2
+"""Factor on `FewViewsConfig.dropout` with `FewViewsConfig.below` photos or more, but fewer than `FEWEST_SEARCHED`
+(measured: docs/experiments/strategies.md)."""
+
 
 def _fewest(config: TrainConfig, scene: Scene) -> bool:
     return len(scene.train) < config.few.below
@@ -32,14 +36,16 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Adapt a configuration to the number of training photos.
 
     With fewer than `FEWEST_SEARCHED` the number of Gaussians is not searched, but grows as far as a search would let
-    it; if `config.few.below` is 0, only with fewer than `FEWEST_PHOTOS`. With fewer than `config.few.below` photos
-    dropout is on, and the number is bounded by a multiple of the points; for small photos by half of it, or one per
-    pixel, and for large ones by what a search may reach if this is more (measured: docs/experiments/strategies.md). A
-    fixed number that the configuration names is kept. Otherwise the configuration is returned as it is.
+    it, and dropout is on. If `config.few.below` is 0, this holds with fewer than `FEWEST_PHOTOS`, and without
+    dropout. With fewer than `config.few.below` photos there is more dropout, and the number is bounded by a multiple
+    of the points; for small photos by half of it, or one per pixel, and for large ones by what a search may reach if
+    this is more (measured: docs/experiments/strategies.md). A fixed number that the configuration names is kept.
+    Otherwise the configuration is returned as it is.
     """
     few, init, first, fewest = config.few, config.init, len(scene.points), _fewest(config, scene)
     if not fewest and (config.size != "auto" or _searched(config, scene)):
         return config
+    dropout = few.dropout * (1 if fewest else SOME_DROPOUT if few.below else 0)
     named = config.size == "fixed" and config.max_gaussians is not None
     if config.size == "auto":
         if not first:
@@ -51,8 +57,7 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
         wanted = _most_of_few(few.growth * first, scene) if fewest else full_size(scene, first)
         most = max(1, min(round(wanted), MOST_GAUSSIANS))
         cap = most if cap is None else min(cap, most)
-    dropout = max(config.dropout, few.dropout) if fewest else config.dropout
-    return replace(config, init=init, max_gaussians=cap, dropout=dropout)
+    return replace(config, init=init, max_gaussians=cap, dropout=max(config.dropout, dropout))
 
 
 def _most_of_few(grown: float, scene: Scene) -> float:

@@ -23,9 +23,9 @@ def scene_of(photos: int, size: tuple[int, int] = SMALL, points: int = 1000) -> 
 @pytest.mark.parametrize(
     ("photos", "size", "points", "most", "dropout"),
     [
-        (23, SMALL, 1000, 3000, 0.0),  # what a search may reach: three times the points
-        (17, SMALL, 1000, 3000, 0.0),
-        (17, (100, 70), 1000, 7000, 0.0),  # or one per pixel
+        (23, SMALL, 1000, 3000, 0.1),  # what a search may reach: three times the points
+        (17, SMALL, 1000, 3000, 0.1),
+        (17, (100, 70), 1000, 7000, 0.1),  # or one per pixel
         (16, SMALL, 1000, 4000, 0.2),  # half of eight times the points, or one per pixel
         (16, (100, 70), 1000, 7000, 0.2),
         (16, (300, 300), 1000, 8000, 0.2),  # at most eight times the points
@@ -39,12 +39,12 @@ def test_numbers_by_hand(photos: int, size: tuple[int, int], points: int, most: 
     assert config == replace(TrainConfig(), size="fixed", max_gaussians=most, dropout=dropout)
 
 
-@pytest.mark.parametrize(("below", "photos"), [(17, 24), (0, 8)])
-def test_with_enough_photos_the_size_is_searched(below: int, photos: int) -> None:
+@pytest.mark.parametrize(("below", "photos", "dropout"), [(17, 24, 0.1), (0, 8, 0.0)])
+def test_with_enough_photos_the_size_is_searched(below: int, photos: int, dropout: float) -> None:
     config = TrainConfig(few=FewViewsConfig(below=below))
     assert adapted(config, scene_of(photos)) is config
     found = adapted(config, scene_of(photos - 1))
-    assert (found.size, found.max_gaussians, found.dropout) == ("fixed", 3000, 0.0)
+    assert (found.size, found.max_gaussians, found.dropout) == ("fixed", 3000, dropout)
 
 
 @pytest.mark.parametrize(
