@@ -282,7 +282,7 @@ class Renderer:
         if run.inverse:
             self.stages.disparity_bwd(run.splats, v_splats)
         if run.dropout:
-            self.stages.dropout_bwd(v_splats, run.dropout)
+            self.stages.dropout_bwd(run.splats, v_splats, run.dropout)
         return v_splats
 
     def backward(self, run: Pass, v_image: Image, *, camera_grad: bool = False) -> Gradients:

@@ -5,6 +5,7 @@ containers. N Gaussians, M intersections of a splat with a tile, T tiles, C colo
 """
 
 from collections.abc import Iterable
+from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, SupportsFloat
 
 from clsplat.field_stages import FieldStages
@@ -100,11 +101,15 @@ class CameraGrads(NamedTuple):
 
 
 class Dropout(NamedTuple):
-    """The splats left out of an image: a fraction `rate` of them, in [0, 1), drawn for each seed and iteration."""
+    """The splats left out of an image: a fraction `rate` of them, in [0, 1), drawn for each seed and iteration.
+
+    Those beyond the depth `far`, in world units, stay as they are.
+    """
 
     rate: float
     seed: int
     iteration: int
+    far: float = inf
 
     @property
     def gain(self) -> float:
@@ -232,7 +237,7 @@ class Stages(FieldStages, Protocol):
     def disparity_fwd(self, splats: AnySplats) -> None: ...
     def disparity_bwd(self, splats: AnySplats, v_splats: AnyGrads) -> None: ...
     def dropout_fwd(self, splats: AnySplats, dropout: Dropout) -> None: ...
-    def dropout_bwd(self, v_splats: AnyGrads, dropout: Dropout) -> None: ...
+    def dropout_bwd(self, splats: AnySplats, v_splats: AnyGrads, dropout: Dropout) -> None: ...
     def bin_splats(
         self,
         splats: AnySplats,

@@ -33,9 +33,10 @@ def by_twin(splats, dropout):
     return result
 
 
+@pytest.mark.parametrize("far", [np.inf, 4.0])
 @pytest.mark.parametrize("n", [1, 65, 2000])
-def test_matches_twin(any_device, n):
-    splats, dropout = splats_of(n), Dropout(0.3, 2**40 + 7, 1234)
+def test_matches_twin(any_device, n, far):
+    splats, dropout = splats_of(n), Dropout(0.3, 2**40 + 7, 1234, far)
     found, expected = by_kernel(any_device, splats, dropout), by_twin(splats, dropout)
     tolerances = DOUBLE if any_device.real == np.float64 else FLOAT
     for name in Splats._fields:
@@ -56,6 +57,17 @@ def test_the_share_that_is_dropped_and_the_mean_of_the_others(rate):
         # Five standard deviations of a share of 1600 draws.
         assert abs(1 - kept.sum() / shown.sum() - rate) <= 5 * np.sqrt(rate * (1 - rate) / shown.sum())
     np.testing.assert_allclose(sums.mean() / 200, splats.opacities.mean(), rtol=0.01)
+
+
+def test_splats_beyond_the_depth_stay_as_they_are():
+    splats = splats_of(2000)
+    far = float(np.median(splats.depths[splats.extents[:, 0] > 0]))
+    after, beyond = by_twin(splats, Dropout(0.5, 0, 1, far)), splats.depths > far
+    assert 100 < (beyond & (splats.opacities > 0)).sum()
+    for name in Splats._fields:
+        np.testing.assert_array_equal(getattr(after, name)[beyond], getattr(splats, name)[beyond])
+    shown = ~beyond & (splats.opacities > 0)
+    assert 0.4 < (after.opacities[shown] > 0).mean() < 0.6
 
 
 def test_boxes_are_those_of_the_new_opacity():
@@ -119,7 +131,7 @@ def test_each_iteration_and_seed_draws_anew(device):
 def test_gradients_through_the_image(device64):
     gaussians, camera = synthetic_scene(12, seed=2, margin=3e-2)
     gaussians.logit_opacities -= 1  # the others' opacities stay below ALPHA_MAX
-    dropout, renderer = Dropout(0.3, 0, 5), Renderer(device64, background=(0.1, 0.5, 0.9))
+    dropout, renderer = Dropout(0.3, 0, 5, far=4.5), Renderer(device64, background=(0.1, 0.5, 0.9))
     weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))
 
     def run(logit_opacities, means):
@@ -140,11 +152,13 @@ def test_gradients_through_the_image(device64):
 
 
 def test_backward_matches_twin(any_device):
-    v = np.random.default_rng(0).normal(size=70)
-    dropout = Dropout(0.25, 0, 1)
+    v, depths = np.random.default_rng(0).normal(size=70), np.arange(70.0)
+    dropout = Dropout(0.25, 0, 1, far=49)
+    splats = Splats(None, None, any_device.upload("depths", depths), None, None, None)
     arrays = SplatGrads(None, None, any_device.upload("v", v), None)
-    ops.dropout_bwd(any_device, arrays, dropout)
+    ops.dropout_bwd(any_device, splats, arrays, dropout)
     expected = SplatGrads(None, None, v.copy(), None)
-    reference.dropout_bwd(expected, dropout)
+    reference.dropout_bwd(splats._replace(depths=depths), expected, dropout)
     np.testing.assert_allclose(arrays.opacities.get(), expected.opacities, rtol=1e-6)
-    np.testing.assert_allclose(expected.opacities, v / 0.75)
+    np.testing.assert_allclose(expected.opacities[:50], v[:50] / 0.75)
+    np.testing.assert_array_equal(expected.opacities[50:], v[50:])

@@ -19,14 +19,14 @@ def dropout_fwd(device: Device, splats: AnySplats, dropout: Dropout) -> None:
     n = len(splats.opacities)
     key = np.array([dropout.seed & 0xFFFFFFFF, dropout.seed >> 32], np.uint32)
     scalars = [n, key, np.uint32(dropout.iteration), np.uint32(dropout.threshold), dropout.gain]
-    scalars.append(int(isinstance(splats, RaySplats)))
-    device.launch("dropout", "dropout_fwd", (n,), [*scalars, splats.extents, splats.opacities])
+    scalars += [int(isinstance(splats, RaySplats)), float(dropout.far)]
+    device.launch("dropout", "dropout_fwd", (n,), [*scalars, splats.depths, splats.extents, splats.opacities])
 
 
-def dropout_bwd(device: Device, v_splats: AnyGrads, dropout: Dropout) -> None:
+def dropout_bwd(device: Device, splats: AnySplats, v_splats: AnyGrads, dropout: Dropout) -> None:
     """Turn gradients by the splats after `dropout_fwd` into gradients by those before it, in place.
 
-    Gradients of dropped splats are 0.
+    Gradients of dropped splats are 0. Of `splats`, before or after `dropout_fwd`, only the depths are read.
     """
     n = len(v_splats.opacities)
-    device.launch("dropout", "dropout_bwd", (n,), [n, dropout.gain, v_splats.opacities])
+    device.launch("dropout", "dropout_bwd", (n,), [n, dropout.gain, float(dropout.far), splats.depths, v_splats.opacities])

@@ -13,7 +13,7 @@ def dropout_fwd(splats: AnySplats, dropout: Dropout) -> None:
     counters = np.zeros((n, 4), np.uint32)
     counters[:, 0], counters[:, 1], counters[:, 2] = np.arange(n), dropout.iteration, 1
     kept = philox(counters, (dropout.seed & 0xFFFFFFFF, dropout.seed >> 32))[:, 0] >= dropout.threshold
-    shown = splats.extents[:, 0] > 0
+    shown = (splats.extents[:, 0] > 0) & (splats.depths <= dropout.far)
     before = splats.opacities[shown]
     after = np.where(kept[shown], dropout.gain * before, 0)
     splats.opacities[shown] = after
@@ -25,6 +25,6 @@ def dropout_fwd(splats: AnySplats, dropout: Dropout) -> None:
     splats.extents[shown] *= np.sqrt(np.maximum(squares, 0))[:, None]
 
 
-def dropout_bwd(v_splats: AnyGrads, dropout: Dropout) -> None:
+def dropout_bwd(splats: AnySplats, v_splats: AnyGrads, dropout: Dropout) -> None:
     """Gradients of `dropout_fwd`, in place. Arguments as for `clsplat.ops.dropout_bwd`."""
-    v_splats.opacities[:] *= dropout.gain
+    v_splats.opacities[splats.depths <= dropout.far] *= dropout.gain

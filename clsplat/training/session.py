@@ -26,6 +26,7 @@ from clsplat.training.densify import Contributions, Edit
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
 from clsplat.training.optimizer import Optimizer, adam_settings
 from clsplat.training.rows import without_harmonics
+from clsplat.training.sky_start import BEYOND
 from clsplat.training.state import State
 
 if TYPE_CHECKING:
@@ -179,7 +180,9 @@ def step(training: Training, view: View) -> float:
     iteration = state.iteration + 1
     progress = (iteration - 1) / max(config.iterations - 1, 1)
     sh_degree = state.sh_degree(iteration, config)
-    dropout = Dropout(config.dropout * progress, config.seed, iteration) if config.dropout else None
+    dropout = None
+    if config.dropout:
+        dropout = Dropout(config.dropout * progress, config.seed, iteration, BEYOND * state.extent)
     seen = example(view, iteration, state, training.photos, config, renderer)
 
     gaussians = state.shown(renderer)

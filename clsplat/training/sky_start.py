@@ -25,6 +25,9 @@ DISTANCE = 30.0
 """Distance of the sky from the middle of the cameras, in extents of the scene. Two cameras see it in directions that
 differ by a few degrees at most; larger distances gained nothing."""
 
+BEYOND = DISTANCE / 2
+"""Distance from which Gaussians count as sky, in extents of the scene. Dropout keeps them."""
+
 REACH = 3.0
 """Least distance of the sky as a factor on that of the points (`FARTHEST`)."""
 
@@ -107,7 +110,7 @@ def may_have_sky(scene: Scene, config: TrainConfig) -> bool:
 def beyond(gaussians: Gaussians, scene: Scene) -> NDArray[np.bool_]:
     """Tell which Gaussians are so far away that no part of the scene is behind them."""
     centre = np.mean([view.camera.position for view in scene.train], axis=0)
-    return np.asarray(np.linalg.norm(gaussians.means - centre, axis=1) > DISTANCE / 2 * scene.extent)
+    return np.asarray(np.linalg.norm(gaussians.means - centre, axis=1) > BEYOND * scene.extent)
 
 
 def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
