@@ -29,4 +29,5 @@ def dropout_bwd(device: Device, splats: AnySplats, v_splats: AnyGrads, dropout: 
     Gradients of dropped splats are 0. Of `splats`, before or after `dropout_fwd`, only the depths are read.
     """
     n = len(v_splats.opacities)
-    device.launch("dropout", "dropout_bwd", (n,), [n, dropout.gain, float(dropout.far), splats.depths, v_splats.opacities])
+    scalars = [n, dropout.gain, float(dropout.far)]
+    device.launch("dropout", "dropout_bwd", (n,), [*scalars, splats.depths, v_splats.opacities])
