@@ -15,6 +15,7 @@ def dropout_fwd(device: Device, splats: AnySplats, dropout: Dropout) -> None:
         Dropped splats become invisible: their extents and opacities are 0. Those along rays are projected with the
         dropout's gain.
     dropout : Dropout
+        Splats beyond its depth `far` stay as they are.
     """
     n = len(splats.opacities)
     key = np.array([dropout.seed & 0xFFFFFFFF, dropout.seed >> 32], np.uint32)

@@ -10,6 +10,7 @@ from clsplat.config import DataConfig, InitConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.scene import Scene, View
+from clsplat.stages import Dropout
 from clsplat.training.initialize import initialize
 from clsplat.training.loop import train
 from clsplat.training.sky_start import (
@@ -237,6 +238,20 @@ def test_a_training_keeps_the_sky_that_no_photo_shows(device: Device, tmp_path) 
     found = trained[True].means[beyond(trained[True], scene)]
     assert (found @ UP / np.linalg.norm(found, axis=1)).max() > 0.8  # photos reach to 0.51
     assert not beyond(trained[False], scene).any()
+
+
+def test_dropout_leaves_the_sky(device: Device, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, used = square(ring()), []
+
+    def noted(*fields: float) -> Dropout:
+        used.append(Dropout(*fields))
+        return used[-1]
+
+    monkeypatch.setattr("clsplat.training.session.Dropout", noted)
+    config = replace(CONFIG, iterations=2, size="fixed", max_gaussians=5000, dropout=0.5)
+    train(scene, config, tmp_path, device)
+    assert len(used) == 2
+    assert all(scene.extent < dropout.far < DISTANCE * scene.extent for dropout in used)
 
 
 def test_of_many_photos_some_decide(monkeypatch: pytest.MonkeyPatch) -> None:
