@@ -18,6 +18,10 @@ PartialFraction = Annotated[float, within(least=0, below=1)]
 Positive = Annotated[float, within(above=0)]
 NonNegative = Annotated[float, within(least=0)]
 
+MOST_DOWNSCALE = 16
+"""Largest factor by which photos are reduced: sums of more than 16 x 16 bytes exceed 16 bits."""
+Downscale = Annotated[int | Literal["auto"], within(least=1, most=MOST_DOWNSCALE)]
+
 INT32_MAX, UINT32_MAX, UINT64_MAX = 2**31 - 1, 2**32 - 1, 2**64 - 1
 """Largest integers of COLMAP's options, of indices and counters on the device, and of the keys of random numbers."""
 
@@ -80,9 +84,9 @@ class SfmConfig:
 class DataConfig:
     """Settings of loading a dataset."""
 
-    downscale: Literal[1, 2, 4, 8] = 1
-    """Factor by which the photos' edges are divided: the folder images_2, images_4 or images_8 is read if it exists,
-    otherwise the photos are resampled."""
+    downscale: Downscale = "auto"
+    """Factor by which the photos' edges are divided; folders images_2, images_4 etc. are read if they exist. auto:
+    the smallest with which no photo has more pixels than a screen, 1920 x 1080."""
     test_every: Annotated[int, within(least=0)] = 8
     """Every n-th photo by name is held out (0: none). Ignored if the dataset has its own split."""
     background: Background = "black"
@@ -220,8 +224,7 @@ class McmcConfig:
     start: Annotated[int, within(least=0)] = 500
     """First iteration after which Gaussians are relocated or added; earlier in short runs."""
     stop_fraction: Fraction = 0.83
-    """Fraction of the iterations after which Gaussians are no longer relocated or added (gsplat: 25 000 of 30
-    000)."""
+    """Fraction of the iterations after which Gaussians are no longer relocated or added (gsplat: five sixths)."""
     every: Count = 100
     """Iterations between two rounds; fewer with --size auto in runs shorter than 3000, in proportion."""
     growth: NonNegative = 0.05
@@ -236,8 +239,7 @@ class McmcConfig:
     opacity_penalty: NonNegative = 0.01
     """Weight of the mean opacity in the loss."""
     scale_penalty: NonNegative = 0.045
-    """Weight of the mean scale, in extents of the scene, in the loss (original: 0.01 in world units, at an extent of
-    4.5)."""
+    """Weight of the mean scale, in extents of the scene, in the loss (original: 0.01 per world unit; extent 4.5)."""
 
 
 @dataclass(frozen=True)
@@ -276,8 +278,7 @@ class FewViewsConfig:
     below: Annotated[int, within(least=0)] = 17
     """Number of training photos below which the settings for few photos apply (0: never)."""
     dropout: PartialFraction = 0.2
-    """Fraction of the splats left out of each image at the end of the training (DropGaussian); half of it with more
-    photos, up to 23."""
+    """Fraction of the splats left out of each image at the end (DropGaussian); half of it with up to 23 photos."""
     growth: Positive = 8.0
     """Largest number of Gaussians, as a multiple of the number of the scene's points. Photos of fewer pixels than
     this lower it to their number, at most by half; photos of more than 90 000 pixels may raise it."""
@@ -345,6 +346,5 @@ class TrainConfig:
     render: Annotated[RenderConfig, tyro.conf.arg(name="")] = field(default_factory=RenderConfig)
 
     def shortened(self, interval: int) -> int:
-        """Shorten an interval of iterations in proportion in a run of fewer than `SHORT_RUN` iterations; at least
-        1."""
+        """Shorten an interval of iterations in proportion in a run of fewer than `SHORT_RUN`; at least 1."""
         return max(1, round(interval * min(1.0, self.iterations / SHORT_RUN)))

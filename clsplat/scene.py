@@ -193,6 +193,8 @@ class Scene:
     offset : (3,) float64
         Offset that was subtracted from the world's coordinates, in world units; zero unless the cameras are far from
         the origin, as in geo-referenced scenes.
+    downscale : int
+        Factor by which the edges of the photos were divided.
     """
 
     train: list[View]
@@ -200,6 +202,7 @@ class Scene:
     points: NDArray[np.float64]
     colors: NDArray[np.uint8]
     offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    downscale: int = 1
 
     @property
     def extent(self) -> float:

@@ -92,6 +92,20 @@ def test_a_panorama_becomes_six_pinhole_views(tmp_path, downscale):
         assert error.max() < 1.5 + 2 * 960 / 8 / 41**2 * (1 if downscale == 1 else 4), view.name
 
 
+@pytest.mark.parametrize("model", ["colmap", "transforms"])
+def test_faces_have_at_most_as_many_pixels_as_a_screen(tmp_path, monkeypatch, model):
+    """A panorama, 256 x 128 px, has faces of 81.5 x 81.5 px."""
+    write_dataset(tmp_path, 1)
+    if model == "colmap":
+        (tmp_path / "transforms.json").unlink()
+        (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 256 128 256 128\n")
+        (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 0.png\n\n")
+        (tmp_path / "points3D.txt").write_text("")
+    for screen, expected in ((81.5**2, 1), (81.4**2, 2)):
+        monkeypatch.setattr(f"clsplat.dataset.{model}.SCREEN", screen)
+        assert load_scene(tmp_path, DataConfig(test_every=0)).downscale == expected
+
+
 def test_masks_become_faces_too(tmp_path):
     """One of them is black, and left out without a warning."""
     write_dataset(tmp_path, 1, masks=True)

@@ -1,11 +1,11 @@
 """Settings that commands share: parts of configurations that have an effect on a command, and those of the viewer."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from clsplat.config import DataConfig, Mode, RenderConfig, SfmConfig
+from clsplat.config import DataConfig, Downscale, Mode, RenderConfig, SfmConfig
 from clsplat.ranges import within
 
 COORDINATE_MAX = 1e18
@@ -40,7 +40,7 @@ class ViewOptions(CameraOptions):
 class PageOptions(ViewOptions):
     """Settings of a web page, which has no photos."""
 
-    downscale: tyro.conf.Fixed[Literal[1, 2, 4, 8]] = 1
+    downscale: tyro.conf.Fixed[Downscale] = "auto"
 
 
 @dataclass(frozen=True)

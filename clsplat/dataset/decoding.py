@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config import BACKGROUNDS, DataConfig
+from clsplat.config import BACKGROUNDS, MOST_DOWNSCALE, DataConfig
 from clsplat.dataset.lenses import Intrinsics, is_pinhole, rendered
 from clsplat.dataset.photos import is_transparent, orientation, photo_size, read_mask, read_photo
 from clsplat.dataset.undistortion import lens_positions, resampled, squares_of
@@ -28,8 +28,8 @@ in proportion to it."""
 CHANNELS = 3
 """Bytes of a pixel of a decoded image."""
 
-DOWNSCALES = (2, 4, 8)
-"""Values of ``--downscale`` that make photos smaller."""
+DOWNSCALES = (2, 4, 8, MOST_DOWNSCALE)
+"""Values of ``--downscale`` that messages recommend."""
 
 ASPECT_TOLERANCE = 0.01
 """Largest relative difference between the aspect ratios of a photo and its camera. The size of a smaller copy may
@@ -96,6 +96,8 @@ class Dataset:
         RGB of the points.
     reduce : int
         Edge, in pixels, of the squares that are averaged to one pixel; 1 if the files have the requested size.
+    downscale : int
+        Factor by which the photos are smaller than at their full size: `reduce`, or that of the smaller copies.
     upright : bool
         Whether the cameras describe the photos turned by their EXIF orientation, rather than as stored.
     """
@@ -104,6 +106,7 @@ class Dataset:
     points: NDArray[np.float64]
     colors: NDArray[np.uint8]
     reduce: int = 1
+    downscale: int = 1
     upright: bool = False
 
 
@@ -147,7 +150,7 @@ def load_views(dataset: Dataset, config: DataConfig, memory: int | None = None) 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         plans = list(pool.map(lambda photo: plan_view(photo, dataset, config.invert_masks), dataset.photos))
         sizes = list(pool.map(lambda plan: _decoded(plan, config), plans))
-        _check_memory(plans, sizes, config)
+        _check_memory(plans, sizes, dataset.downscale)
         budget = photo_budget(memory)
         if budget is not None and sum(sizes) > budget:
             return _stream(plans, dataset.reduce, config, budget).views()
@@ -155,15 +158,14 @@ def load_views(dataset: Dataset, config: DataConfig, memory: int | None = None) 
         return list(tqdm(views, "photos", len(plans), unit="photo", dynamic_ncols=True, leave=False))
 
 
-def _check_memory(plans: list[Plan], sizes: list[int], config: DataConfig) -> None:
+def _check_memory(plans: list[Plan], sizes: list[int], downscale: int) -> None:
     """Raise an InputError if a file and what is decoded of it do not fit the machine."""
     files = [CHANNELS * plan.size[0] * plan.size[1] for plan in plans]
     k = max(range(len(plans)), key=lambda k: files[k] + sizes[k])
     available = physical_memory()
     if available is None or files[k] + sizes[k] <= available:
         return
-    fitting = [d for d in DOWNSCALES if d > config.downscale]
-    fitting = [d for d in fitting if files[k] + sizes[k] * (config.downscale / d) ** 2 <= available]
+    fitting = [d for d in DOWNSCALES if d > downscale and files[k] + sizes[k] * (downscale / d) ** 2 <= available]
     remedy = f"--downscale {fitting[0]}" if fitting else "use smaller photos"
     raise InputError(
         f"{plans[k].photo.path}: expected photos that fit this machine's memory of {available / 1e9:.2f} GB, found "

@@ -2,11 +2,20 @@
 
 import warnings
 from collections.abc import Sequence
+from math import ceil, pi, sqrt
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any
+from typing import Any, Literal
 
-from clsplat.dataset.photos import SUFFIXES
+from clsplat.config import MOST_DOWNSCALE
+from clsplat.dataset.photos import SUFFIXES, photo_size
 from clsplat.errors import InputError
+
+SCREEN = 1920 * 1080
+"""Most pixels of a photo with ``--downscale auto``: those of a screen. The time of a step is in proportion to them.
+The code of Kerbl et al. 2023 reduces photos to a width of 1600, for the same reason."""
+
+PANORAMA = pi**2 / 2
+"""Pixels of a panorama for each pixel of a face of its cube: a face is a panorama's width over pi wide."""
 
 
 class PhotosMissing(InputError):
@@ -34,7 +43,9 @@ def without_suffix(name: str) -> str:
     return name.removesuffix(suffix) if suffix.lower() in SUFFIXES else name
 
 
-def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path | None], int]:
+def locate(
+    root: Path, names: Sequence[str], downscale: int | Literal["auto"], most: float = SCREEN
+) -> tuple[list[Path | None], int, int]:
     """Locate the files of photos, in the requested size if the dataset has it.
 
     Parameters
@@ -43,9 +54,11 @@ def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path 
         Folder of the dataset.
     names : sequence of str
         Paths inside `root`, checked by `checked_name`. The suffix may be missing or differ from the file's.
-    downscale : int
-        Requested reduction: 1, 2, 4 or 8. For 2, ``images_2/a.jpg`` is preferred to ``images/a.jpg``, unless it
-        exists for fewer photos; 4 and 8 likewise.
+    downscale : int or "auto"
+        Requested reduction. For 2, ``images_2/a.jpg`` is preferred to ``images/a.jpg``, unless it exists for fewer
+        photos; others likewise. "auto": the smallest with which no photo has more than `most` pixels, or that of the
+        largest copies if there are only copies.
+    most : float
 
     Returns
     -------
@@ -53,19 +66,26 @@ def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path 
         One entry per name; None if it has no file. At least one is not None.
     reduce : int
         Factor by which the files are still to be reduced: 1 if they already have the requested size.
+    downscale : int
+        The reduction.
 
     Raises
     ------
     PhotosMissing
         If no photo is found; the message names the smaller sizes that exist.
+    InputError
+        If the size of a photo cannot be read, where "auto" needs it; the message names it.
     """
     full = [_find(root, name) for name in names]
     found = sum(file is not None for file in full)
+    copies = [] if found else [d for d in (2, 4, 8) if any(_find(root, name, d) is not None for name in names)]
+    if downscale == "auto":
+        downscale = copies[0] if copies else _fitting([file for file in full if file is not None], most)
     if downscale > 1:
         small = [_find(root, name, downscale) for name in names]
         found_small = sum(file is not None for file in small)
         if found_small >= max(found, 1):
-            return small, 1
+            return small, 1, downscale
         if found_small:
             warnings.warn(
                 f"{root}: copies {downscale} times smaller exist for only {found_small} of {found} photos; all "
@@ -73,12 +93,17 @@ def locate(root: Path, names: Sequence[str], downscale: int) -> tuple[list[Path 
                 stacklevel=2,
             )
     if found:
-        return full, downscale
-    sizes = [d for d in (2, 4, 8) if any(_find(root, name, d) is not None for name in names)]
+        return full, downscale, downscale
     raise PhotosMissing(
         f"cannot find any of the {len(names)} photos, the first of them {root / names[0]}"
-        + (f"; smaller copies exist: use downscale {' or '.join(map(str, sizes))}" if sizes else "")
+        + (f"; smaller copies exist: use downscale {' or '.join(map(str, copies))}" if copies else "")
     )
+
+
+def _fitting(files: list[Path], most: float) -> int:
+    """The smallest reduction with which no photo has more than `most` pixels; 1 of no photos."""
+    largest = max((width * height for width, height in map(photo_size, files)), default=0)
+    return min(MOST_DOWNSCALE, max(1, ceil(sqrt(largest / most))))
 
 
 def warn_of_missing(source: Path, names: Sequence[str], files: Sequence[Path | None]) -> None:

@@ -100,7 +100,8 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
         for before, view in pairwise(part):  # sorted by name
             if before.name == view.name:
                 raise InputError(f"{path}: expected a camera for each photo, found several for {view.name}")
-    return with_near_planes(_near_origin(Scene(train, test, dataset.points, dataset.colors)))
+    scene = Scene(train, test, dataset.points, dataset.colors, downscale=dataset.downscale)
+    return with_near_planes(_near_origin(scene))
 
 
 def load_scene_with_points(path: str | Path, config: DataConfig) -> Scene:
@@ -332,4 +333,5 @@ def _near_origin(scene: Scene) -> Scene:
     def moved(part: list[View]) -> list[View]:
         return [view.with_camera(view.camera.translated(centre)) for view in part]
 
-    return Scene(moved(scene.train), moved(scene.test), scene.points - centre, scene.colors, centre)
+    train, test = moved(scene.train), moved(scene.test)
+    return replace(scene, train=train, test=test, points=scene.points - centre, offset=centre)

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from clsplat.config import DataConfig
 from clsplat.dataset.decoding import SIZE_MAX, Dataset, PosedPhoto
 from clsplat.dataset.finding import (
+    PANORAMA,
+    SCREEN,
     checked_name,
     find_mask,
     locate,
@@ -97,7 +99,8 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
         for frame, part in (_split(meta, path) if held_out is None else [(f, held_out) for f in meta["frames"]])
     ]
     names = [checked_name(frame["file_path"], path) for frame, path, _ in frames]
-    files, reduce = locate(root, names, config.downscale)
+    most = SCREEN * (PANORAMA if any(frame.get("camera_model") == "EQUIRECTANGULAR" for frame, _, _ in frames) else 1)
+    files, reduce, downscale = locate(root, names, config.downscale, most)
     warn_of_missing(metas[0][0], names, files)
     masks = None if config.masks is None else mask_folder(root, config.masks)
     photos = []
@@ -106,7 +109,7 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
             continue
         if without_suffix(name) == name and not name.endswith(file.suffix):
             name += file.suffix
-        intrinsics = _intrinsics(frame, f"{path}, frame {name}", file, config.downscale // reduce)
+        intrinsics = _intrinsics(frame, f"{path}, frame {name}", file, downscale // reduce)
         if masks is not None:
             inside = name if (masks / "images").is_dir() else name.removeprefix("images/")
             mask: Path | None = find_mask(masks, inside)
@@ -114,7 +117,7 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
             mask = root / checked_name(frame["mask_path"], path) if "mask_path" in frame else None
         photos.append(PosedPhoto(name, file, _viewmat(frame, path, name), intrinsics, mask, held_out))
     points, colors = _read_points(root, metas[0][2], metas[0][0])
-    return Dataset(photos, points, colors, reduce)
+    return Dataset(photos, points, colors, reduce, downscale)
 
 
 def _read_json(path: Path) -> Json:

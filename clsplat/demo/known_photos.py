@@ -161,7 +161,8 @@ def known_scene(count: int = 24, width: int = 160, height: int = 120, points: in
     train = [view for k, view in enumerate(views) if k % 8]
     each = np.diff(np.arange(len(train) + 1) * points // len(train))
     parts = [_points(view, n, [seed, k], solids) for k, (view, n) in enumerate(zip(train, each, strict=True))]
-    return Scene(train, views[::8], *(np.concatenate(part) for part in zip(*parts, strict=True)))
+    places, colors = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Scene(train, views[::8], places, colors)
 
 
 def _points(view: View, count: int, seed: list[int], solids: list[Solid]) -> tuple[Array, Array]:

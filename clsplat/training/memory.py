@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clsplat.config import TrainConfig
+from clsplat.config import MOST_DOWNSCALE, TrainConfig
 from clsplat.constants import GPU_TILE, SEGMENT
 from clsplat.errors import InputError
 from clsplat.scene import Scene, View
@@ -157,8 +157,8 @@ class Footprint:
         """The largest number of Gaussians that are drawn, and do not train, within `limit` bytes; 0 where none is."""
         return max(0, int((limit - self.fixed) / replace(self, backdrop=1).still()))
 
-    def check(self, start: int, limit: int) -> None:
-        """Check that `start` Gaussians fit `limit` bytes.
+    def check(self, start: int, limit: int, downscale: int = 1) -> None:
+        """Check that `start` Gaussians fit `limit` bytes, with photos that are already `downscale` times smaller.
 
         Raises
         ------
@@ -166,12 +166,14 @@ class Footprint:
             If they do not; the message names what does.
         """
         if self.total(start) > limit:
-            smaller = {d: replace(self, width=self.width // d, height=self.height // d) for d in (2, 4, 8)}
-            fitting = [f" with all of them: --downscale {d}" for d, f in smaller.items() if f.total(start) <= limit]
+            factors = [d for d in (2, 4, 8) if d * downscale <= MOST_DOWNSCALE]
+            smaller = {d: replace(self, width=self.width // d, height=self.height // d) for d in factors}
+            fitting = [d * downscale for d, footprint in smaller.items() if footprint.total(start) <= limit]
+            remedy = f" with all of them: --downscale {fitting[0]}" if fitting else ""
             raise InputError(
                 f"--memory-limit: expected at least {bytes_text(self.total(start))} for {start} Gaussians at "
                 f"{self.width}x{self.height}, found {bytes_text(limit)}; what fits at this size: "
-                f"{self.most_gaussians(limit)} Gaussians{''.join(fitting[:1])}"
+                f"{self.most_gaussians(limit)} Gaussians{remedy}"
             )
 
     def describe(self, start: int, cap: int | None, limit: int) -> str:

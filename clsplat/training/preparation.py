@@ -77,6 +77,10 @@ def prepare(
         scene = load_scene(path, config.data, verbose, photo_memory(config))
     scene = with_near_planes(scene)
     tell(f"scene: {len(scene.train)} photos to train on, {len(scene.test)} held out, {len(scene.points)} points")
+    if config.data.downscale == "auto" and scene.downscale > 1:
+        camera = scene.train[0].camera
+        size = f"{camera.width}x{camera.height}"
+        tell(f"photos: {size} pixels, reduced by {scene.downscale} (--downscale chooses another size)")
     if config.init.triangulate and not len(scene.points):
         scene = with_points(scene, path, config.data, verbose)
         found = f"{len(scene.points)} points, from photos and poses" if len(scene.points) else "random"
@@ -124,7 +128,7 @@ def check_memory(scene: Scene, config: TrainConfig, device: "Device", tell: Call
     need, start = Footprint.of(scene, config, device), start_count(scene, start_config(config), config.max_gaussians)
     if config.blocks != 1:
         start = min(start, max(1, need.most_gaussians(limit)))
-    need.check(start, limit)
+    need.check(start, limit, scene.downscale)
     tell(need.describe(start, config.max_gaussians, limit))
 
 

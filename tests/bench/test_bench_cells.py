@@ -30,7 +30,7 @@ class TestCells:
         ("text", "expected"),
         [
             ("a:downscal=2", "downscal: expected one of background"),
-            ("a:downscale=3", "downscale: expected 1, 2, 4, 8"),
+            ("a:downscale=17", "downscale: expected an integer or 'auto', 1 to 16"),
             ("a:thinn=3", "variants: thin, arc, points.*thinn: expected one of"),
             ("a:thin=0.5", "thin: expected"),
             ("a:thin=0", "thin: expected an integer, 1 or more, found 0"),
@@ -71,7 +71,7 @@ class TestCells:
         assert found == expected
         assert len(cells) == len(expected)
         assert [c.source.name for c in cells] == sorted(c.source.name for c in cells), "photos are read once"
-        assert all(c.config.data.downscale == (2 if c.source.name != "b" else 1) for c in cells)
+        assert all(c.config.data.downscale == (2 if c.source.name != "b" else "auto") for c in cells)
 
     def test_all_trainings_of_a_seed_come_first(self):
         cells = make_cells(["a", "b"], ["mcmc", "paper-7k"], ["own"], [], seeds=[5, 3])

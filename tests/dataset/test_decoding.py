@@ -28,7 +28,7 @@ def posed(path, intrinsics=PINHOLE, viewmat=None, mask=None):
 
 
 def load(*photos, reduce=1, upright=False, **options):
-    dataset = Dataset(list(photos), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), reduce, upright)
+    dataset = Dataset(list(photos), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), reduce, reduce, upright)
     return load_views(dataset, DataConfig(**options))
 
 
@@ -64,21 +64,44 @@ def touch(root, *names):
 def test_the_size_asked_for_is_preferred(tmp_path):
     touch(tmp_path, "images/a.jpg", "images/s/b.jpg", "images_4/a.png", "images_4/s/b.png")
     names = ["images/a.jpg", "images/s/b.jpg"]
-    assert locate(tmp_path, names, 1) == ([tmp_path / name for name in names], 1)
-    assert locate(tmp_path, names, 2) == ([tmp_path / name for name in names], 2)
-    assert locate(tmp_path, names, 4) == ([tmp_path / "images_4/a.png", tmp_path / "images_4/s/b.png"], 1)
+    assert locate(tmp_path, names, 1) == ([tmp_path / name for name in names], 1, 1)
+    assert locate(tmp_path, names, 2) == ([tmp_path / name for name in names], 2, 2)
+    assert locate(tmp_path, names, 4) == ([tmp_path / "images_4/a.png", tmp_path / "images_4/s/b.png"], 1, 4)
+
+
+@pytest.mark.parametrize(
+    ("most", "expected"), [(3072, 1), (3071, 2), (768, 2), (767, 3), (342, 3), (341, 4), (13, 16), (1, 16)]
+)
+def test_the_largest_photo_fits_a_screen(tmp_path, most, expected):
+    """Of two photos with 3072 and 768 pixels."""
+    save(tmp_path / "a.png", noise(64, 48))
+    save(tmp_path / "b.png", noise(24, 32))
+    assert locate(tmp_path, ["b.png", "a.png", "c.png"], "auto", most)[1:] == (expected, expected)
+
+
+def test_smaller_copies_are_read_where_photos_exceed_a_screen(tmp_path):
+    save(tmp_path / "images/a.png", noise(64, 48))
+    save(tmp_path / "images_3/a.png", noise(21, 16))
+    assert locate(tmp_path, ["images/a.png"], "auto", 341.4) == ([tmp_path / "images_3/a.png"], 1, 3)
+    with pytest.raises(PhotosMissing, match=r"b\.png"):
+        locate(tmp_path, ["images/b.png"], "auto")
+
+
+def test_the_largest_copies_are_read_where_there_are_only_copies(tmp_path):
+    touch(tmp_path, "images_8/a.jpg", "images_4/a.jpg")
+    assert locate(tmp_path, ["images/a.jpg"], "auto") == ([tmp_path / "images_4/a.jpg"], 1, 4)
 
 
 def test_a_size_that_exists_for_some_photos_only_is_not_mixed_in(tmp_path):
     touch(tmp_path, "images/a.jpg", "images/b.jpg", "images_2/a.jpg")
     with pytest.warns(UserWarning, match="1 of 2"):
-        files, reduce = locate(tmp_path, ["images/a.jpg", "images/b.jpg"], 2)
+        files, reduce, _ = locate(tmp_path, ["images/a.jpg", "images/b.jpg"], 2)
     assert reduce == 2 and files == [tmp_path / "images/a.jpg", tmp_path / "images/b.jpg"]
 
 
 def test_photos_in_the_datasets_own_folder_have_no_smaller_copies(tmp_path):
     touch(tmp_path, "a.jpg")
-    assert locate(tmp_path, ["a.jpg"], 2) == ([tmp_path / "a.jpg"], 2)
+    assert locate(tmp_path, ["a.jpg"], 2) == ([tmp_path / "a.jpg"], 2, 2)
 
 
 def test_absent_photos_are_none_and_all_absent_is_an_error(tmp_path):
@@ -230,7 +253,7 @@ def test_masks_and_transparency_count_among_the_bytes_of_photos(tmp_path):
 
 @pytest.mark.parametrize(
     ("downscale", "available", "remedy"),
-    [(1, 10_800, "--downscale 4"), (2, 10_800, "--downscale 4"), (2, 9_500, "--downscale 8"), (8, 0, "use smaller")],
+    [(1, 10_800, "--downscale 4"), (3, 9_900, "--downscale 4"), (2, 9_500, "--downscale 8"), (16, 0, "use smaller")],
 )
 def test_photos_that_do_not_fit_the_memory_are_named_with_a_remedy(
     tmp_path, monkeypatch, downscale, available, remedy
@@ -242,7 +265,7 @@ def test_photos_that_do_not_fit_the_memory_are_named_with_a_remedy(
     )
     large = posed(save(tmp_path / "large.png", noise()))
     with pytest.raises(InputError, match=rf"large\.png: expected photos that fit .*; {remedy}"):
-        load(small, large, reduce=downscale, downscale=downscale)
+        load(small, large, reduce=downscale)
 
 
 # ---- masks

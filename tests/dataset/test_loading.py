@@ -89,6 +89,23 @@ def test_scenes_far_from_the_origin_are_moved_to_it(tmp_path, centre):
     assert far.extent == pytest.approx(near.extent)
 
 
+@pytest.mark.parametrize(("screen", "expected"), [(192, (16, 12, 1)), (191, (8, 6, 2)), (47, (5, 4, 3))])
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_photos_with_more_pixels_than_a_screen_are_reduced(tmp_path, monkeypatch, kind, screen, expected):
+    """Photos of 16x12 pixels, and cameras far from the origin, which is moved."""
+    monkeypatch.setattr(f"clsplat.dataset.{kind}.SCREEN", screen)
+    if kind == "colmap":
+        write_colmap(tmp_path, centre=(500_000.0, 0.0, 0.0))
+    else:
+        write_transforms(tmp_path, ["a.png", "b.png"])
+    scene = load_scene(tmp_path, DataConfig())
+    camera = scene.train[0].camera
+    assert (camera.width, camera.height, scene.downscale) == expected
+    assert camera.fx == pytest.approx(20 / expected[2])
+    full = load_scene(tmp_path, DataConfig(downscale=1))
+    assert full.train[0].camera.width == 16 and full.downscale == 1
+
+
 def test_scenes_near_the_origin_stay(tmp_path):
     write_colmap(tmp_path, centre=(3000.0, 0.0, 0.0))  # extent 4.4: less than 1000 extents
     scene = load_scene(tmp_path, DataConfig())
@@ -98,7 +115,7 @@ def test_scenes_near_the_origin_stay(tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"downscale": 3}, "downscale"), ({"test_every": -1}, "--test-every"), ({"masks": "m"}, "masks")],
+    [({"downscale": 17}, "downscale"), ({"test_every": -1}, "--test-every"), ({"masks": "m"}, "masks")],
 )
 def test_bad_options_are_refused(tmp_path, change, message):
     write_colmap(tmp_path)

@@ -95,8 +95,10 @@ def test_smaller_copies_keep_the_declared_intrinsics(tmp_path):
     write(tmp_path, fl_x=50, cx=33, cy=25, w=64, h=48)
     camera = load_scene(tmp_path, DataConfig(downscale=2)).train[0].camera
     assert (camera.fx, camera.cx, camera.cy, camera.width, camera.height) == (25, 16.5, 12.5, 32, 24)
+    found = load_scene(tmp_path, DataConfig()).train[0].camera
+    assert (found.fx, found.width, found.height) == (25, 32, 24)
     with pytest.raises(InputError, match="downscale 2"):
-        load_scene(tmp_path, DataConfig())
+        load_scene(tmp_path, DataConfig(downscale=1))
 
 
 @pytest.mark.parametrize("fields", [{"fl_x": 50}, {"camera_angle_x": 2 * np.arctan(32 / 50)}])

@@ -55,6 +55,23 @@ def test_poses_without_points(posed: list[View], tmp_path: Path) -> None:
     assert len(scene.points) == POINTS_TARGET and f"start: {POINTS_TARGET} points, from photos and poses" in told[1]
 
 
+def test_photos_that_are_reduced_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_dataset(tmp_path / "data", 8)
+    config = TrainConfig(iterations=5, init=InitConfig(random_points=300))
+    told: list[str] = []
+    width = prepare(tmp_path / "data", config, tell=told.append)[0].train[0].camera.width
+    assert not any("reduced" in line for line in told)
+    monkeypatch.setattr("clsplat.dataset.transforms.SCREEN", 320)
+    scene, _ = prepare(tmp_path / "data", config, tell=told.append)
+    camera = scene.train[0].camera
+    assert camera.width * scene.downscale == width
+    size = f"{camera.width}x{camera.height}"
+    assert f"photos: {size} pixels, reduced by 2 (--downscale chooses another size)" in told
+    told.clear()
+    prepare(tmp_path / "data", replace(config, data=DataConfig(downscale=2)), tell=told.append)
+    assert not any("reduced" in line for line in told), "it was asked for"
+
+
 @pytest.mark.parametrize("below", [17, 3])
 def test_the_points_of_few_photos_limit_the_gaussians(below: int, posed: list[View], tmp_path: Path) -> None:
     """The size is not searched with as few photos, whether or not the settings for fewer still apply."""
