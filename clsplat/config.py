@@ -85,8 +85,8 @@ class DataConfig:
     """Settings of loading a dataset."""
 
     downscale: Downscale = "auto"
-    """Factor by which the photos' edges are divided; folders images_2, images_4 etc. are read if they exist. auto:
-    the smallest with which no photo has more pixels than a screen, 1920 x 1080."""
+    """Divisor of the photos' edges (images_2 etc. are read if they exist). auto: the smallest for at most 1920 x 1080
+    pixels."""
     test_every: Annotated[int, within(least=0)] = 8
     """Every n-th photo by name is held out (0: none). Ignored if the dataset has its own split."""
     background: Background = "black"

@@ -152,7 +152,7 @@ def dataset_lines(path: Path) -> list[str]:
     source = sfm.recorded_photos(path, record) if record else path
     photos = [photo_folder(source) / name for name in list_photos(source)]
     try:
-        what, dataset = detect(path, DataConfig())
+        what, dataset = detect(path, DataConfig(downscale=1))
     except PhotosMissing:
         if model is None:
             raise
