@@ -239,7 +239,7 @@ class McmcConfig:
     opacity_penalty: NonNegative = 0.01
     """Weight of the mean opacity in the loss."""
     scale_penalty: NonNegative = 0.045
-    """Weight of the mean scale, in extents of the scene, in the loss (original: 0.01 per world unit; extent 4.5)."""
+    """Weight of the mean scale, in extents of the scene, in the loss (original: 0.01 in world units, extent 4.5)."""
 
 
 @dataclass(frozen=True)
@@ -278,7 +278,7 @@ class FewViewsConfig:
     below: Annotated[int, within(least=0)] = 17
     """Number of training photos below which the settings for few photos apply (0: never)."""
     dropout: PartialFraction = 0.2
-    """Fraction of the splats left out of each image at the end (DropGaussian); half of it with up to 23 photos."""
+    """Fraction of splats left out of each image at the end (DropGaussian); half of it with more photos, up to 23."""
     growth: Positive = 8.0
     """Largest number of Gaussians, as a multiple of the number of the scene's points. Photos of fewer pixels than
     this lower it to their number, at most by half; photos of more than 90 000 pixels may raise it."""

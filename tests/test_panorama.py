@@ -102,7 +102,7 @@ def test_faces_have_at_most_as_many_pixels_as_a_screen(tmp_path, monkeypatch, mo
         (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 0.png\n\n")
         (tmp_path / "points3D.txt").write_text("")
     for screen, expected in ((81.5**2, 1), (81.4**2, 2)):
-        monkeypatch.setattr(f"clsplat.dataset.{model}.SCREEN", screen)
+        monkeypatch.setattr("clsplat.dataset.finding.SCREEN", screen)
         assert load_scene(tmp_path, DataConfig(test_every=0)).downscale == expected
 
 

@@ -11,16 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.config import DataConfig
 from clsplat.dataset.decoding import SIZE_MAX, Dataset, PosedPhoto
-from clsplat.dataset.finding import (
-    PANORAMA,
-    SCREEN,
-    PhotosMissing,
-    checked_name,
-    find_mask,
-    locate,
-    mask_folder,
-    warn_of_missing,
-)
+from clsplat.dataset.finding import PhotosMissing, checked_name, find_mask, locate, mask_folder, warn_of_missing
 from clsplat.dataset.lenses import Intrinsics
 from clsplat.errors import InputError
 
@@ -94,12 +85,12 @@ def read_dataset(root: Path, model: Path, config: DataConfig, photos: Path | Non
     cameras, images, points, colors = read_model(model)
     names = [name for name, _, _ in images]
     folder = root if photos is None else photos
-    most = SCREEN * (PANORAMA if any(camera.model == "EQUIRECTANGULAR" for camera in cameras.values()) else 1)
+    panoramas = any(camera.model == "EQUIRECTANGULAR" for camera in cameras.values())
     try:
-        files, reduce, downscale = locate(folder, [f"images/{name}" for name in names], config.downscale, most)
+        files, reduce, downscale = locate(folder, [f"images/{name}" for name in names], config.downscale, panoramas)
     except PhotosMissing as error:
         try:
-            files, reduce, downscale = locate(folder, names, config.downscale, most)
+            files, reduce, downscale = locate(folder, names, config.downscale, panoramas)
         except PhotosMissing:
             raise error from None
     warn_of_missing(model, names, files)

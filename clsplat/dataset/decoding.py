@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config import BACKGROUNDS, MOST_DOWNSCALE, DataConfig
+from clsplat.config import BACKGROUNDS, DataConfig
+from clsplat.dataset.finding import DOWNSCALES
 from clsplat.dataset.lenses import Intrinsics, is_pinhole, rendered
 from clsplat.dataset.photos import is_transparent, orientation, photo_size, read_mask, read_photo
 from clsplat.dataset.undistortion import lens_positions, resampled, squares_of
@@ -27,9 +28,6 @@ in proportion to it."""
 
 CHANNELS = 3
 """Bytes of a pixel of a decoded image."""
-
-DOWNSCALES = (2, 4, 8, MOST_DOWNSCALE)
-"""Values of ``--downscale`` that messages recommend."""
 
 ASPECT_TOLERANCE = 0.01
 """Largest relative difference between the aspect ratios of a photo and its camera. The size of a smaller copy may

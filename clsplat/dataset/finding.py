@@ -17,6 +17,9 @@ The code of Kerbl et al. 2023 reduces photos to a width of 1600, for the same re
 PANORAMA = pi**2 / 2
 """Pixels of a panorama for each pixel of a face of its cube: a face is a panorama's width over pi wide."""
 
+DOWNSCALES = (2, 4, 8, MOST_DOWNSCALE)
+"""Values of ``--downscale`` that messages recommend."""
+
 
 class PhotosMissing(InputError):
     """No photo of a dataset was found."""
@@ -44,7 +47,7 @@ def without_suffix(name: str) -> str:
 
 
 def locate(
-    root: Path, names: Sequence[str], downscale: int | Literal["auto"], most: float = SCREEN
+    root: Path, names: Sequence[str], downscale: int | Literal["auto"], panoramas: bool = False
 ) -> tuple[list[Path | None], int, int]:
     """Locate the files of photos, in the requested size if the dataset has it.
 
@@ -56,9 +59,10 @@ def locate(
         Paths inside `root`, checked by `checked_name`. The suffix may be missing or differ from the file's.
     downscale : int or "auto"
         Requested reduction. For 2, ``images_2/a.jpg`` is preferred to ``images/a.jpg``, unless it exists for fewer
-        photos; others likewise. "auto": the smallest with which no photo has more than `most` pixels, or that of the
-        largest copies if there are only copies.
-    most : float
+        photos; others likewise. "auto": the smallest with which no photo has more than `SCREEN` pixels, or that of
+        the largest copies if there are only copies.
+    panoramas : bool
+        Whether some photos are panoramas, whose faces have at most `SCREEN` pixels.
 
     Returns
     -------
@@ -78,9 +82,9 @@ def locate(
     """
     full = [_find(root, name) for name in names]
     found = sum(file is not None for file in full)
-    copies = [] if found else [d for d in (2, 4, 8) if any(_find(root, name, d) is not None for name in names)]
+    copies = [] if found else [d for d in DOWNSCALES if any(_find(root, name, d) is not None for name in names)]
     if downscale == "auto":
-        downscale = copies[0] if copies else _fitting([file for file in full if file is not None], most)
+        downscale = copies[0] if copies else _fitting([file for file in full if file is not None], panoramas)
     if downscale > 1:
         small = [_find(root, name, downscale) for name in names]
         found_small = sum(file is not None for file in small)
@@ -100,9 +104,10 @@ def locate(
     )
 
 
-def _fitting(files: list[Path], most: float) -> int:
-    """The smallest reduction with which no photo has more than `most` pixels; 1 of no photos."""
+def _fitting(files: list[Path], panoramas: bool) -> int:
+    """The smallest reduction with which no photo, or no face of a panorama, exceeds a screen; 1 of no photos."""
     largest = max((width * height for width, height in map(photo_size, files)), default=0)
+    most = SCREEN * (PANORAMA if panoramas else 1)
     return min(MOST_DOWNSCALE, max(1, ceil(sqrt(largest / most))))
 
 

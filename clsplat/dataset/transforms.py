@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from clsplat.config import DataConfig
 from clsplat.dataset.decoding import SIZE_MAX, Dataset, PosedPhoto
 from clsplat.dataset.finding import (
-    PANORAMA,
-    SCREEN,
     checked_name,
     find_mask,
     locate,
@@ -99,8 +97,8 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
         for frame, part in (_split(meta, path) if held_out is None else [(f, held_out) for f in meta["frames"]])
     ]
     names = [checked_name(frame["file_path"], path) for frame, path, _ in frames]
-    most = SCREEN * (PANORAMA if any(frame.get("camera_model") == "EQUIRECTANGULAR" for frame, _, _ in frames) else 1)
-    files, reduce, downscale = locate(root, names, config.downscale, most)
+    panoramas = any(frame.get("camera_model") == "EQUIRECTANGULAR" for frame, _, _ in frames)
+    files, reduce, downscale = locate(root, names, config.downscale, panoramas)
     warn_of_missing(metas[0][0], names, files)
     masks = None if config.masks is None else mask_folder(root, config.masks)
     photos = []

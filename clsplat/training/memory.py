@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clsplat.config import MOST_DOWNSCALE, TrainConfig
+from clsplat.config import TrainConfig
 from clsplat.constants import GPU_TILE, SEGMENT
+from clsplat.dataset.finding import DOWNSCALES
 from clsplat.errors import InputError
 from clsplat.scene import Scene, View
 
@@ -166,9 +167,9 @@ class Footprint:
             If they do not; the message names what does.
         """
         if self.total(start) > limit:
-            factors = [d for d in (2, 4, 8) if d * downscale <= MOST_DOWNSCALE]
-            smaller = {d: replace(self, width=self.width // d, height=self.height // d) for d in factors}
-            fitting = [d * downscale for d, footprint in smaller.items() if footprint.total(start) <= limit]
+            width, height = downscale * self.width, downscale * self.height
+            smaller = {d: replace(self, width=width // d, height=height // d) for d in DOWNSCALES if d > downscale}
+            fitting = [d for d, footprint in smaller.items() if footprint.total(start) <= limit]
             remedy = f" with all of them: --downscale {fitting[0]}" if fitting else ""
             raise InputError(
                 f"--memory-limit: expected at least {bytes_text(self.total(start))} for {start} Gaussians at "

@@ -70,19 +70,21 @@ def test_the_size_asked_for_is_preferred(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("most", "expected"), [(3072, 1), (3071, 2), (768, 2), (767, 3), (342, 3), (341, 4), (13, 16), (1, 16)]
+    ("screen", "expected"), [(3072, 1), (3071, 2), (768, 2), (767, 3), (342, 3), (341, 4), (13, 16), (1, 16)]
 )
-def test_the_largest_photo_fits_a_screen(tmp_path, most, expected):
+def test_the_largest_photo_fits_a_screen(tmp_path, monkeypatch, screen, expected):
     """Of two photos with 3072 and 768 pixels."""
     save(tmp_path / "a.png", noise(64, 48))
     save(tmp_path / "b.png", noise(24, 32))
-    assert locate(tmp_path, ["b.png", "a.png", "c.png"], "auto", most)[1:] == (expected, expected)
+    monkeypatch.setattr("clsplat.dataset.finding.SCREEN", screen)
+    assert locate(tmp_path, ["b.png", "a.png", "c.png"], "auto")[1:] == (expected, expected)
 
 
-def test_smaller_copies_are_read_where_photos_exceed_a_screen(tmp_path):
+def test_smaller_copies_are_read_where_photos_exceed_a_screen(tmp_path, monkeypatch):
     save(tmp_path / "images/a.png", noise(64, 48))
     save(tmp_path / "images_3/a.png", noise(21, 16))
-    assert locate(tmp_path, ["images/a.png"], "auto", 341.4) == ([tmp_path / "images_3/a.png"], 1, 3)
+    monkeypatch.setattr("clsplat.dataset.finding.SCREEN", 342)
+    assert locate(tmp_path, ["images/a.png"], "auto") == ([tmp_path / "images_3/a.png"], 1, 3)
     with pytest.raises(PhotosMissing, match=r"b\.png"):
         locate(tmp_path, ["images/b.png"], "auto")
 

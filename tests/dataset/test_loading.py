@@ -93,7 +93,7 @@ def test_scenes_far_from_the_origin_are_moved_to_it(tmp_path, centre):
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])
 def test_photos_with_more_pixels_than_a_screen_are_reduced(tmp_path, monkeypatch, kind, screen, expected):
     """Photos of 16x12 pixels, and cameras far from the origin, which is moved."""
-    monkeypatch.setattr(f"clsplat.dataset.{kind}.SCREEN", screen)
+    monkeypatch.setattr("clsplat.dataset.finding.SCREEN", screen)
     if kind == "colmap":
         write_colmap(tmp_path, centre=(500_000.0, 0.0, 0.0))
     else:

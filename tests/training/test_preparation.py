@@ -61,7 +61,7 @@ def test_photos_that_are_reduced_are_named(tmp_path: Path, monkeypatch: pytest.M
     told: list[str] = []
     width = prepare(tmp_path / "data", config, tell=told.append)[0].train[0].camera.width
     assert not any("reduced" in line for line in told)
-    monkeypatch.setattr("clsplat.dataset.transforms.SCREEN", 320)
+    monkeypatch.setattr("clsplat.dataset.finding.SCREEN", 320)
     scene, _ = prepare(tmp_path / "data", config, tell=told.append)
     camera = scene.train[0].camera
     assert camera.width * scene.downscale == width
