@@ -168,7 +168,7 @@ class Footprint:
         """
         if self.total(start) > limit:
             width, height = downscale * self.width, downscale * self.height
-            smaller = {d: replace(self, width=width // d, height=height // d) for d in DOWNSCALES if d > downscale}
+            smaller = {d: replace(self, width=width // d, height=height // d) for d in DOWNSCALES}
             fitting = [d for d, footprint in smaller.items() if footprint.total(start) <= limit]
             remedy = f" with all of them: --downscale {fitting[0]}" if fitting else ""
             raise InputError(

@@ -189,8 +189,9 @@ def test_a_start_that_does_not_fit_says_what_would() -> None:
     with pytest.raises(InputError, match=r"^--memory-limit: expected at least") as error:
         need.check(200_000, 400_000_000)
     assert f"{need.most_gaussians(400_000_000)} Gaussians with all of them: --downscale 2" in str(error.value)
-    with pytest.raises(InputError, match=r"with all of them: --downscale 4$"):
-        need.check(200_000, 400_000_000, 3)
+    for limit, remedy in ((400_000_000, 4), (Footprint(1200, 900, 3, False).total(200_000) - 1, 8)):
+        with pytest.raises(InputError, match=rf"with all of them: --downscale {remedy}$"):
+            need.check(200_000, limit, 3)
     for start, limit, downscale in ((10**6, 300_000_000, 1), (200_000, 400_000_000, 16)):
         with pytest.raises(InputError) as error:
             need.check(start, limit, downscale)
