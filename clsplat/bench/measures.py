@@ -15,7 +15,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, ssim
 from clsplat.render import Stored, renderings
 from clsplat.renderer import Renderer
-from clsplat.scene import Scene, View, evenly_spaced
+from clsplat.scene import Scene, View, digest, evenly_spaced
 
 FRAMES = 5
 """Number of times that each held-out view is rendered for the rate of frames."""
@@ -39,15 +39,25 @@ def sample_iterations(iterations: int) -> list[int]:
 
 
 def facts_of(scene: Scene, rare: Masks | None) -> Record:
-    """Numbers of photos, their largest size, and the fraction of held-out pixels that are rare."""
+    """Digest and numbers of the photos, their largest size, and the fraction of held-out pixels that are rare."""
     views = scene.train + scene.test
     return {
+        "photos": digest_of(scene),
         "train": len(scene.train),
         "test": len(scene.test),
         "width": max(view.camera.width for view in views),
         "height": max(view.camera.height for view in views),
         "rare": rare_share(scene.test, rare),
     }
+
+
+def digest_of(scene: Scene) -> str:
+    """Digest of the photos: their names and pixels, or the names alone if the photos stream from the disk.
+
+    It tells datasets apart whose folders have the same name.
+    """
+    parts = [[(v.name, None if v.ahead else v.digests) for v in part] for part in (scene.train, scene.test)]
+    return digest(np.frombuffer(repr(parts).encode(), np.uint8))
 
 
 def measure(

@@ -18,6 +18,7 @@ from clsplat.bench.environment import describe
 from clsplat.bench.field_cells import run_field, source_of
 from clsplat.bench.measures import (
     Masks,
+    digest_of,
     facts_of,
     frames_per_second,
     measure,
@@ -46,8 +47,8 @@ WARM_UP = 4
 def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[str], None]) -> None:
     """Run the trainings that are not finished yet. Each sample is appended to `results` when it is taken.
 
-    A cell that failed, was interrupted, or has other settings than before runs again, and its old records are
-    removed. A failure is recorded with its reason, and the next cell runs.
+    A cell that failed, was interrupted, or has other settings or photos than before runs again, and its old records
+    are removed. A failure is recorded with its reason, and the next cell runs.
 
     Parameters
     ----------
@@ -63,7 +64,8 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
     about = describe(device)
     label = about["device"]["label"]
     records = read_records(results)
-    missing = [cell for cell in cells if not _finished(cell, records, label)]
+    reader = Reader()
+    missing = [cell for cell in cells if not _finished(cell, records, label, reader)]
     stale = [cell.key(label) for cell in missing]
     write_records(results, [r for r in records if {name: r[name] for name in KEYS} not in stale])
     say(f"{len(cells) - len(missing)} of {len(cells)} trainings are already finished")
@@ -74,7 +76,6 @@ def run_cells(cells: list[Cell], device: Device, results: Path, say: Callable[[s
         "commit": about["software"]["commit"],
         "load": about["load"],
     }
-    reader = Reader()
     for number, cell in enumerate(missing, start=1):
         say(f"[{number}/{len(missing)}] {cell.label}")
 
@@ -149,9 +150,15 @@ def _reason(error: Exception, path: Path) -> str:
     return text.replace(str(path), path.name) if path.name else text  # "." has no name
 
 
-def _finished(cell: Cell, records: list[Record], device: str) -> bool:
+def _finished(cell: Cell, records: list[Record], device: str, reader: Reader) -> bool:
     wanted = cell.key(device) | {"settings": differences(cell.config)}
-    return any("fps" in r and {k: r.get(k) for k in wanted} == wanted for r in records)
+    photos = [r.get("photos") for r in records if "fps" in r and {k: r.get(k) for k in wanted} == wanted]
+    if not photos:
+        return False
+    try:
+        return digest_of(reader.read(source_of(cell))[0]) in photos
+    except ClsplatError:  # results are kept without their dataset
+        return True
 
 
 def run_cell(

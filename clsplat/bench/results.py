@@ -22,7 +22,7 @@ FIGURES = (
 )
 """Entries that are numbers, or None where they were not measured."""
 
-TEXTS = ("scene", "method", "device", "failed", "driver", "version", "date")
+TEXTS = ("scene", "method", "device", "photos", "failed", "driver", "version", "date")
 
 KINDS: dict[str, tuple[type, ...]] = {
     **{name: KNOWN for name in FIGURES},

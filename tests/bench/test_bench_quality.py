@@ -1,6 +1,7 @@
 """`clsplat bench quality`: trainings, their records, interruptions and failures."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,11 +15,11 @@ from small_fields import SmallNerf
 
 from clsplat.bench import measures, quality
 from clsplat.bench.cells import make_cells
-from clsplat.bench.measures import sample_iterations
+from clsplat.bench.measures import digest_of, sample_iterations
 from clsplat.bench.quality import run_cell, run_cells
 from clsplat.bench.quality_summary import COSTS
 from clsplat.bench.results import append_record, read_records, write_records
-from clsplat.config import UINT64_MAX, AdcConfig
+from clsplat.config import UINT64_MAX, AdcConfig, DataConfig
 from clsplat.dataset import load_scene
 from clsplat.errors import InputError
 from clsplat.fields import METHODS
@@ -168,6 +169,35 @@ class TestBench:
         again = read_records(path)
         assert len(again) == len(records)
         assert all(r["settings"]["adc"] == {"every": 7} for r in again)
+
+    def test_other_photos_replace_the_records(self, data, device, tmp_path):
+        """A folder of the same name elsewhere, or with another photo, is another dataset."""
+        path = tmp_path / "results.jsonl"
+        records, _ = self.start(data, device, path, "plain")
+        shutil.copytree(data, tmp_path / "copy")
+        copied = tmp_path / "copy"
+        assert self.start(copied, device, path, "plain")[1][0].startswith("1 of 1 ")
+        photo = copied / "one" / "3.png"
+        Image.open(photo).point(lambda value: 255 - value).save(photo)
+        again, said = self.start(copied, device, path, "plain")
+        assert said[0].startswith("0 of 1 ")
+        assert len(again) == len(records)
+        assert {r["photos"] for r in again}.isdisjoint({r["photos"] for r in records})
+
+    def test_results_are_kept_without_their_dataset(self, data, device, tmp_path):
+        path = tmp_path / "results.jsonl"
+        shutil.copytree(data, tmp_path / "copy")
+        records, _ = self.start(tmp_path / "copy", device, path, "plain")
+        shutil.rmtree(tmp_path / "copy" / "one")
+        again, said = self.start(tmp_path / "copy", device, path, "plain")
+        assert said[0].startswith("1 of 1 ") and again == records
+
+    def test_streamed_photos_keep_their_digest_once_they_are_read(self, data):
+        scene = load_scene(data / "one", DataConfig(), memory=0)
+        before = digest_of(scene)
+        assert all(view.ahead for view in scene.train)
+        assert [view.image.shape for view in scene.train] and scene.train[0].digests
+        assert digest_of(scene) == before
 
     def test_a_seed_keeps_the_records_of_the_others(self, data, device, tmp_path):
         path = tmp_path / "results.jsonl"
