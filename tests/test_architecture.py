@@ -29,7 +29,7 @@ LAYERS = """
     streaming
     buffers
     structs reference device
-    ops testing formats surface
+    ops inputs testing formats surface
     renderer field_selftest
     selftest
     render dataset demo raster_gradients fields

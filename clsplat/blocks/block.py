@@ -23,6 +23,7 @@ from clsplat.errors import ClsplatError
 from clsplat.formats import save_gaussians
 from clsplat.formats.ply import with_coefficients
 from clsplat.gaussians import Gaussians
+from clsplat.inputs import Inputs
 from clsplat.pruning.prices import without_invisible
 from clsplat.renderer import Renderer
 from clsplat.resuming import CHECKPOINT
@@ -30,7 +31,6 @@ from clsplat.run_log import LOG
 from clsplat.scene import Scene, View
 from clsplat.streaming import Files, photo_budget
 from clsplat.training.checkpoint import load_state
-from clsplat.training.inputs import Inputs
 from clsplat.training.loop import complete
 from clsplat.training.memory import Footprint
 from clsplat.training.preparation import open_device, photo_memory

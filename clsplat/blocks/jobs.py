@@ -14,9 +14,9 @@ from clsplat.blocks.plan import Block
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError, named
+from clsplat.inputs import Photo
 from clsplat.scene import DIGEST_BYTES, DepthMap, View, digest
 from clsplat.training.checkpoint import without_free
-from clsplat.training.inputs import Photo
 from clsplat.training.presets import with_settings
 
 BOXES = ("near", "box", "wide")

@@ -33,13 +33,13 @@ from clsplat.formats import save_gaussians
 from clsplat.formats.ply import save_ply_parts
 from clsplat.formats.ply_parts import PlyParts
 from clsplat.gaussians import Gaussians
+from clsplat.inputs import Photo, photos_of
 from clsplat.renderer import Renderer
 from clsplat.resuming import CHECKPOINT
 from clsplat.run_log import LOG
 from clsplat.scene import Scene, in_turn
 from clsplat.show.training_curve import read_log
 from clsplat.training.checkpoint import without_free
-from clsplat.training.inputs import Photo, photos_of
 from clsplat.training.loop import train
 
 if TYPE_CHECKING:

@@ -14,6 +14,7 @@ from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 from clsplat.fields.field import Field
 from clsplat.fields.space import Space
+from clsplat.inputs import Inputs
 from clsplat.resuming import FREE
 
 if TYPE_CHECKING:
@@ -35,9 +36,12 @@ def save_field(path: Path, field: Field) -> None:
     _write(path, arrays | {"about": np.array(json.dumps(_about(field)))})
 
 
-def save_checkpoint(path: Path, field: Field, config: TrainConfig, seconds: float, losses: list[float]) -> None:
+def save_checkpoint(
+    path: Path, field: Field, config: TrainConfig, inputs: Inputs, seconds: float, losses: list[float]
+) -> None:
     """Write everything that further training depends on, whole or not at all; `losses` are those not yet logged."""
-    about = _about(field) | {"config": _compared(config), "seconds": seconds, "losses": losses}
+    about = _about(field) | {"config": _compared(config), "inputs": asdict(inputs)}
+    about |= {"seconds": seconds, "losses": losses}
     _write(path, field.model() | field.optimiser() | {"about": np.array(json.dumps(about))})
 
 
@@ -67,19 +71,30 @@ def load_field(path: Path, methods: dict[str, type[Field]], device: "Device") ->
 
 
 def load_checkpoint(
-    path: Path, method: type[Field], config: TrainConfig, device: "Device"
+    path: Path, method: type[Field], config: TrainConfig, inputs: Inputs, device: "Device"
 ) -> tuple[Field, float, list[float]]:
     """Read what `save_checkpoint` wrote: the field, its training time in seconds, and the losses not yet logged.
 
     Raises
     ------
     InputError
-        If the file is missing or damaged, or of another method or configuration.
+        If the file is missing or damaged, or of another method, configuration or dataset.
+
+    Warns
+    -----
+    UserWarning
+        If it was made on another device.
     """
     field, about = _read(path, {method.name: method}, device)
     if about.get("config") != _compared(config):
         raise InputError(f"{path}: expected the configuration it was made with, found another one")
-    return field, float(about["seconds"]), list(about.get("losses", []))  # earlier versions had none
+    try:
+        made_from = Inputs.restored(about["inputs"])
+        seconds, losses = float(about["seconds"]), [float(loss) for loss in about["losses"]]
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected a checkpoint of clsplat, found a damaged file: {error!r}") from error
+    made_from.continued(inputs, path)
+    return field, seconds, losses
 
 
 def _read(path: Path, methods: dict[str, type[Field]], device: "Device") -> tuple[Field, dict[str, Any]]:

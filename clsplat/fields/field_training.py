@@ -15,6 +15,7 @@ from clsplat.fields.field import Field
 from clsplat.fields.field_files import MODEL, load_checkpoint, save_checkpoint, save_field
 from clsplat.fields.pixels import Pixels
 from clsplat.fields.space import Space
+from clsplat.inputs import Inputs
 from clsplat.randomness import stream
 from clsplat.resuming import CHECKPOINT
 from clsplat.run_log import LOG, LOG_EVERY, log_file
@@ -64,23 +65,29 @@ def train_field(
     Raises
     ------
     InputError
-        If `resume` finds no checkpoint, or one of another method or configuration.
+        If `resume` finds no checkpoint, or one of another method, configuration or dataset.
     DeviceError
         If the device's memory, or its limit, is exceeded.
     ClsplatError
         If the loss stops being finite.
+
+    Warns
+    -----
+    UserWarning
+        If a training resumes on another device.
     """
     config = replace(config, iterations=config.iterations or method.iterations)
+    inputs = Inputs.of(scene, device)
     seconds, losses = 0.0, list[float]()
     if resume:
-        field, seconds, losses = load_checkpoint(out / CHECKPOINT, method, config, device)
+        field, seconds, losses = load_checkpoint(out / CHECKPOINT, method, config, inputs, device)
     else:
         field = method(Space.of(scene.train), device, config.seed)
     pixels, clock = Pixels(scene.train, field.space, BACKGROUNDS[config.data.background]), _Clock(seconds)
     log = _Lines(out / LOG, field.iteration, losses)
 
     def save() -> None:
-        save_checkpoint(out / CHECKPOINT, field, config, clock.seconds, losses)
+        save_checkpoint(out / CHECKPOINT, field, config, inputs, clock.seconds, losses)
 
     while field.iteration < config.iterations:
         loss = _advance(field, pixels, config)

@@ -18,6 +18,7 @@ from clsplat.atomic import replacing
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.inputs import Inputs
 from clsplat.ranges import flags_of
 from clsplat.renderer import download, fetch
 from clsplat.resuming import FREE
@@ -25,7 +26,6 @@ from clsplat.scene import Scene
 from clsplat.training import photo_exposures, photo_poses
 from clsplat.training.autosize.rule import Candidate, Search, SmallSide
 from clsplat.training.densify import STRATEGIES
-from clsplat.training.inputs import Inputs
 from clsplat.training.optimizer import Moments
 from clsplat.training.photo_parameters import PerPhoto
 from clsplat.training.photo_poses import refined
@@ -161,7 +161,7 @@ def demand_same(saved: TrainConfig, asked: TrainConfig, source: Path) -> None:
 def without_free(config: TrainConfig) -> TrainConfig:
     """A configuration with the defaults of all settings that may differ when a run resumes.
 
-    Masks and depth maps are compared by their content (`clsplat.training.inputs`), so that they may have moved.
+    Masks and depth maps are compared by their content (`clsplat.inputs`), so that they may have moved.
     """
     default = TrainConfig()
     data = replace(config.data, masks=None, depth=None)

@@ -10,6 +10,7 @@ from clsplat.config import TrainConfig
 from clsplat.dataset.near_planes import with_near_planes
 from clsplat.errors import BuildError, DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians
+from clsplat.inputs import Inputs
 from clsplat.pruning.prices import shown_by_any, without_invisible
 from clsplat.renderer import fetch
 from clsplat.resuming import CHECKPOINT
@@ -22,7 +23,6 @@ from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import load_state, write_photos
 from clsplat.training.dense_start import first_points
 from clsplat.training.initialize import initialize
-from clsplat.training.inputs import Inputs
 from clsplat.training.preparation import check_settings, open_device
 from clsplat.training.recorder import Recorder
 from clsplat.training.run_folder import held

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from clsplat.config import InitConfig, TrainConfig
 from clsplat.gaussians import Gaussians
+from clsplat.inputs import Inputs
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
 from clsplat.training import photo_exposures, photo_poses
@@ -16,7 +17,6 @@ from clsplat.training.autosize import rule
 from clsplat.training.autosize.validation import can_validate
 from clsplat.training.densify import STRATEGIES, Strategy
 from clsplat.training.initialize import initialize
-from clsplat.training.inputs import Inputs
 from clsplat.training.optimizer import Moments, sh_degree_at
 from clsplat.training.photo_parameters import PerPhoto
 from clsplat.training.rows import Rows

@@ -22,8 +22,8 @@ from clsplat.blocks.jobs import make_job
 from clsplat.blocks.transport import Cache, Desk
 from clsplat.device import Device
 from clsplat.errors import InputError
+from clsplat.inputs import photos_of
 from clsplat.scene import DepthMap
-from clsplat.training.inputs import photos_of
 
 distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
 

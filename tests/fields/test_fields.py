@@ -18,6 +18,7 @@ from clsplat.fields.field_files import MODEL, load_checkpoint, load_field, save_
 from clsplat.fields.field_training import train_field
 from clsplat.fields.pixels import Pixels
 from clsplat.fields.space import FAR, Space
+from clsplat.inputs import Inputs
 from clsplat.metrics import psnr, to_uint8
 from clsplat.randomness import stream
 from clsplat.resuming import CHECKPOINT, FREE
@@ -119,7 +120,8 @@ def test_an_interrupt_within_a_step_leaves_the_last_checkpoint(device, scene, me
 
     with pytest.raises(KeyboardInterrupt):
         train_field(scene, method, config, tmp_path, device, evaluate=evaluate)
-    assert load_checkpoint(tmp_path / CHECKPOINT, method, config, device)[0].iteration == 5
+    inputs = Inputs.of(scene, device)
+    assert load_checkpoint(tmp_path / CHECKPOINT, method, config, inputs, device)[0].iteration == 5
     resumed = train_field(scene, method, config, tmp_path, device, resume=True)
     for name, array in whole.model().items():
         np.testing.assert_array_equal(resumed.model()[name], array)
@@ -138,11 +140,42 @@ def test_the_file_renders_what_was_trained(device, method, room, tmp_path):
 def test_another_configuration_does_not_resume(device, scene, method, tmp_path):
     config = replace(CONFIG, iterations=2)
     train_field(scene, method, config, tmp_path, device)
+    inputs = Inputs.of(scene, device)
     with pytest.raises(InputError, match="expected the configuration it was made with"):
-        load_checkpoint(tmp_path / CHECKPOINT, method, replace(config, seed=1), device)
+        load_checkpoint(tmp_path / CHECKPOINT, method, replace(config, seed=1), inputs, device)
     free = {"device": "a", "checkpoint_every": 7, "eval_every": 8, "memory_limit": "9GB"}
     assert free.keys() == set(FREE)
-    assert load_checkpoint(tmp_path / CHECKPOINT, method, replace(config, **free), device)[0].iteration == 2
+    assert load_checkpoint(tmp_path / CHECKPOINT, method, replace(config, **free), inputs, device)[0].iteration == 2
+
+
+def test_other_photos_do_not_resume(device, scene, tmp_path):
+    config = replace(CONFIG, iterations=2)
+    train_field(scene, SmallNerf, config, tmp_path, device)
+    first, *others = scene.train
+    negative = replace(scene, train=[replace(first, image=255 - first.image), *others])
+    with pytest.raises(InputError, match=rf"expected the dataset it was made with, found other pixels.*{first.name}"):
+        train_field(negative, SmallNerf, config, tmp_path, device, resume=True)
+    with pytest.raises(InputError, match="found fewer photos"):
+        train_field(replace(scene, train=others), SmallNerf, config, tmp_path, device, resume=True)
+
+
+def test_another_device_resumes_with_a_warning(device, scene, tmp_path):
+    config = replace(CONFIG, iterations=2)
+    train_field(scene, SmallNerf, config, tmp_path, device)
+    elsewhere = replace(Inputs.of(scene, device), device="another")
+    with pytest.warns(UserWarning, match="the run continues on another"):
+        load_checkpoint(tmp_path / CHECKPOINT, SmallNerf, config, elsewhere, device)
+
+
+@pytest.mark.parametrize(("name", "value"), [("inputs", {}), ("inputs", 3), ("seconds", "x"), ("losses", [None])])
+def test_damaged_facts_of_a_checkpoint_are_refused(device, scene, tmp_path, name, value):
+    path, config = tmp_path / CHECKPOINT, replace(CONFIG, iterations=2)
+    train_field(scene, SmallNerf, config, tmp_path, device)
+    arrays = dict(np.load(path))
+    about = json.loads(str(arrays["about"])) | {name: value}
+    np.savez(path, **arrays | {"about": np.array(json.dumps(about))})
+    with pytest.raises(InputError, match=f"{CHECKPOINT}: expected a checkpoint of clsplat, found a damaged file"):
+        load_checkpoint(path, SmallNerf, config, Inputs.of(scene, device), device)
 
 
 def test_rays_without_samples_see_the_background(device, scene, monkeypatch):
@@ -259,11 +292,12 @@ def test_archives_that_python_cannot_read_are_damaged(byte, device, scene, tmp_p
 def test_a_grid_whose_arrays_do_not_fit_is_refused(device, scene, tmp_path, name, change):
     """Kernels would read beyond the end of the arrays."""
     path, config = tmp_path / CHECKPOINT, replace(CONFIG, iterations=1)
-    save_checkpoint(path, SmallPlenoxels(Space.of(scene.train), device, 0), config, 0.0, [])
+    inputs = Inputs.of(scene, device)
+    save_checkpoint(path, SmallPlenoxels(Space.of(scene.train), device, 0), config, inputs, 0.0, [])
     arrays = dict(np.load(path))
     np.savez(path, **arrays | {name: change(arrays[name])})
     with pytest.raises(InputError, match="damaged"):
-        load_checkpoint(path, SmallPlenoxels, config, device)
+        load_checkpoint(path, SmallPlenoxels, config, inputs, device)
 
 
 def test_pixels_are_those_of_the_photos(scene):

@@ -26,11 +26,11 @@ from clsplat.formats import FORMATS, save_gaussians
 from clsplat.formats.sog import META
 from clsplat.formats.spz import save_spz
 from clsplat.formats.streamed_sog import LOD_META
+from clsplat.inputs import Inputs, Photo
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
 from clsplat.training.autosize.rule import Candidate, Search, SmallSide, Trial
 from clsplat.training.checkpoint import save_state
-from clsplat.training.inputs import Inputs, Photo
 from clsplat.training.loop import initial_state
 from clsplat.training.presets import PRESETS, load_preset
 

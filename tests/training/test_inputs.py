@@ -14,9 +14,9 @@ from small_run import CONFIG, SIZE
 
 from clsplat.device import Device
 from clsplat.errors import InputError
+from clsplat.inputs import Inputs
 from clsplat.scene import DepthMap, Scene, View
 from clsplat.training.checkpoint import load_state
-from clsplat.training.inputs import Inputs
 from clsplat.training.loop import train
 
 SHORT = replace(CONFIG, iterations=8, checkpoint_every=4)
