@@ -21,6 +21,7 @@ PURPOSES = (
     "points of the grid",
     "dense points",
     "points of blocks",
+    "points of a hull",
 )
 """Uses of random numbers. The index is part of the stream: new purposes are added at the end."""
 

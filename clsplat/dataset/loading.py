@@ -16,6 +16,7 @@ from clsplat.dataset.decoding import Dataset, PosedPhoto, by_faces, load_view, l
 from clsplat.dataset.depth_maps import aligned, find_depth_map, load_depth_map
 from clsplat.dataset.finding import PhotosMissing, mask_folder
 from clsplat.dataset.near_planes import with_near_planes
+from clsplat.dataset.outlines import points_of_outlines
 from clsplat.dataset.photos import list_photos
 from clsplat.dataset.sfm import reconstruction as sfm
 from clsplat.dataset.sfm.triangulation import filled, triangulate
@@ -163,8 +164,9 @@ def _split(views: list[View], dataset: Dataset, test_every: int) -> tuple[list[V
 def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: bool = False) -> Scene:
     """Triangulate points from the training photos, if the scene has none, and add points between them.
 
-    Near planes then follow these points. Without points, training starts from random ones, and nothing tells how near
-    the scene is. The cost is measured in docs/stability.md.
+    Where the photos have too few features in common, the points are those of the outlines of an object before a plain
+    background (`clsplat.dataset.outlines`). Near planes then follow the points. Without points, training starts from
+    random ones, and nothing tells how near the scene is. The cost is measured in docs/stability.md.
 
     Parameters
     ----------
@@ -181,7 +183,7 @@ def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: boo
     Returns
     -------
     Scene
-        The scene with points; still without points if the photos show too few.
+        The scene with points; still without points if the photos show neither features nor outlines.
 
     Raises
     ------
@@ -195,9 +197,9 @@ def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: boo
     views = (load_view(photo, dataset, config) for photo in photos)
     moved = (replace(view, camera=view.camera.translated(scene.offset)) for view in views)
     points, colors = triangulate(moved, verbose)
+    points, colors = filled(points, colors) if len(points) else points_of_outlines(scene.train)
     if not len(points):
         return scene
-    points, colors = filled(points, colors)
     train, test = ([v.with_camera(replace(v.camera, near=None)) for v in part] for part in (scene.train, scene.test))
     return with_near_planes(replace(scene, train=train, test=test, points=points, colors=colors))
 

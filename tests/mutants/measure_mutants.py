@@ -95,8 +95,11 @@ TESTS: dict[str, tuple[str, ...]] = {
 TRAINING = {
     **{
         f"clsplat/training/{name}.py": tuple(f"tests/training/test_{test}.py" for test in (name, "loop"))
-        for name in ("camera_room", "coarse_to_fine", "run_length")
+        for name in ("camera_room", "coarse_to_fine", "dense_start", "run_length", "sky_start")
     },
+    "clsplat/training/few_views.py": ("tests/training/test_few_views_rule.py", "tests/training/test_loop.py"),
+    "clsplat/dataset/near_planes.py": ("tests/dataset/test_near_planes.py",),
+    "clsplat/dataset/coverage.py": ("tests/dataset/test_coverage.py", "tests/dataset/test_near_planes.py"),
     "clsplat/training/densify": tuple(
         f"tests/training/test_{name}.py" for name in ("densify", "mcmc", "error_guided", "loop")
     ),

@@ -11,7 +11,15 @@ from clsplat.device import Device
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene, View
 from clsplat.training.autosize import rule
-from clsplat.training.dense_start import Depths, agreed, first_points, neighbours, thinned, with_dense_points
+from clsplat.training.dense_start import (
+    BYTES,
+    Depths,
+    agreed,
+    first_points,
+    neighbours,
+    thinned,
+    with_dense_points,
+)
 from clsplat.training.loop import train
 
 WALL = 4.0
@@ -107,8 +115,9 @@ def test_scenes_that_tell_no_depths_stay_as_they_are(device: Device) -> None:
     scene = wall()
     without = replace(scene, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8))
     assert dense(without, device) is without
-    two = replace(scene, train=scene.train[:2])
+    two, three = (replace(scene, train=scene.train[:count]) for count in (2, 3))
     assert dense(two, device) is two
+    assert len(dense(three, device).points) > 60
     fisheyes = [view.with_camera(replace(view.camera, model="fisheye")) for view in scene.train]
     assert dense(replace(scene, train=fisheyes), device).points is scene.points
 
@@ -164,7 +173,7 @@ def test_points_are_supported_by_sure_depths_of_two_photos() -> None:
     np.testing.assert_allclose(sizes, expected, rtol=1e-9)
     # Of the three others one alone agrees, where the depths of two differ or are unsure.
     assert not len(found(factor=1.03)) and not len(found(score=0.39)) and not len(found(own=0.59))
-    assert len(found(score=0.41)) == len(found(own=0.61)) == len(points)
+    assert len(found(score=0.41)) == len(found(own=0.61)) == len(found(factor=1.009)) == len(points)
 
 
 def test_thinned_points_keep_to_the_number_where_their_sizes_differ() -> None:
@@ -189,6 +198,12 @@ def test_configuration_and_memory_leave_dense_points_out(device: Device) -> None
     assert len(first_points(scene, replace(config, max_gaussians=200), device).points) <= 100
     small = Device(device.cl_device, memory_limit=2_000_000)
     assert first_points(scene, config, small) is scene
+
+
+def test_dense_points_take_no_more_memory_than_is_said(device: Device) -> None:
+    counted = Device(device.cl_device)
+    assert len(dense(wall(), counted).points) > 500
+    assert counted.memory_peak <= BYTES * 64 * 48
 
 
 def test_training_starts_with_dense_points(device: Device, tmp_path) -> None:

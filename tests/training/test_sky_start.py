@@ -104,6 +104,21 @@ def test_cells_of_the_sky_are_smooth_and_reach_the_edge() -> None:
     np.testing.assert_allclose(averages[:5], np.broadcast_to(BLUE / 255, (5, 20, 3)))
 
 
+@pytest.mark.parametrize(("channels", "factor"), [(slice(None), 1), (2, 3)], ids=["grey", "blue"])
+@pytest.mark.parametrize(("deviation", "smooth"), [(0.047, True), (0.053, False)])
+@pytest.mark.parametrize("size", [1, 3], ids=["cells of 4 px", "of 6 px"])
+def test_cells_of_the_sky_have_little_texture(channels, factor, deviation, smooth, size) -> None:
+    """A chequerboard deviates from its mean by as much in each pixel; blue is a third of the grey value."""
+    view = outdoors(Camera.look_at((0, 0, 0), (0, 0, 1), UP, 50 * size, WIDTH * size, HEIGHT * size))
+    view = replace(view, image=np.full((HEIGHT * size, WIDTH * size, 3), 128, np.uint8))
+    signs = np.where(np.indices(view.image.shape[:2]).sum(axis=0) % 2, 1, -1)[:, :, None]
+    board = np.rint(128 + signs * 255 * deviation * factor)
+    view.image[:, :, channels] = board if factor == 1 else board[:, :, 0]
+    cells, _, edge = sky_cells(view, np.zeros((0, 3)), UP)
+    assert edge == {1: 4, 3: 6}[size]
+    assert cells[0].all() == cells.any() == smooth
+
+
 def test_what_is_smooth_below_the_horizon_is_no_sky() -> None:
     view = outdoors(camera())
     view.image[:] = BLUE
@@ -189,10 +204,14 @@ def test_the_sky_continues_a_little_where_no_photo_looks() -> None:
 
 def test_the_background_needs_no_sky() -> None:
     views = ring()
+    white = replace(CONFIG, data=DataConfig(background="white"))
     for view in views:
-        view.image[: HEIGHT // 2] = 255
+        view.image[: HEIGHT // 2] = 250  # a difference of 5 / 255 = 0.0196
     assert sky_gaussians(square(views), CONFIG) is not None
-    assert sky_gaussians(square(views), replace(CONFIG, data=DataConfig(background="white"))) is None
+    assert sky_gaussians(square(views), white) is None
+    for view in views:
+        view.image[: HEIGHT // 2] = 249
+    assert sky_gaussians(square(views), white) is not None
 
 
 def test_a_start_without_sky_is_unchanged() -> None:

@@ -1,0 +1,137 @@
+"""Points of an object before a plain background, from its outlines in the photos.
+
+Few photos from all sides have few features in common, so that no points can be triangulated. But the object lies
+where no photo shows the background: in its visual hull (Laurentini 1994, doi:10.1109/34.273735), which is carved out
+of a grid (Martin and Aggarwal 1983, doi:10.1109/TPAMI.1983.4767367). Measured: docs/experiments/strategies.md.
+"""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import focus_point
+from clsplat.dataset.coverage import projected
+from clsplat.randomness import stream
+from clsplat.ranges import FLOAT32_TINY
+from clsplat.scene import View, evenly_spaced, in_turn
+
+Array = NDArray[np.float64]
+
+MOST_PHOTOS = 100
+"""Largest number of photos whose outlines are compared, evenly spaced, which bounds the time."""
+
+FEWEST_PHOTOS = 3
+"""Fewest photos whose outlines are compared: the hull of two reaches far behind the object."""
+
+TOLERANCE = 0.06
+"""Largest difference of a background's colour from its median, from 0 to 1: several times the noise of a photo."""
+
+PLAIN = 0.6
+"""Least fraction of the pixels on the photos' edges that have the background's colour: an object may reach beyond the
+edges, but a room has no such colour."""
+
+SHOWN = 0.5
+"""Least fraction of the photos that have a point of the hull in their frames."""
+
+OUTSIDE = 0.1
+"""Largest fraction of the photos with a point in their frames that show the background there: a part of the object
+may have the background's colour in one of them."""
+
+GRIDS = (64, 96)
+"""Numbers of cells along an edge of the grids: the first finds the object, the second lies around it."""
+
+SEED = 0
+"""Seed of the places of points within their cells."""
+
+
+def points_of_outlines(views: list[View]) -> tuple[Array, NDArray[np.uint8]]:
+    """Find points on the surface of the visual hull of an object.
+
+    Parameters
+    ----------
+    views : list of View
+        Photos of the object from several sides.
+
+    Returns
+    -------
+    points : (P, 3) float64
+        One in each cell of the grid on the hull's surface, world units. P is 0 if the background is not plain, or no
+        place is inside the outlines.
+    colors : (P, 3) uint8
+        Their mean colours in the photos that do not show the background there.
+    """
+    from scipy.ndimage import binary_erosion
+
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    views = evenly_spaced(views, MOST_PHOTOS)
+    color = plain_color(views) if len(views) >= FEWEST_PHOTOS else None
+    if color is None:
+        return nothing
+    cameras = [view.camera for view in views]
+    centre = focus_point(cameras)
+    distance = np.median([np.linalg.norm(camera.position - centre) for camera in cameras])
+    half = float(distance * np.median([max(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]))
+    for count, following in pairwise([*GRIDS, 0]):
+        middles = half * ((2 * np.arange(count) + 1) / count - 1)
+        points = centre + np.stack(np.meshgrid(*[middles] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        inside, colors = _carved(points, views, color)
+        if not inside.any():
+            return nothing
+        if following:
+            low, high = points[inside].min(axis=0), points[inside].max(axis=0)
+            centre, half = (low + high) / 2, float((high - low).max() / 2 + 2 * half / count)
+    volume = inside.reshape([GRIDS[-1]] * 3)
+    surface = (volume & ~binary_erosion(volume)).ravel()
+    rng = stream(SEED, "points of a hull")
+    points = points[surface] + rng.uniform(-1, 1, (surface.sum(), 3)) * half / GRIDS[-1]
+    return points, np.rint(colors[surface]).astype(np.uint8)
+
+
+def plain_color(views: list[View]) -> Array | None:
+    """Find the colour (3,) of the background, RGB from 0 to 1: that of most pixels on the photos' edges.
+
+    None if there is no such colour.
+    """
+    edges = [view.image[_rim(view)] for view in in_turn(views)]
+    pixels = np.concatenate(edges) / 255
+    if not len(pixels):
+        return None
+    color = np.median(pixels, axis=0)
+    return color if (np.abs(pixels - color).max(axis=1) < TOLERANCE).mean() >= PLAIN else None
+
+
+def background(view: View, color: Array) -> NDArray[np.bool_]:
+    """Find the pixels (H, W) of the background: those of its colour that are joined to the photo's edge."""
+    from scipy.ndimage import label
+
+    alike = np.ones(view.image.shape[:2], bool)
+    for channel, value in enumerate(255 * color):
+        alike &= np.abs(view.image[:, :, channel] - value) < 255 * TOLERANCE
+    labels, _ = label(alike & view.counts)
+    found = np.unique(labels[_rim(view)])
+    return np.isin(labels, found[found > 0])
+
+
+def _rim(view: View) -> NDArray[np.bool_]:
+    """Pixels (H, W) on the edges of a photo that count."""
+    rim = view.counts.copy()
+    rim[1:-1, 1:-1] = False
+    return rim
+
+
+def _carved(points: Array, views: list[View], color: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Whether points (P, 3) are inside the outlines, and their mean colours (P, 3) there, from 0 to 255."""
+    shown, outside, sums = np.zeros(len(points), int), np.zeros(len(points), int), np.zeros((len(points), 3))
+    left = np.arange(len(points))
+    for view in in_turn(views):
+        places, _, inside = projected(replace(view.camera, near=FLOAT32_TINY), points[left])
+        column, row = places[inside].astype(int).T
+        rows, behind = left[inside], background(view, color)[row, column]
+        shown[rows] += 1
+        outside[rows] += behind
+        sums[rows] += np.where(behind[:, None], 0, view.image[row, column])
+        left = left[outside[left] <= OUTSIDE * len(views)]  # no number of other photos would make up for more
+    kept = (shown >= max(FEWEST_PHOTOS, SHOWN * len(views))) & (outside <= OUTSIDE * shown)
+    return kept, sums / np.maximum(shown - outside, 1)[:, None]
