@@ -165,7 +165,7 @@ def evaluate_images(
         "views": records,
     }
     with replacing(out / "metrics.json") as file:
-        file.write((json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode())
+        file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
     write_page(out / "index.html", result)
     return result
 

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from urllib.parse import unquote
 
@@ -156,6 +157,14 @@ def test_long_names_are_cut_to_what_a_file_system_allows(gaussians, tmp_path):
     records = evaluate(gaussians, views, tmp_path, REFERENCE)["views"]
     for view, record in zip(views, records, strict=True):
         np.testing.assert_array_equal(read(tmp_path / record["truth"]), view.image)
+
+
+def test_names_need_not_be_text(gaussians, tmp_path):
+    """Names of files are bytes; those that are not UTF-8 come with surrogates (PEP 383)."""
+    (view,) = make_views(gaussians, [5])
+    result = evaluate(gaussians, [replace(view, name="fa\udce7ade.jpg")], tmp_path, REFERENCE)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == result
+    assert "fa?ade.jpg" in (tmp_path / "index.html").read_text(encoding="utf-8")
 
 
 def test_the_same_again_is_the_same_bytes(gaussians, tmp_path):

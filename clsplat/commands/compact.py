@@ -80,7 +80,7 @@ class Compact:
         scene = None
         dataset = self.photos or self.cameras
         if dataset is not None:
-            scene = load_scene_with_points(dataset, self.data_config)
+            scene = load_scene_with_points(dataset, self.data_config, self.data_config.triangulate)
             gaussians, offset = moved(gaussians, offset - scene.offset), scene.offset
         pricing, evaluation = self._views(gaussians, scene, renderer)
         say(f"views: {len(pricing)} to price the Gaussians, {len(evaluation)} to measure the loss")

@@ -13,6 +13,7 @@ from clsplat.commands.run_folders import SCENE, Run, is_run, read_run
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 from clsplat.ranges import flags_of
+from clsplat.run_log import LOG
 from clsplat.training.presets import read_settings
 
 if TYPE_CHECKING:
@@ -48,7 +49,8 @@ class Info:
         if not self.path.exists():
             raise InputError(f"{self.path}: expected a file of Gaussians, a run or a dataset, found nothing")
         if self.path.is_dir() and described_by(self.path) is None:
-            lines = run_lines(self.path) if (self.path / "log.jsonl").is_file() else dataset_lines(self.path)
+            of_run = is_run(self.path) or (self.path / LOG).is_file()
+            lines = run_lines(self.path) if of_run else dataset_lines(self.path)
         else:
             lines = scene_lines(self.path)
         print("\n".join(lines))
@@ -94,7 +96,9 @@ def run_lines(folder: Path) -> list[str]:
     from clsplat.show.training_curve import read_log
 
     run = read_run(folder) if is_run(folder) else Run(None, TrainConfig())
-    last = read_log(folder / "log.jsonl", ("iteration", "seconds"))[-1]
+    log = folder / LOG
+    begun = log.is_file() and log.stat().st_size > 0
+    last = read_log(log, ("iteration", "seconds"))[-1] if begun else {"iteration": 0, "seconds": 0.0}
     rows = {"what": f"a run of clsplat train --method {run.method}" if run.method else "a run of clsplat train"}
     if run.data is not None:
         rows["dataset"] = f"{run.data}{'' if run.data.exists() else ', missing'}"
@@ -104,11 +108,12 @@ def run_lines(folder: Path) -> list[str]:
     rows |= _scores(folder, last)
     if changed := flags_of(run.config, TrainConfig(iterations=run.config.iterations)):
         rows["settings"] = " ".join(changed)
-    if "num_gaussians" not in last:
+    if run.method or (begun and "num_gaussians" not in last):
         return [str(folder), *_table(rows | _model(folder))]
     scene = folder / SCENE
     if not scene.is_file():
-        rows |= {"Gaussians": f"{last['num_gaussians']:,}", SCENE: UNFINISHED}
+        rows |= {"Gaussians": f"{last['num_gaussians']:,}"} if begun else {}
+        rows[SCENE] = UNFINISHED
         return [str(folder), *_table(rows)]
     return [str(folder), *_table(rows), "", *scene_lines(scene)]
 
@@ -155,8 +160,9 @@ def dataset_lines(path: Path) -> list[str]:
         what, dataset = detect(path, DataConfig(downscale=1))
     except PhotosMissing:
         if model is None:
-            raise
-        what, dataset, photos = COLMAP, None, []
+            what, dataset = detect(path, DataConfig())  # the copies, if there are any
+        else:
+            what, dataset, photos = COLMAP, None, []
     if dataset is not None:
         photos = [photo.path for photo in dataset.photos]
     if what == TRANSFORMS and dataset is not None:

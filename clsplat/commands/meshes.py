@@ -52,7 +52,7 @@ class Mesh:
         data = dataset_of("mesh", self.data)
         gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
-        scene = load_scene_with_points(data, self.data_config)
+        scene = load_scene_with_points(data, self.data_config, self.data_config.triangulate)
         gaussians = moved(gaussians, offset - scene.offset)
         box = (self.box[:3] - scene.offset, self.box[3:] - scene.offset) if self.box else None
         cameras = [view.camera for view in scene.train]

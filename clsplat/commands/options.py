@@ -19,6 +19,8 @@ class PhotoOptions(DataConfig):
     random_background: tyro.conf.Fixed[bool] = False
     depth: tyro.conf.Fixed[str | None] = None
     sfm: tyro.conf.Fixed[SfmConfig] = field(default_factory=SfmConfig)
+    triangulate: tyro.conf.Fixed[bool] = True
+    """Whether points are triangulated where the dataset has none, as in the training."""
 
 
 @dataclass(frozen=True)

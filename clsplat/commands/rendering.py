@@ -70,7 +70,7 @@ class Eval:
         try_folder(out)
         gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
-        scene = load_scene_with_points(data, self.data_config)
+        scene = load_scene_with_points(data, self.data_config, self.data_config.triangulate)
         if not scene.test:
             raise InputError(f"{data}: expected held-out photos to compare with, found none; see --test-every")
         gaussians = moved(gaussians, offset - scene.offset)
@@ -125,7 +125,7 @@ class Render:
         try_folder(out)
         gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
-        scene = load_scene_with_points(data, self.data_config)
+        scene = load_scene_with_points(data, self.data_config, self.data_config.triangulate)
         gaussians = moved(gaussians, offset - scene.offset)
         views = scene.test or scene.train
         if self.path == "test":

@@ -117,7 +117,7 @@ def with_run(command: Command, dataset: str = "data") -> Command | None:
     if not is_run(given.scene):
         return None
     run = read_run(given.scene)
-    changes: dict[str, Any] = {"data_config": _photos(given.data_config, run.config.data)}
+    changes: dict[str, Any] = {"data_config": _photos(given.data_config, run.config)}
     if hasattr(given, "render"):
         changes["render"] = _with(given.render, run.config.render)
     if getattr(given, dataset) is None and run.data is not None:
@@ -129,10 +129,10 @@ def with_run(command: Command, dataset: str = "data") -> Command | None:
     return result
 
 
-def _photos(part: PhotoOptions, settings: DataConfig) -> PhotoOptions:
+def _photos(part: PhotoOptions, config: TrainConfig) -> PhotoOptions:
     """The photos' settings of a run, without the folders of files that the command does not read."""
-    masks = None if isinstance(part, CameraOptions) else settings.masks
-    return replace(_with(part, settings), masks=masks, depth=None)
+    masks = None if isinstance(part, CameraOptions) else config.data.masks
+    return replace(_with(part, config.data), masks=masks, depth=None, triangulate=config.init.triangulate)
 
 
 def _with(part: Part, settings: Any) -> Part:

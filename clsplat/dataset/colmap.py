@@ -85,12 +85,13 @@ def read_dataset(root: Path, model: Path, config: DataConfig, photos: Path | Non
     cameras, images, points, colors = read_model(model)
     names = [name for name, _, _ in images]
     folder = root if photos is None else photos
-    panoramas = any(camera.model == "EQUIRECTANGULAR" for camera in cameras.values())
+    faces = config.panoramas == "faces"
+    cut = [faces and cameras[camera].model == "EQUIRECTANGULAR" for _, camera, _ in images]
     try:
-        files, reduce, downscale = locate(folder, [f"images/{name}" for name in names], config.downscale, panoramas)
+        files, reduce, downscale = locate(folder, [f"images/{name}" for name in names], config.downscale, cut)
     except PhotosMissing as error:
         try:
-            files, reduce, downscale = locate(folder, names, config.downscale, panoramas)
+            files, reduce, downscale = locate(folder, names, config.downscale, cut)
         except PhotosMissing:
             raise error from None
     warn_of_missing(model, names, files)

@@ -47,7 +47,7 @@ def without_suffix(name: str) -> str:
 
 
 def locate(
-    root: Path, names: Sequence[str], downscale: int | Literal["auto"], panoramas: bool = False
+    root: Path, names: Sequence[str], downscale: int | Literal["auto"], cut: Sequence[bool] = ()
 ) -> tuple[list[Path | None], int, int]:
     """Locate the files of photos, in the requested size if the dataset has it.
 
@@ -61,8 +61,9 @@ def locate(
         Requested reduction. For 2, ``images_2/a.jpg`` is preferred to ``images/a.jpg``, unless it exists for fewer
         photos; others likewise. "auto": the smallest with which no photo has more than `SCREEN` pixels, or that of
         the largest copies if there are only copies.
-    panoramas : bool
-        Whether some photos are panoramas, whose faces have at most `SCREEN` pixels.
+    cut : sequence of bool
+        Whether each photo is a panorama that is cut into faces, which then have at most `SCREEN` pixels. Default:
+        none is.
 
     Returns
     -------
@@ -84,7 +85,7 @@ def locate(
     found = sum(file is not None for file in full)
     copies = [] if found else [d for d in DOWNSCALES if any(_find(root, name, d) is not None for name in names)]
     if downscale == "auto":
-        downscale = copies[0] if copies else _fitting([file for file in full if file is not None], panoramas)
+        downscale = copies[0] if copies else _fitting(full, cut or [False] * len(full))
     if downscale > 1:
         small = [_find(root, name, downscale) for name in names]
         found_small = sum(file is not None for file in small)
@@ -104,11 +105,11 @@ def locate(
     )
 
 
-def _fitting(files: list[Path], panoramas: bool) -> int:
+def _fitting(files: Sequence[Path | None], cut: Sequence[bool]) -> int:
     """The smallest reduction with which no photo, or no face of a panorama, exceeds a screen; 1 of no photos."""
-    largest = max((width * height for width, height in map(photo_size, files)), default=0)
-    most = SCREEN * (PANORAMA if panoramas else 1)
-    return min(MOST_DOWNSCALE, max(1, ceil(sqrt(largest / most))))
+    pairs = [(photo_size(file), faces) for file, faces in zip(files, cut, strict=True) if file is not None]
+    largest = max((width * height / (PANORAMA if faces else 1) for (width, height), faces in pairs), default=0)
+    return min(MOST_DOWNSCALE, max(1, ceil(sqrt(largest / SCREEN))))
 
 
 def warn_of_missing(source: Path, names: Sequence[str], files: Sequence[Path | None]) -> None:

@@ -22,7 +22,7 @@ from clsplat.dataset.sfm import reconstruction as sfm
 from clsplat.dataset.sfm.triangulation import filled, triangulate
 from clsplat.errors import InputError, named
 from clsplat.ranges import FLOAT32_MAX, check
-from clsplat.scene import Scene, View
+from clsplat.scene import DepthMap, Scene, View
 
 RECOVERED, COLMAP, TRANSFORMS, PHOTOS = (
     "photos with cameras recovered by clsplat",
@@ -105,12 +105,13 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
     return with_near_planes(_near_origin(scene))
 
 
-def load_scene_with_points(path: str | Path, config: DataConfig) -> Scene:
-    """Load a dataset, and triangulate points where it has poses alone.
+def load_scene_with_points(path: str | Path, config: DataConfig, triangulate: bool = True) -> Scene:
+    """Load a dataset, and triangulate points where it has poses alone, unless `triangulate` is False.
 
-    Near planes are then those of training. Parameters and errors are those of `load_scene`.
+    Near planes are then those of a training with the same setting. Parameters and errors are those of `load_scene`.
     """
-    return with_points(load_scene(path, config), path, config)
+    scene = load_scene(path, config)
+    return with_points(scene, path, config) if triangulate else scene
 
 
 def load_photos(path: str | Path, config: DataConfig, names: Container[str], memory: int | None = None) -> list[View]:
@@ -214,7 +215,7 @@ def with_depth_maps(scene: Scene, path: str | Path, config: DataConfig, tell: Ca
     path : str or Path
         The dataset from which it was loaded.
     config : DataConfig
-        The options with which it was loaded; `config.depth` is the folder of the maps.
+        The options with which it was loaded; `config.depth` is the folder of the maps. What masks hide is unknown.
     tell : callable
         Called with a sentence about the result.
 
@@ -256,7 +257,15 @@ def read_depth_maps(views: list[View], path: str | Path, config: DataConfig) -> 
     files = {view.name: find_depth_map(folder, view.name) for view in views}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         maps = pool.map(lambda name: load_depth_map(files[name], photos[name], dataset), files)
-        return [view.with_depth(depth) for view, depth in zip(views, maps, strict=True)]
+        return [
+            view.with_depth(_where_used(depth, view) if photos[view.name].mask else depth)
+            for view, depth in zip(views, maps, strict=True)
+        ]
+
+
+def _where_used(depth: DepthMap, view: View) -> DepthMap:
+    """A depth map that knows nothing of the pixels that a photo's mask hides."""
+    return replace(depth, values=np.where(view.counts, depth.values, np.float32(np.nan)))
 
 
 def _full_size(path: Path, config: DataConfig) -> Dataset:

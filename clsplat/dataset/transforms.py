@@ -97,8 +97,9 @@ def read_dataset(root: Path, config: DataConfig) -> Dataset:
         for frame, part in (_split(meta, path) if held_out is None else [(f, held_out) for f in meta["frames"]])
     ]
     names = [checked_name(frame["file_path"], path) for frame, path, _ in frames]
-    panoramas = any(frame.get("camera_model") == "EQUIRECTANGULAR" for frame, _, _ in frames)
-    files, reduce, downscale = locate(root, names, config.downscale, panoramas)
+    faces = config.panoramas == "faces"
+    cut = [faces and frame.get("camera_model") == "EQUIRECTANGULAR" for frame, _, _ in frames]
+    files, reduce, downscale = locate(root, names, config.downscale, cut)
     warn_of_missing(metas[0][0], names, files)
     masks = None if config.masks is None else mask_folder(root, config.masks)
     photos = []

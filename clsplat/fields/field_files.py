@@ -3,7 +3,7 @@
 import json
 import zipfile
 import zlib
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +56,7 @@ def _about(field: Field) -> dict[str, Any]:
 
 
 def _compared(config: TrainConfig) -> dict[str, Any]:
+    config = replace(config, data=replace(config.data, masks=None))  # compared by content, as they may have moved
     return {name: value for name, value in json.loads(json.dumps(asdict(config))).items() if name not in FREE}
 
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.fields.space import Space
+from clsplat.fields.space import Space, transparent
 from clsplat.scene import Color, View
 
 Array = NDArray[Any]
@@ -43,7 +43,7 @@ class Pixels:
         pairs = zip(self._views, self._used, strict=True)
         counts = [view.camera.width * view.camera.height if used is None else len(used) for view, used in pairs]
         self._first = np.cumsum([0, *counts])
-        self.transparent = any(view.clear is not None for view in self._views)
+        self.transparent = transparent(self._views)
 
     def draw(self, rng: np.random.Generator, count: int) -> Batch:
         """Draw pixels, each with the same chance; transparent photos are shown on a random background."""

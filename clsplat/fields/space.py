@@ -65,7 +65,7 @@ class Space:
         cameras = [view.camera for view in views]
         centre = focus_point(cameras)
         distances = [float(np.linalg.norm(camera.position - centre)) for camera in cameras]
-        is_object = any(view.clear is not None for view in views)
+        is_object = transparent(views)
         near = 0.0 if is_object else NEAR_FACTOR * min(camera.near_depth for camera in cameras)
         if near >= FAR * max(distances):  # cameras in one place, as on a tripod: rays would end before they begin
             distances = [near] * len(cameras)
@@ -124,6 +124,11 @@ class Space:
         """
         widths = np.linalg.norm(camera.rays(u + 1, v) - camera.rays(u, v), axis=1)
         return np.nan_to_num(widths) * 2 / 12**0.5
+
+
+def transparent(views: list[View]) -> bool:
+    """Whether the background is visible in a pixel of the photos. A channel alpha alone does not tell."""
+    return any(view.clear is not None and view.clear.any() for view in views)
 
 
 def _spacing(camera: Camera) -> float:

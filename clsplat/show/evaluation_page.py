@@ -134,7 +134,7 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
         steps_of_255=round(DIFFERENCE_MAX * 255),
     )
     with replacing(path) as file:
-        file.write(page.encode())
+        file.write(page.encode(errors="replace"))  # names of files need not be valid text
 
 
 def _model(result: dict[str, Any]) -> tuple[str, ...]:

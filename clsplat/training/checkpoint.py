@@ -95,7 +95,7 @@ def write_photos(path: Path, state: State, scene: Scene) -> None:
             camera = refined(view.camera, state.poses.of(view.name)).translated(-scene.offset)
             content[view.name]["viewmat"] = camera.viewmat.tolist()
     with replacing(path) as file:
-        file.write((json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
+        file.write((json.dumps(content, indent=1) + "\n").encode())
 
 
 def load_state(path: Path, extent: float, config: TrainConfig, inputs: Inputs | None = None) -> State:

@@ -140,6 +140,31 @@ def test_a_run(gaussians, tmp_path, capsys):
     assert "config.json: expected JSON" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("begun", ["checkpoint.npz", "blocks/plan.json", "log.jsonl"])
+def test_a_run_that_has_just_begun(tmp_path, capsys, begun):
+    """Before iteration 10 the log is empty, and that of a training in blocks is written at its end."""
+    (tmp_path / "config.json").write_text(json.dumps({"iterations": 40, "data_path": str(tmp_path / "data")}))
+    (tmp_path / begun).parent.mkdir(exist_ok=True)
+    (tmp_path / begun).touch()
+    rows, _ = info(tmp_path, capsys)
+    assert rows["iterations"] == "0 of 40" and "--resume" in rows["scene.ply"] and "Gaussians" not in rows
+
+
+def test_a_field_that_has_just_begun(tmp_path, capsys):
+    (tmp_path / "config.json").write_text(json.dumps({"iterations": 40, "method": "ingp-base"}))
+    rows, _ = info(tmp_path, capsys)
+    assert "ingp-base" in rows["what"] and "--resume" in rows["field.npz"]
+
+
+def test_smaller_copies_alone(tmp_path, capsys):
+    (tmp_path / "images_2").mkdir()
+    Image.new("RGB", (20, 10)).save(tmp_path / "images_2" / "0.png")
+    frames = [{"file_path": "images/0.png", "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "w": 40, "h": 20, "frames": frames}))
+    rows, _ = info(tmp_path, capsys)
+    assert (rows["photos"], rows["sizes"], rows["smaller copies"]) == ("1", "1 of 20x10", "1 in images_2")
+
+
 def test_photos_and_transforms(tmp_path, capsys):
     for k, width in enumerate((40, 40, 30)):
         Image.new("RGB", (width, 20)).save(tmp_path / f"{k}.png")

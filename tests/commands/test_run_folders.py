@@ -48,6 +48,20 @@ def test_eval_repeats_the_evaluation_of_the_run(copied: Path, tmp_path: Path) ->
     assert metrics(copied / "eval") == again
 
 
+def test_commands_triangulate_where_the_training_did(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near planes of triangulated points would differ from those of a training without them."""
+    asked = []
+    monkeypatch.setattr("clsplat.dataset.loading.with_points", lambda scene, *_: asked.append(scene) or scene)
+    run("eval", copied)
+    assert len(asked) == 1
+    config = json.loads((copied / "config.json").read_text())
+    config["init"]["triangulate"] = False
+    (copied / "config.json").write_text(json.dumps(config))
+    run("eval", copied)
+    run("render", copied)
+    assert len(asked) == 1
+
+
 def test_flags_and_arguments_count_more_than_the_run(copied: Path, dataset: Path, tmp_path: Path) -> None:
     run("eval", copied, dataset, "-o", tmp_path / "a", "--test-every", 4, "--downscale", 1)
     assert [v["name"] for v in metrics(tmp_path / "a")["views"]] == ["0.png", "4.png", "8.png"]

@@ -80,6 +80,18 @@ def test_the_largest_photo_fits_a_screen(tmp_path, monkeypatch, screen, expected
     assert locate(tmp_path, ["b.png", "a.png", "c.png"], "auto")[1:] == (expected, expected)
 
 
+def test_photos_beside_a_panorama_fit_a_screen(tmp_path, monkeypatch):
+    """A face of a panorama of 2048 pixels has 415, the photo 768."""
+    save(tmp_path / "panorama.png", noise(64, 32))
+    save(tmp_path / "photo.png", noise(32, 24))
+    names = ["panorama.png", "photo.png"]
+    for screen, cut, expected in (768, [True, False], 1), (767, [True, False], 2), (768, [False, False], 2):
+        monkeypatch.setattr("clsplat.dataset.finding.SCREEN", screen)
+        assert locate(tmp_path, names, "auto", cut)[2] == expected
+    monkeypatch.setattr("clsplat.dataset.finding.SCREEN", 416)
+    assert [locate(tmp_path, names[:1], "auto", [cut])[2] for cut in (True, False)] == [1, 3]
+
+
 def test_smaller_copies_are_read_where_photos_exceed_a_screen(tmp_path, monkeypatch):
     save(tmp_path / "images/a.png", noise(64, 48))
     save(tmp_path / "images_3/a.png", noise(21, 16))

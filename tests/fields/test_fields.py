@@ -159,6 +159,16 @@ def test_other_photos_do_not_resume(device, scene, tmp_path):
         train_field(replace(scene, train=others), SmallNerf, config, tmp_path, device, resume=True)
 
 
+def test_masks_may_move(device, scene, tmp_path):
+    config = replace(CONFIG, iterations=2, data=DataConfig(masks="/a/masks"))
+    train_field(scene, SmallNerf, config, tmp_path, device)
+    moved = replace(config, data=DataConfig(masks="/b/masks"))
+    train_field(scene, SmallNerf, moved, tmp_path, device, resume=True)
+    hidden = [replace(view, mask=np.eye(EDGE, dtype=bool)) for view in scene.train]
+    with pytest.raises(InputError, match="found other masks"):
+        train_field(replace(scene, train=hidden), SmallNerf, moved, tmp_path, device, resume=True)
+
+
 def test_another_device_resumes_with_a_warning(device, scene, tmp_path):
     config = replace(CONFIG, iterations=2)
     train_field(scene, SmallNerf, config, tmp_path, device)
@@ -312,6 +322,17 @@ def test_pixels_are_those_of_the_photos(scene):
     missed = nearest > 0.7
     assert 50 < missed.sum() < 450
     np.testing.assert_allclose(batch.colors[missed], np.tile(batch.background, (missed.sum(), 1)), atol=1e-9)
+
+
+def test_a_channel_alpha_without_transparency_changes_nothing(scene):
+    opaque = [replace(view, clear=np.zeros_like(view.clear)) for view in scene.train]
+    none = [replace(view, clear=None) for view in scene.train]
+    first, second = Space.of(opaque), Space.of(none)
+    assert first.contracted and second.contracted and first.scale == second.scale
+    batch = Pixels(opaque, first, WHITE).draw(stream(0, "pixels of a batch"), 20)
+    assert batch.background == WHITE
+    one = [replace(opaque[0], clear=scene.train[0].clear), *opaque[1:]]
+    assert not Space.of(one).contracted and Pixels(one, Space.of(one), WHITE).transparent
 
 
 def test_masked_pixels_are_not_drawn(scene):

@@ -14,7 +14,7 @@ from clsplat.errors import InputError
 from clsplat.renderer import Renderer
 from clsplat.run_log import log_file
 from clsplat.scene import Scene
-from clsplat.training.checkpoint import load_state, save_state
+from clsplat.training.checkpoint import load_state, save_state, write_photos
 from clsplat.training.densify import Edit
 from clsplat.training.loop import train
 from clsplat.training.optimizer import Optimizer
@@ -109,6 +109,14 @@ def test_a_folder_that_cannot_be_made_is_named(scene: Scene, device: Device, tmp
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"cannot create .*file/out: Not a directory"):
         train(scene, CONFIG, tmp_path / "file" / "out", device)
+
+
+def test_names_of_photos_need_not_be_text(scene: Scene, tmp_path: Path) -> None:
+    """Names of files are bytes; those that are not UTF-8 come with surrogates (PEP 383)."""
+    odd = [replace(scene.train[0], name="fa\udce7ade.png"), *scene.train[1:]]
+    named = replace(scene, train=odd)
+    write_photos(tmp_path / "photos.json", random_state(named), named)
+    assert "fa\udce7ade.png" in json.loads((tmp_path / "photos.json").read_text())
 
 
 def test_the_log_is_also_written_for_tensorboard(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Training with depth maps: from files to the scene, resumed, and its benefit with few photos."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from clsplat.camera import Camera
 from clsplat.config import DataConfig, OptimConfig
 from clsplat.dataset import load_scene
 from clsplat.dataset.depth_maps import aligned
+from clsplat.dataset.loading import read_depth_maps
 from clsplat.dataset.near_planes import with_near_planes
 from clsplat.demo.known_photos import known_scene
 from clsplat.demo.ray_tracer import Solid, camera_rays, trace
@@ -99,6 +101,33 @@ def test_from_files_and_resumed(data: Path, tmp_path: Path, capsys: pytest.Captu
     (data / "depth").rename(data / "moved")
     run("eval", tmp_path / "whole")
     (data / "moved").rename(data / "depth")
+
+
+def test_what_a_mask_hides_has_no_depth(data: Path, tmp_path: Path) -> None:
+    """A passer-by before the left half of each photo, whom the masks hide."""
+    for name in "transforms.json", "points.ply":
+        shutil.copy(data / name, tmp_path / name)
+    for photo in data.glob("*.png"):
+        shutil.copy(photo, tmp_path / photo.name)
+        hidden = np.full(SIZE[::-1], 255, np.uint8)
+        hidden[:, :20] = 0
+        for folder in "masks", "nearer":
+            (tmp_path / folder).mkdir(exist_ok=True)
+        Image.fromarray(hidden).save(tmp_path / "masks" / photo.name)
+        if (data / "depth" / photo.name).exists():
+            values = np.array(Image.open(data / "depth" / photo.name))
+            values[:, :20] = 60_000
+            Image.fromarray(values).save(tmp_path / "nearer" / photo.name)
+    found = {}
+    for maps in data / "depth", tmp_path / "nearer":
+        config = DataConfig(masks="masks", depth=str(maps))
+        for memory in None, 0:  # in memory, and streamed from the disk
+            scene = load_scene(tmp_path, config, memory=memory)
+            found[maps, memory] = [view.depth.values for view in read_depth_maps(scene.train, tmp_path, config)]
+    first, *others = found.values()
+    assert all(np.isnan(values[:, :20]).all() and np.isfinite(values[:, 20:]).any() for values in first)
+    for other in others:
+        np.testing.assert_array_equal(other, first)
 
 
 def test_refusals_name_the_file(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
