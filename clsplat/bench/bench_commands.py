@@ -44,7 +44,7 @@ class Kernels:
     views: Count = 1
     """Number of views of the dataset, evenly spread. Each is a workload."""
     downscale: Literal[1, 2, 4, 8] = 1
-    """Factor by which the dataset's photos are reduced, as for `train`."""
+    """Divisor of the edges of the dataset's photos. `train` reduces large photos, and prints by how much."""
     scaling: Path | None = None
     """File for a chart of time against the numbers of Gaussians and pixels (.png, .svg, .pdf); its workloads are
     timed too."""
@@ -130,7 +130,7 @@ class Knobs:
     views: Count = 1
     """Number of views of the dataset, evenly spread. Each is a workload."""
     downscale: Literal[1, 2, 4, 8] = 1
-    """Factor by which the dataset's photos are reduced, as for `train`."""
+    """Divisor of the edges of the dataset's photos. `train` reduces large photos, and prints by how much."""
     repeats: Count = 7
     """Number of timed runs of each setting. They alternate with runs of the default."""
     chart: Path | None = None
@@ -193,7 +193,8 @@ class Quality:
     fern:downscale=2. So do options for a variant: thin=4 (every 4th training photo), arc=0.2 (the end of the path is
     held out), points=0.1 (a tenth of the sparse points)."""
     methods: tuple[str, ...] = ("paper-7k", "auto")
-    """Presets of `train`, configuration files as for its --config, or radiance fields as for its --method."""
+    """Methods: auto (the default settings of `train`), its presets, radiance fields as for its --method, or
+    configuration files as for its --config. What a file says of photos is ignored: it follows a dataset's name."""
     budgets: tuple[str, ...] = ("own",)
     """Caps on the number of Gaussians: "own" for the method's cap, a factor of it such as x0.5, or a number such as
     40000."""
@@ -229,7 +230,8 @@ class Captures:
     """Datasets, as for `train`; two or more for a choice by rotation. Options for reading the photos follow a colon:
     fern:downscale=4."""
     methods: tuple[str, ...] = ("paper-7k", "auto")
-    """Presets of `train`, or configuration files as for its --config."""
+    """Methods: auto (the default settings of `train`), its presets, or configuration files as for its --config. What
+    a file says of photos is ignored: it follows a dataset's name."""
     iterations: Annotated[tuple[int, ...], within(least=1, most=UINT32_MAX)] = ()
     """Numbers of iterations; default: that of each method."""
     seeds: Annotated[tuple[int, ...], within(least=0, most=UINT64_MAX)] = (0, 1)

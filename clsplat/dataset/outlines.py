@@ -1,15 +1,16 @@
-"""Points of an object before a plain background, from its outlines in the photos.
+"""The place of an object before a plain background, from its outlines in the photos.
 
 Few photos from all sides have few features in common, so that no points can be triangulated. But the object lies
 where no photo shows the background: in its visual hull (Laurentini 1994, doi:10.1109/34.273735), which is carved out
-of a grid (Martin and Aggarwal 1983, doi:10.1109/TPAMI.1983.4767367). Measured: docs/experiments/strategies.md.
+of a grid (Martin and Aggarwal 1983, doi:10.1109/TPAMI.1983.4767367). What is carved away stays free: Gaussians of the
+background's colour there would be seen from new viewpoints only, where they hide the object. Measured:
+docs/experiments/strategies.md.
 """
 
-from dataclasses import replace
-from itertools import pairwise
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clsplat.camera import focus_point
 from clsplat.dataset.coverage import projected
@@ -39,11 +40,21 @@ OUTSIDE = 0.1
 """Largest fraction of the photos with a point in their frames that show the background there: a part of the object
 may have the background's colour in one of them."""
 
-GRIDS = (64, 96)
-"""Numbers of cells along an edge of the grids: the first finds the object, the second lies around it."""
+GRIDS = (64, 64, 96)
+"""Numbers of cells along an edge of the grids: around all cameras, around what their frames have in common, in which
+the object is found, and around the object."""
 
 SEED = 0
 """Seed of the places of points within their cells."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A cube of cells: its centre (3,) and half its edge, world units, and whether a cell is free (n, n, n)."""
+
+    centre: Array
+    half: float
+    free: NDArray[np.bool_]
 
 
 def points_of_outlines(views: list[View]) -> tuple[Array, NDArray[np.uint8]]:
@@ -62,31 +73,75 @@ def points_of_outlines(views: list[View]) -> tuple[Array, NDArray[np.uint8]]:
     colors : (P, 3) uint8
         Their mean colours in the photos that do not show the background there.
     """
+    return _compared(views)[1:]
+
+
+def free_space(views: list[View]) -> list[Grid]:
+    """Find the cells of space in which no object is, since photos show a plain background behind them.
+
+    Parameters
+    ----------
+    views : list of View
+        Photos of an object from several sides.
+
+    Returns
+    -------
+    list of Grid
+        Grids around the object, the finest first. A cell is free if all around it are, for outlines are not exact.
+        Empty if the background is not plain.
+    """
     from scipy.ndimage import binary_erosion
 
-    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    around = np.ones((3, 3, 3), bool)
+    return [replace(g, free=binary_erosion(g.free, around, border_value=1)) for g in reversed(_compared(views)[0])]
+
+
+def in_free_space(points: ArrayLike, grids: list[Grid]) -> NDArray[np.bool_]:
+    """Whether points (P, 3) are in cells that are free in the finest of the grids that has them."""
+    points = np.asarray(points, np.float64)
+    found, free = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    for grid in grids:
+        count = len(grid.free)
+        cells = np.floor((points - grid.centre) / (2 * grid.half) * count + count / 2)
+        inside = ~found & ((cells >= 0) & (cells < count)).all(axis=1)
+        free[inside] = grid.free[tuple(cells[inside].astype(int).T)]
+        found |= inside
+    return free
+
+
+def _compared(views: list[View]) -> tuple[list[Grid], Array, NDArray[np.uint8]]:
+    """The grids, the coarsest first, and the points and colours of `points_of_outlines`."""
+    from scipy.ndimage import binary_erosion
+
+    grids: list[Grid] = []
+    points, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     views = evenly_spaced(views, MOST_PHOTOS)
     color = plain_color(views) if len(views) >= FEWEST_PHOTOS else None
     if color is None:
-        return nothing
+        return grids, points, colors
     cameras = [view.camera for view in views]
     centre = focus_point(cameras)
-    distance = np.median([np.linalg.norm(camera.position - centre) for camera in cameras])
-    half = float(distance * np.median([max(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]))
-    for count, following in pairwise([*GRIDS, 0]):
+    distances = [np.linalg.norm(camera.position - centre) for camera in cameras]
+    frame = float(np.median(distances) * np.median([max(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]))
+    half = max(float(max(distances)), frame)
+    for count in GRIDS:
         middles = half * ((2 * np.arange(count) + 1) / count - 1)
-        points = centre + np.stack(np.meshgrid(*[middles] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        inside, colors = _carved(points, views, color)
-        if not inside.any():
-            return nothing
-        if following:
-            low, high = points[inside].min(axis=0), points[inside].max(axis=0)
+        places = centre + np.stack(np.meshgrid(*[middles] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        inside, free, found = _carved(places, views, color)
+        volume = inside.reshape([count] * 3)
+        grids.append(Grid(centre, half, free.reshape(volume.shape)))
+        if len(grids) == 1:
+            half = frame
+        elif not inside.any():
+            break
+        elif len(grids) == len(GRIDS):
+            surface = (volume & ~binary_erosion(volume)).ravel()
+            offsets = stream(SEED, "points of a hull").uniform(-1, 1, (surface.sum(), 3))
+            points, colors = places[surface] + offsets * half / count, np.rint(found[surface]).astype(np.uint8)
+        else:
+            low, high = places[inside].min(axis=0), places[inside].max(axis=0)
             centre, half = (low + high) / 2, float((high - low).max() / 2 + 2 * half / count)
-    volume = inside.reshape([GRIDS[-1]] * 3)
-    surface = (volume & ~binary_erosion(volume)).ravel()
-    rng = stream(SEED, "points of a hull")
-    points = points[surface] + rng.uniform(-1, 1, (surface.sum(), 3)) * half / GRIDS[-1]
-    return points, np.rint(colors[surface]).astype(np.uint8)
+    return grids, points, colors
 
 
 def plain_color(views: list[View]) -> Array | None:
@@ -121,17 +176,21 @@ def _rim(view: View) -> NDArray[np.bool_]:
     return rim
 
 
-def _carved(points: Array, views: list[View], color: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Whether points (P, 3) are inside the outlines, and their mean colours (P, 3) there, from 0 to 255."""
+def _carved(points: Array, views: list[View], color: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
+    """Whether points (P, 3) are inside the outlines, and outside of them, and their mean colours (P, 3), 0 to 255.
+
+    Points that few photos show are neither.
+    """
     shown, outside, sums = np.zeros(len(points), int), np.zeros(len(points), int), np.zeros((len(points), 3))
     left = np.arange(len(points))
     for view in in_turn(views):
-        places, _, inside = projected(replace(view.camera, near=FLOAT32_TINY), points[left])
-        column, row = places[inside].astype(int).T
-        rows, behind = left[inside], background(view, color)[row, column]
+        places, _, seen = projected(replace(view.camera, near=FLOAT32_TINY), points[left])
+        column, row = places[seen].astype(int).T
+        rows, behind = left[seen], background(view, color)[row, column]
         shown[rows] += 1
         outside[rows] += behind
         sums[rows] += np.where(behind[:, None], 0, view.image[row, column])
         left = left[outside[left] <= OUTSIDE * len(views)]  # no number of other photos would make up for more
-    kept = (shown >= max(FEWEST_PHOTOS, SHOWN * len(views))) & (outside <= OUTSIDE * shown)
-    return kept, sums / np.maximum(shown - outside, 1)[:, None]
+    free = outside > OUTSIDE * shown
+    inside = ~free & (shown >= max(FEWEST_PHOTOS, SHOWN * len(views)))
+    return inside, free, sums / np.maximum(shown - outside, 1)[:, None]

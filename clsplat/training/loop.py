@@ -174,5 +174,6 @@ def finish(training: Training, out: Path) -> Gaussians:
         shown = shown_by_any(gaussians, cameras, training.renderer)
         if may_have_sky(scene, training.config):
             shown |= beyond(gaussians, scene)
+        shown &= ~training.in_free_space(gaussians)
         gaussians = gaussians.take(shown) if shown.any() else gaussians
     return without_invisible(gaussians)

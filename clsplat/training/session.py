@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.constants import ALPHA_MIN
+from clsplat.dataset.outlines import Grid, free_space, in_free_space
 from clsplat.gaussians import Gaussians, logit
 from clsplat.randomness import stream
 from clsplat.renderer import Renderer
@@ -26,7 +27,7 @@ from clsplat.training.densify import Contributions, Edit
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
 from clsplat.training.optimizer import Optimizer, adam_settings
 from clsplat.training.rows import without_harmonics
-from clsplat.training.sky_start import BEYOND
+from clsplat.training.sky_start import BEYOND, may_have_sky
 from clsplat.training.state import State
 
 if TYPE_CHECKING:
@@ -75,6 +76,16 @@ class Training:
         """Viewpoints and slope for `clsplat.training.camera_room`."""
         cameras = [view.camera for view in self.scene.train]
         return viewpoints(cameras), steepest_slope(cameras)
+
+    def in_free_space(self, gaussians: Gaussians) -> NDArray[np.bool_]:
+        """Whether Gaussians on the host lie where photos show a plain background, if the strategy leaves room."""
+        if not self.state.strategy.leaves_room or self.renderer.backdrop is not None:
+            return np.zeros(len(gaussians), bool)
+        return in_free_space(gaussians.means, self._free_space)
+
+    @cached_property
+    def _free_space(self) -> list[Grid]:
+        return free_space(self.scene.train) if may_have_sky(self.scene, self.config) else []
 
     def fork(self, state: State) -> "Training":
         """Make a training of the same scene that continues from another state."""
@@ -171,7 +182,12 @@ class Training:
         edit = state.strategy.edit(state.iteration, gaussians, cap, survey)
         if edit.reset_opacities and state.filter:
             reset_shown(edit, gaussians, without_harmonics(state.shown(self.renderer)))
-        return edit._replace(gaussians=self.with_room(edit.gaussians))
+        edit = edit._replace(gaussians=self.with_room(edit.gaussians))
+        kept = ~self.in_free_space(edit.gaussians)
+        if kept.all() or not kept.any():
+            return edit
+        state.strategy.keep(kept)
+        return edit._replace(gaussians=edit.gaussians.take(kept), rows=edit.rows[kept], fresh=edit.fresh[kept])
 
 
 def step(training: Training, view: View) -> float:

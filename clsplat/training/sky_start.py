@@ -1,4 +1,4 @@
-"""Gaussians of the sky: far behind the scene, where photos show a smooth region above it.
+"""Gaussians of the sky: far behind the scene, where photos show a smooth region above it, or a plain background.
 
 Features find no points in the sky. Without Gaussians there, training explains it by large ones in the air before the
 scene, where other views see them as haze. The sky box of Kerbl et al. 2024, "A hierarchical 3D Gaussian
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset.coverage import projected
+from clsplat.dataset.outlines import background, plain_color
 from clsplat.gaussians import Gaussians
 from clsplat.scene import Scene, View, evenly_spaced, in_turn
 from clsplat.training.dense_start import MOST_PHOTOS
@@ -117,12 +118,15 @@ def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
     """Make the Gaussians of the sky; None if the photos show no sky.
 
     They lie on a sphere around the cameras, in all directions that are sky in each photo that looks there, of at most
-    `MOST_PHOTOS`, and in directions nearby into which no photo looks.
+    `MOST_PHOTOS`, and in directions nearby into which no photo looks. A plain background around an object
+    (`clsplat.dataset.outlines`) is sky below the horizon, too.
     """
     from scipy.spatial import cKDTree
 
-    up = vertical([view.camera for view in scene.train])
-    if up is None:
+    views = evenly_spaced(scene.train, MOST_PHOTOS)
+    plain = plain_color(views)
+    up = vertical([view.camera for view in scene.train]) if plain is None else None
+    if up is None and plain is None:
         return None
     directions = sphere(round(4 * np.pi / SPACING**2))
     centre = np.mean([view.camera.position for view in scene.train], axis=0)
@@ -130,8 +134,8 @@ def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
     distance = max(DISTANCE * scene.extent, reach)
     means = centre + distance * directions
     colors, shown, as_sky = np.zeros_like(means), np.zeros(len(means), int), np.zeros(len(means), int)
-    for view in in_turn(evenly_spaced(scene.train, MOST_PHOTOS)):
-        cells, averages, edge = sky_cells(view, scene.points, up)
+    for view in in_turn(views):
+        cells, averages, edge = sky_cells(view, scene.points, up, plain)
         places, _, inside = projected(view.camera, means)
         rows = np.flatnonzero(inside)
         column, row = (places[rows] // edge).astype(int).T
@@ -145,7 +149,9 @@ def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
     if not kept.any():
         return None
     away, nearest = cKDTree(directions[kept]).query(directions)
-    unseen = (shown == 0) & (directions @ up > 0) & (away < UNSEEN)
+    unseen = (shown == 0) & (away < UNSEEN)
+    if up is not None:
+        unseen &= directions @ up > 0
     colors[unseen] = colors[kept][nearest[unseen]]
     chosen = kept | unseen
     init = replace(config.init, opacity=OPACITY)
@@ -175,7 +181,9 @@ def vertical(cameras: list[Camera]) -> Array | None:
     return up if up @ mean > 0 else -up
 
 
-def sky_cells(view: View, points: Array, up: Array) -> tuple[NDArray[np.bool_], Array, int]:
+def sky_cells(
+    view: View, points: Array, up: Array | None, plain: Array | None = None
+) -> tuple[NDArray[np.bool_], Array, int]:
     """Find the square cells of a photo that show the sky: smooth, without points, and joined to the photo's edge.
 
     Parameters
@@ -184,8 +192,10 @@ def sky_cells(view: View, points: Array, up: Array) -> tuple[NDArray[np.bool_], 
         With its arrays in memory.
     points : (P, 3)
         In world units.
-    up : (3,)
-        Unit vector, world.
+    up : (3,), optional
+        Unit vector, world. Without it, cells are those of a plain background.
+    plain : (3,), optional
+        Colour of the plain background, RGB from 0 to 1.
 
     Returns
     -------
@@ -207,12 +217,16 @@ def sky_cells(view: View, points: Array, up: Array) -> tuple[NDArray[np.bool_], 
     sums, squares = (_cell_sums(values, edge)[:, :, 0] for values in (grey, grey**2))
     deviation = np.sqrt(edge**2 * squares - sums**2) / (3 * 255 * edge**2)
     counts = view.counts if view.clear is None else view.counts & (view.clear == 0)
+    if plain is not None:
+        counts = counts & background(view, plain)
     whole = np.pad(counts, padding, mode="edge").reshape(rows, edge, columns, edge).all(axis=(1, 3))
 
     places, _, inside = projected(camera, points)
     empty = np.ones((rows, columns), bool)
     column, row = (places[inside] // edge).astype(int).T
     empty[row, column] = False
+    if up is None:
+        return whole & empty, averages, edge
     x, y = np.meshgrid(edge * (np.arange(columns) + 0.5), edge * (np.arange(rows) + 0.5))
     sines = camera.rays(x, y) @ (camera.viewmat[:3, :3] @ up)  # NaN where a fisheye sees nothing
 

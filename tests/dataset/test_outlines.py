@@ -9,7 +9,7 @@ from PIL import Image
 from clsplat.camera import Camera
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene_with_points
-from clsplat.dataset.outlines import background, plain_color, points_of_outlines
+from clsplat.dataset.outlines import background, free_space, in_free_space, plain_color, points_of_outlines
 from clsplat.scene import View
 
 RADIUS, PLACE = 0.5, np.array([3.0, -2.0, 5.0])
@@ -62,12 +62,29 @@ def test_a_small_object_has_points_too() -> None:
     assert len(points) > 5_000 and away.max() < 0.12
 
 
+def test_space_before_a_plain_background_is_free() -> None:
+    views = around()
+    grids = free_space(views)
+    assert [len(grid.free) for grid in grids] == [96, 64, 64]
+    cameras = np.array([view.camera.position for view in views])
+    directions = np.random.default_rng(0).normal(size=(500, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ball = PLACE + RADIUS * directions
+    assert not in_free_space(ball, grids).any()
+    between = PLACE + np.linspace(0.35, 0.8, 10)[:, None, None] * (cameras - PLACE)
+    assert in_free_space(between.reshape(-1, 3), grids).mean() > 0.9
+    # What no photo shows is not free: behind the cameras, and far away.
+    assert not in_free_space(PLACE + 1.05 * (cameras - PLACE), grids).any()
+    assert not in_free_space(PLACE + 30 * directions, grids).any()
+
+
 def test_photos_without_a_plain_background_have_no_outlines() -> None:
     rng = np.random.default_rng(1)
     views = [replace(view, image=rng.integers(0, 256, view.image.shape, np.uint8)) for view in around()]
     assert plain_color(views) is None
     for found in points_of_outlines(views):
         assert found.shape == (0, 3)
+    assert free_space(views) == [] and not in_free_space(np.zeros((3, 3)), []).any()
     # An object that covers half of the photos' edges.
     views = around()
     for view in views:

@@ -7,6 +7,7 @@ import pytest
 
 from clsplat.camera import Camera
 from clsplat.config import DataConfig, InitConfig, TrainConfig
+from clsplat.dataset.outlines import free_space, in_free_space
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
 from clsplat.scene import Scene, View
@@ -212,6 +213,50 @@ def test_the_background_needs_no_sky() -> None:
     for view in views:
         view.image[: HEIGHT // 2] = 249
     assert sky_gaussians(square(views), white) is not None
+
+
+def in_a_studio(color=(90, 140, 220)):
+    """Photos from all around, level and from above, of noise before a plain background."""
+    views = []
+    for k in range(12):
+        angle, height = 2 * np.pi * k / 12, -0.8 * (k % 2)
+        image = np.full((HEIGHT, WIDTH, 3), color, np.uint8)
+        image[20:40, 30:50] = np.random.default_rng(k).integers(0, 256, (20, 20, 3))
+        views.append(View(f"{k}.png", camera((np.cos(angle), height, np.sin(angle)), (0, 0, 0)), image))
+    points = np.random.default_rng(1).uniform(-0.1, 0.1, (3000, 3))
+    return Scene(views, [], points, np.zeros(points.shape, np.uint8))
+
+
+def test_a_plain_background_is_sky_below_the_horizon_too() -> None:
+    scene = in_a_studio()
+    sky = sky_gaussians(scene, CONFIG)
+    assert sky is not None
+    directions = sky.means / np.linalg.norm(sky.means, axis=1, keepdims=True)
+    heights = directions @ UP
+    # Cameras 0.8 above look down by 0.67 radians; their photos reach 0.54 farther, and the sky 0.5 beyond them.
+    assert heights.min() < -0.98 and heights.max() > 0.7
+    np.testing.assert_allclose(0.5 + 0.28209479 * sky.sh[:, 0], np.broadcast_to(BLUE / 255, (len(sky), 3)), atol=1e-6)
+    cells, _, edge = sky_cells(scene.train[0], scene.points, None, BLUE / 255)
+    assert cells[0].all() and cells[-1].all() and not cells[20 // edge : 40 // edge, 32 // edge : 48 // edge].any()
+    assert sky_gaussians(in_a_studio((255, 255, 255)), replace(CONFIG, data=DataConfig(background="white"))) is None
+
+
+@pytest.mark.parametrize("iterations", [3, 60], ids=["at the end", "and in rounds"])
+def test_a_training_leaves_the_space_before_a_plain_background_free(device: Device, tmp_path, iterations) -> None:
+    """Gaussians of the background's colour in front of the object are in no photo's way, and in that of others."""
+    scene = in_a_studio()
+    away = np.array([view.camera.position for view in scene.train])
+    points = np.concatenate([scene.points, 0.5 * np.repeat(away, 20, axis=0)])
+    colors = np.concatenate([scene.colors, np.tile(BLUE.astype(np.uint8), (len(away) * 20, 1))])
+    points[-len(away) * 20 :] += np.random.default_rng(0).normal(0, 0.02, (len(away) * 20, 3))
+    scene, grids, left = replace(scene, points=points, colors=colors), free_space(scene.train), {}
+    for sky in True, False:
+        init = InitConfig(sky=sky, dense=False)
+        config = replace(CONFIG, iterations=iterations, size="fixed", max_gaussians=6000, init=init)
+        trained = train(scene, config, tmp_path / str(sky), device)
+        left[sky] = int(in_free_space(trained.means, grids).sum())
+        assert len(trained) > 1000
+    assert left[True] == 0 < left[False]
 
 
 def test_a_start_without_sky_is_unchanged() -> None:

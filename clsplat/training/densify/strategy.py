@@ -76,11 +76,16 @@ class Strategy:
     """Opacity of the first Gaussians, where the user gives none."""
 
     leaves_room = False
-    """Whether Gaussians that reach a viewpoint are shrunk (`clsplat.training.camera_room`), and those that no photo
-    shows are removed at the end: both would be seen from new viewpoints only."""
+    """Whether Gaussians that reach a viewpoint are shrunk (`clsplat.training.camera_room`), and those removed that
+    lie before a plain background (`clsplat.dataset.outlines`) or, at the end, that no photo shows: all of them would
+    be seen from new viewpoints only."""
 
     def __init__(self, config: TrainConfig, extent: float, n: int) -> None:
         self.statistics: dict[str, Any] = {}
+
+    def keep(self, kept: NDArray[np.bool_]) -> None:
+        """Follow the removal of some rows of the last edit; its statistics are on the host."""
+        self.statistics = {name: array[kept] for name, array in self.statistics.items()}
 
     def on(self, device: "Device | None") -> "Strategy":
         """The strategy with its statistics on the device, or on the host for None."""
