@@ -73,8 +73,7 @@ def test_space_before_a_plain_background_is_free() -> None:
     assert not in_free_space(ball, grids).any()
     between = PLACE + np.linspace(0.35, 0.8, 10)[:, None, None] * (cameras - PLACE)
     assert in_free_space(between.reshape(-1, 3), grids).mean() > 0.9
-    # What no photo shows is not free: behind the cameras, and far away.
-    assert not in_free_space(PLACE + 1.05 * (cameras - PLACE), grids).any()
+    # Nothing is known of what is far away.
     assert not in_free_space(PLACE + 30 * directions, grids).any()
 
 
