@@ -276,7 +276,7 @@ class FewViewsConfig:
     """Settings for few photos (reasons: clsplat.training.few_views; effects: docs/experiments/strategies.md)."""
 
     below: Annotated[int, within(least=0)] = 17
-    """Number of training photos below which all settings for few photos apply (0: none). Up to 23, some of them do."""
+    """Number of training photos below which all settings for few photos apply (0: none). Up to 23, some do."""
     dropout: PartialFraction = 0.2
     """Fraction of splats left out of each image at the end (DropGaussian); half of it with more photos, up to 23."""
     growth: Positive = 8.0

@@ -41,8 +41,8 @@ OUTSIDE = 0.1
 may have the background's colour in one of them."""
 
 GRIDS = (64, 64, 96)
-"""Numbers of cells along an edge of the grids: around all cameras, around what their frames have in common, in which
-the object is found, and around the object."""
+"""Largest numbers of cells along an edge of the grids, and no more than pixels along the photos' longer edge: around
+all cameras, around what their frames have in common, in which the object is found, and around the object."""
 
 SEED = 0
 """Seed of the places of points within their cells."""
@@ -124,7 +124,8 @@ def _compared(views: list[View]) -> tuple[list[Grid], Array, NDArray[np.uint8]]:
     distances = [np.linalg.norm(camera.position - centre) for camera in cameras]
     frame = float(np.median(distances) * np.median([max(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]))
     half = max(float(max(distances)), frame)
-    for count in GRIDS:
+    edge = max(max(camera.width, camera.height) for camera in cameras)
+    for count in (min(most, edge) for most in GRIDS):
         middles = half * ((2 * np.arange(count) + 1) / count - 1)
         places = centre + np.stack(np.meshgrid(*[middles] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         inside, free, found = _carved(places, views, color)
