@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.constants import ALPHA_MIN
-from clsplat.dataset.outlines import Grid, free_space, in_free_space
+from clsplat.dataset.outlines import Grid, in_free_space
 from clsplat.gaussians import Gaussians, logit
 from clsplat.randomness import stream
 from clsplat.renderer import Renderer
@@ -27,7 +27,7 @@ from clsplat.training.densify import Contributions, Edit
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
 from clsplat.training.optimizer import Optimizer, adam_settings
 from clsplat.training.rows import without_harmonics
-from clsplat.training.sky_start import BEYOND, may_have_sky
+from clsplat.training.sky_start import BEYOND, empty_space, may_have_sky
 from clsplat.training.state import State
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class Training:
 
     @cached_property
     def _free_space(self) -> list[Grid]:
-        return free_space(self.scene.train) if may_have_sky(self.scene, self.config) else []
+        return empty_space(self.scene) if may_have_sky(self.scene, self.config) else []
 
     def fork(self, state: State) -> "Training":
         """Make a training of the same scene that continues from another state."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.dataset.coverage import projected
-from clsplat.dataset.outlines import background, plain_color
+from clsplat.dataset.outlines import Grid, background, free_space, in_free_space, plain_color
 from clsplat.gaussians import Gaussians
 from clsplat.scene import Scene, View, evenly_spaced, in_turn
 from clsplat.training.dense_start import MOST_PHOTOS
@@ -66,6 +66,9 @@ cameras leave the vertical open, as they do if all look into one direction."""
 UNSEEN = 0.5
 """Angle from the sky that photos show to which it continues where no photo looks, radians."""
 
+ON_BACKGROUND = 0.02
+"""Largest fraction of the points that may lie before a plain background, as wrong ones do."""
+
 DIFFERENCE = 0.02
 """Largest difference of a colour from the background's, from 0 to 1, with which the background is the sky."""
 
@@ -108,6 +111,15 @@ def may_have_sky(scene: Scene, config: TrainConfig) -> bool:
     return config.init.sky and len(scene.points) > 0
 
 
+def empty_space(scene: Scene) -> list[Grid]:
+    """Grids of the space before a plain background (`clsplat.dataset.outlines`); none where it has points.
+
+    Points there show that what looks like a background is a surface, such as the wall of a room.
+    """
+    grids = free_space(scene.train)
+    return grids if grids and in_free_space(scene.points, grids).mean() <= ON_BACKGROUND else []
+
+
 def beyond(gaussians: Gaussians, scene: Scene) -> NDArray[np.bool_]:
     """Tell which Gaussians are so far away that no part of the scene is behind them."""
     centre = np.mean([view.camera.position for view in scene.train], axis=0)
@@ -124,7 +136,7 @@ def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
     from scipy.spatial import cKDTree
 
     views = evenly_spaced(scene.train, MOST_PHOTOS)
-    plain = plain_color(views)
+    plain = plain_color(views) if empty_space(scene) else None
     up = vertical([view.camera for view in scene.train]) if plain is None else None
     if up is None and plain is None:
         return None

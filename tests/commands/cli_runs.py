@@ -61,4 +61,14 @@ def fails(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return lines[0]
 
 
-TRAIN = ("--iterations", 20, "--init.random-points", 200, "--checkpoint-every", 10, "--eval-every", 10)
+TRAIN = (
+    "--iterations",
+    20,
+    "--init.random-points",
+    200,
+    "--init.no-triangulate",
+    "--checkpoint-every",
+    10,
+    "--eval-every",
+    10,
+)
