@@ -246,9 +246,9 @@ def test_a_training_leaves_the_space_before_a_plain_background_free(device: Devi
     """Gaussians of the background's colour in front of the object are in no photo's way, and in that of others."""
     scene = in_a_studio()
     away = np.array([view.camera.position for view in scene.train])
-    points = np.concatenate([scene.points, 0.5 * np.repeat(away, 20, axis=0)])
-    colors = np.concatenate([scene.colors, np.tile(BLUE.astype(np.uint8), (len(away) * 20, 1))])
-    points[-len(away) * 20 :] += np.random.default_rng(0).normal(0, 0.02, (len(away) * 20, 3))
+    points = np.concatenate([scene.points, 0.5 * np.repeat(away, 4, axis=0)])
+    colors = np.concatenate([scene.colors, np.tile(BLUE.astype(np.uint8), (len(away) * 4, 1))])
+    points[-len(away) * 4 :] += np.random.default_rng(0).normal(0, 0.02, (len(away) * 4, 3))
     scene, grids, left = replace(scene, points=points, colors=colors), free_space(scene.train), {}
     for sky in True, False:
         init = InitConfig(sky=sky, dense=False)
