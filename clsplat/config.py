@@ -117,7 +117,7 @@ class InitConfig:
     dense: bool = True
     """Add points where neighbouring photos agree on a depth, if there are few sparse points for the photos' size."""
     sky: bool = True
-    """Start with Gaussians of the sky, far behind the scene, where photos show a smooth region above it."""
+    """Start with distant Gaussians of the sky, where photos show a smooth region above or all around the scene."""
     random_points: Annotated[int | None, within(least=1, most=UINT32_MAX)] = None
     """Number of Gaussians of a random start, if there are no points. Default: 100 000 (original), or 10 000 with
     --size auto, which adds more where they are needed."""

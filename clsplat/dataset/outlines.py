@@ -7,6 +7,7 @@ background's colour there would be seen from new viewpoints only, where they hid
 docs/experiments/strategies.md.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -96,7 +97,7 @@ def free_space(views: list[View]) -> list[Grid]:
     return [replace(g, free=binary_erosion(g.free, around, border_value=1)) for g in reversed(_compared(views)[0])]
 
 
-def in_free_space(points: ArrayLike, grids: list[Grid]) -> NDArray[np.bool_]:
+def in_free_space(points: ArrayLike, grids: Sequence[Grid]) -> NDArray[np.bool_]:
     """Whether points (P, 3) are in cells that are free in the finest of the grids that has them."""
     points = np.asarray(points, np.float64)
     found, free = np.zeros(len(points), bool), np.zeros(len(points), bool)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat.config import TrainConfig
 from clsplat.dataset.near_planes import with_near_planes
+from clsplat.dataset.outlines import in_free_space
 from clsplat.errors import BuildError, DeviceError, InputError, driver_errors
 from clsplat.gaussians import Gaussians
 from clsplat.inputs import Inputs
@@ -28,7 +29,7 @@ from clsplat.training.recorder import Recorder
 from clsplat.training.run_folder import held
 from clsplat.training.run_length import with_length
 from clsplat.training.session import Training
-from clsplat.training.sky_start import beyond, may_have_sky, with_sky
+from clsplat.training.sky_start import beyond, empty_space, may_have_sky, with_sky
 from clsplat.training.state import initial_state, start_config
 
 if TYPE_CHECKING:
@@ -96,18 +97,18 @@ def train(
     scene, config = with_near_planes(scene), with_length(config, scene)
     out, device = Path(out), device or open_device(config)
     with held(out):
-        inputs = Inputs.of(scene, device)
+        inputs, empty = Inputs.of(scene, device), empty_space(scene, config)
         if resume:
             state = load_state(out / CHECKPOINT, scene.extent, config, inputs)
         else:
             started = time.perf_counter()
             start = first_points(scene, config, device)
             gaussians = initialize(start, start_config(config), config.seed, config.max_gaussians)
-            gaussians = with_sky(gaussians, start, config)
+            gaussians = with_sky(gaussians, start, config, plain=bool(empty))
             state = replace(initial_state(scene, config, gaussians), inputs=inputs)
             state.seconds = time.perf_counter() - started
         state.inputs.demand(scene)
-        training = Training(scene, config, device, state)
+        training = Training(scene, config, device, state, empty=empty)
         return complete(training, out, evaluate=evaluate, evaluate_after=evaluate_after, progress=progress)
 
 
@@ -174,6 +175,6 @@ def finish(training: Training, out: Path) -> Gaussians:
         shown = shown_by_any(gaussians, cameras, training.renderer)
         if may_have_sky(scene, training.config):
             shown |= beyond(gaussians, scene)
-        shown &= ~training.in_free_space(gaussians)
+        shown &= ~in_free_space(gaussians.means, training.empty)
         gaussians = gaussians.take(shown) if shown.any() else gaussians
     return without_invisible(gaussians)

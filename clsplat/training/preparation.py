@@ -156,7 +156,6 @@ def of_fixed_size(config: TrainConfig, gaussians: int, rate: float) -> TrainConf
         max_gaussians=gaussians,
         optim=replace(config.optim, means_lr=rate * config.optim.means_lr, sh_degree_every=1),
         coarse=CoarseConfig(factor=1),
-        init=replace(config.init, sky=False),  # removes Gaussians before a plain background
     )
 
 

@@ -1,7 +1,7 @@
 """A training session: iterations of algorithm 1 of Kerbl et al. 2023, which can be run up to a point and forked."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from functools import cached_property, lru_cache
 from math import ceil
@@ -27,7 +27,7 @@ from clsplat.training.densify import Contributions, Edit
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
 from clsplat.training.optimizer import Optimizer, adam_settings
 from clsplat.training.rows import without_harmonics
-from clsplat.training.sky_start import BEYOND, empty_space, may_have_sky
+from clsplat.training.sky_start import BEYOND
 from clsplat.training.state import State
 
 if TYPE_CHECKING:
@@ -47,12 +47,20 @@ class Training:
         State from which the training continues.
     backdrop : Gaussians, optional
         Gaussians that are drawn in every image and do not train, such as the surroundings of a block.
+    empty : sequence of Grid
+        Space that is kept free of Gaussians, as from `clsplat.training.sky_start.empty_space`.
     """
 
     def __init__(
-        self, scene: Scene, config: TrainConfig, device: "Device", state: State, backdrop: Gaussians | None = None
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        device: "Device",
+        state: State,
+        backdrop: Gaussians | None = None,
+        empty: Sequence[Grid] = (),
     ):
-        self.scene, self.config, self.device, self.state = scene, config, device, state
+        self.scene, self.config, self.device, self.state, self.empty = scene, config, device, state, empty
         self.renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background], backdrop)
         self.optimizer = Optimizer(self.renderer, config.optimizer)
         self.photos = Photos(device)
@@ -76,16 +84,6 @@ class Training:
         """Viewpoints and slope for `clsplat.training.camera_room`."""
         cameras = [view.camera for view in self.scene.train]
         return viewpoints(cameras), steepest_slope(cameras)
-
-    def in_free_space(self, gaussians: Gaussians) -> NDArray[np.bool_]:
-        """Whether Gaussians on the host lie where photos show a plain background, if the strategy leaves room."""
-        if not self.state.strategy.leaves_room or self.renderer.backdrop is not None:
-            return np.zeros(len(gaussians), bool)
-        return in_free_space(gaussians.means, self._free_space)
-
-    @cached_property
-    def _free_space(self) -> list[Grid]:
-        return empty_space(self.scene) if may_have_sky(self.scene, self.config) else []
 
     def fork(self, state: State) -> "Training":
         """Make a training of the same scene that continues from another state."""
@@ -183,7 +181,7 @@ class Training:
         if edit.reset_opacities and state.filter:
             reset_shown(edit, gaussians, without_harmonics(state.shown(self.renderer)))
         edit = edit._replace(gaussians=self.with_room(edit.gaussians))
-        kept = ~self.in_free_space(edit.gaussians)
+        kept = ~in_free_space(edit.gaussians.means, self.empty)
         if kept.all() or not kept.any():
             return edit
         state.strategy.keep(kept)

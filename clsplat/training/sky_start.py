@@ -18,6 +18,7 @@ from clsplat.dataset.outlines import Grid, background, free_space, in_free_space
 from clsplat.gaussians import Gaussians
 from clsplat.scene import Scene, View, evenly_spaced, in_turn
 from clsplat.training.dense_start import MOST_PHOTOS
+from clsplat.training.densify import STRATEGIES
 from clsplat.training.initialize import from_points
 
 Array = NDArray[np.float64]
@@ -73,7 +74,7 @@ DIFFERENCE = 0.02
 """Largest difference of a colour from the background's, from 0 to 1, with which the background is the sky."""
 
 
-def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussians:
+def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig, plain: bool = False) -> Gaussians:
     """Add Gaussians of the sky to the first ones of a training, if the configuration asks for them.
 
     Where there may be no more than `config.max_gaussians`, they replace others, evenly spaced. They are at most half:
@@ -86,6 +87,8 @@ def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussia
     scene : Scene
         Its training photos show the sky, and its points tell what is not sky.
     config : TrainConfig
+    plain : bool
+        Whether the background is plain, as `empty_space` tells.
 
     Returns
     -------
@@ -95,7 +98,7 @@ def with_sky(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> Gaussia
     """
     if not may_have_sky(scene, config):
         return gaussians
-    sky = sky_gaussians(scene, config)
+    sky = sky_gaussians(scene, config, plain)
     if sky is None:
         return gaussians
     both = len(gaussians) + len(sky)
@@ -111,11 +114,14 @@ def may_have_sky(scene: Scene, config: TrainConfig) -> bool:
     return config.init.sky and len(scene.points) > 0
 
 
-def empty_space(scene: Scene) -> list[Grid]:
-    """Grids of the space before a plain background (`clsplat.dataset.outlines`); none where it has points.
+def empty_space(scene: Scene, config: TrainConfig) -> list[Grid]:
+    """Grids of the space before a plain background (`clsplat.dataset.outlines`) that a training keeps free.
 
-    Points there show that what looks like a background is a surface, such as the wall of a room.
+    None if the configuration has no sky or a strategy that leaves no room, or if there are points in it: what looks
+    like a background is then a surface, such as the wall of a room.
     """
+    if not may_have_sky(scene, config) or not STRATEGIES[config.strategy].leaves_room:
+        return []
     grids = free_space(scene.train)
     return grids if grids and in_free_space(scene.points, grids).mean() <= ON_BACKGROUND else []
 
@@ -126,19 +132,19 @@ def beyond(gaussians: Gaussians, scene: Scene) -> NDArray[np.bool_]:
     return np.asarray(np.linalg.norm(gaussians.means - centre, axis=1) > BEYOND * scene.extent)
 
 
-def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
+def sky_gaussians(scene: Scene, config: TrainConfig, plain: bool = False) -> Gaussians | None:
     """Make the Gaussians of the sky; None if the photos show no sky.
 
     They lie on a sphere around the cameras, in all directions that are sky in each photo that looks there, of at most
-    `MOST_PHOTOS`, and in directions nearby into which no photo looks. A plain background around an object
-    (`clsplat.dataset.outlines`) is sky below the horizon, too.
+    `MOST_PHOTOS`, and in directions nearby into which no photo looks. A plain background is sky below the horizon,
+    too.
     """
     from scipy.spatial import cKDTree
 
     views = evenly_spaced(scene.train, MOST_PHOTOS)
-    plain = plain_color(views) if empty_space(scene) else None
-    up = vertical([view.camera for view in scene.train]) if plain is None else None
-    if up is None and plain is None:
+    color = plain_color(views) if plain else None
+    up = vertical([view.camera for view in scene.train]) if color is None else None
+    if up is None and color is None:
         return None
     directions = sphere(round(4 * np.pi / SPACING**2))
     centre = np.mean([view.camera.position for view in scene.train], axis=0)
@@ -147,7 +153,7 @@ def sky_gaussians(scene: Scene, config: TrainConfig) -> Gaussians | None:
     means = centre + distance * directions
     colors, shown, as_sky = np.zeros_like(means), np.zeros(len(means), int), np.zeros(len(means), int)
     for view in in_turn(views):
-        cells, averages, edge = sky_cells(view, scene.points, up, plain)
+        cells, averages, edge = sky_cells(view, scene.points, up, color)
         places, _, inside = projected(view.camera, means)
         rows = np.flatnonzero(inside)
         column, row = (places[rows] // edge).astype(int).T
@@ -194,7 +200,7 @@ def vertical(cameras: list[Camera]) -> Array | None:
 
 
 def sky_cells(
-    view: View, points: Array, up: Array | None, plain: Array | None = None
+    view: View, points: Array, up: Array | None, color: Array | None = None
 ) -> tuple[NDArray[np.bool_], Array, int]:
     """Find the square cells of a photo that show the sky: smooth, without points, and joined to the photo's edge.
 
@@ -206,7 +212,7 @@ def sky_cells(
         In world units.
     up : (3,), optional
         Unit vector, world. Without it, cells are those of a plain background.
-    plain : (3,), optional
+    color : (3,), optional
         Colour of the plain background, RGB from 0 to 1.
 
     Returns
@@ -229,8 +235,8 @@ def sky_cells(
     sums, squares = (_cell_sums(values, edge)[:, :, 0] for values in (grey, grey**2))
     deviation = np.sqrt(edge**2 * squares - sums**2) / (3 * 255 * edge**2)
     counts = view.counts if view.clear is None else view.counts & (view.clear == 0)
-    if plain is not None:
-        counts = counts & background(view, plain)
+    if color is not None:
+        counts = counts & background(view, color)
     whole = np.pad(counts, padding, mode="edge").reshape(rows, edge, columns, edge).all(axis=(1, 3))
 
     places, _, inside = projected(camera, points)

@@ -1,5 +1,8 @@
 """Fields of few parameters and short steps, for tests."""
 
+import pytest
+
+from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.fields.ingp import IngpBase
 from clsplat.fields.mipnerf360 import MipNerf360Small
 from clsplat.fields.nerf import NerfSmall
@@ -31,3 +34,14 @@ class SmallMipNerf360(MipNerf360Small):
     width, features, color_width, proposal_width, levels = 32, 32, 16, 16, 4
     proposals, samples, rays = 16, 12, 128
     rate = 1e-2
+
+
+WHITE = BACKGROUNDS["white"]
+CONFIG = TrainConfig(iterations=250, data=DataConfig(background="white"))
+
+SMALL = [SmallIngp, SmallPlenoxels, SmallNerf, SmallMipNerf360]
+EACH = pytest.mark.parametrize("method", SMALL, ids=lambda m: m.name)
+
+CASES = [*((method, False) for method in SMALL), (SmallPlenoxels, True)]
+ALL = pytest.mark.parametrize(("method", "room"), CASES, ids=lambda v: v.name if isinstance(v, type) else f"room={v}")
+"""All methods without a background, and the one with it whose model then has other arrays."""

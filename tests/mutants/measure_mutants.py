@@ -44,7 +44,7 @@ WHOLE = (
 )
 """Tests of the whole renderer and of training, for mutants that the tests of their file do not see."""
 
-FIELDS = ("tests/fields/test_layers.py", "tests/fields/test_fields.py")
+FIELDS = tuple(f"tests/fields/test_{name}.py" for name in ("layers", "fields", "field_files"))
 """Tests of the training of radiance fields, in the place of those of the renderer."""
 
 FIELD_STAGES = (

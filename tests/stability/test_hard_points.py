@@ -1,6 +1,7 @@
 """Points and poses far from what a scene has: duplicates, outliers, cameras that see nothing, impossible poses."""
 
 import resource
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -147,7 +148,9 @@ def test_a_pose_at_another_place_altogether_fails_by_a_sentence(scene, trained):
 @pytest.mark.slow
 def test_five_million_gaussians_fit_24_gb(scene, device, tmp_path, monkeypatch):
     """One iteration, and a render, of tiny photos; without the search for neighbours, which takes minutes."""
-    monkeypatch.setattr("clsplat.training.initialize._variances", lambda points: np.full(len(points), 0.005**2))
+    # By its name, the module is hidden by the function that the package exports.
+    module = sys.modules["clsplat.training.initialize"]
+    monkeypatch.setattr(module, "_variances", lambda points: np.full(len(points), 0.005**2))
     count = 5_000_000
     points = np.random.default_rng(0).uniform(-0.7, 0.7, (count, 3))
     config = replace(CONFIG, iterations=1, max_gaussians=count, init=InitConfig(sh_degree=3))

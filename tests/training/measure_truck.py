@@ -6,19 +6,18 @@ clsplat bench quality OUT:downscale=2 OUT:downscale=2:thin=2 OUT:downscale=2:thi
 
 import json
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from rendered_photos import write_photos
 
-from clsplat import render
 from clsplat.camera import Camera
 from clsplat.formats import load_gaussians
 
 WIDTH, HEIGHT, FOCAL = 800, 600, 528.0
 SKY = (0.6, 0.7, 0.8)
-NOISE = 0.008
 RINGS = ((0.0, 1.0), (0.12, 1.0), (0.3, 0.9))
 """Heights and radii of the rings of cameras, in distances of the given views from the point that they look at."""
 
@@ -29,9 +28,8 @@ NEAR = 0.25
 Gaussians of the scene alone, which no photo of the truck shows."""
 
 
-def main(scene: str, views: str, out: Path) -> None:
-    """Write 60 photos with noise, and their poses as transforms.json."""
-    gaussians = load_gaussians(scene)[0]
+def cameras(views: str, rng: np.random.Generator) -> Iterator[Camera]:
+    """Cameras on rings around the point at which given views look, each a little off its place."""
     given = json.loads(Path(views).read_text())
     matrices = np.array([view["world_to_camera"] for view in given["views"]])
     ahead, places = matrices[:, 2, :3], -np.einsum("nij,ni->nj", matrices[:, :3, :3], matrices[:, :3, 3])
@@ -42,8 +40,6 @@ def main(scene: str, views: str, out: Path) -> None:
     east = np.cross(up, [1, 0, 0.1])
     east /= np.linalg.norm(east)
     north = np.cross(up, east)
-    (out / "images").mkdir(parents=True, exist_ok=True)
-    rng, frames = np.random.default_rng(0), []
     for ring, (height, wide) in enumerate(RINGS):
         for k in range(PER_RING):
             turn = 2 * np.pi * (k + 0.37 * ring) / PER_RING + rng.normal(0, 0.02)
@@ -51,15 +47,13 @@ def main(scene: str, views: str, out: Path) -> None:
             position = centre + arm + height * radius * up
             target = centre + rng.normal(0, 0.04 * radius, 3)
             camera = Camera.look_at(position, target, up, FOCAL, WIDTH, HEIGHT)
-            camera = replace(camera, near=NEAR * radius)
-            image = np.asarray(render(gaussians, camera, background=SKY, gradients=False).rgb)
-            image = np.clip(image + rng.normal(0, NOISE, image.shape), 0, 1)
-            name = f"images/{len(frames):04d}.png"
-            Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(out / name)
-            pose = np.linalg.inv(camera.viewmat) @ np.diag([1, -1, -1, 1])
-            frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-    lens = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT}
-    (out / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+            yield replace(camera, near=NEAR * radius)
+
+
+def main(scene: str, views: str, out: Path) -> None:
+    """Write 60 photos with noise, and their poses as transforms.json."""
+    rng = np.random.default_rng(0)
+    write_photos(load_gaussians(scene)[0], cameras(views, rng), SKY, rng, out)
 
 
 if __name__ == "__main__":

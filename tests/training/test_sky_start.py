@@ -21,6 +21,7 @@ from clsplat.training.sky_start import (
     SPACING,
     UNSEEN,
     beyond,
+    empty_space,
     sky_cells,
     sky_gaussians,
     sphere,
@@ -229,8 +230,8 @@ def in_a_studio(color=(90, 140, 220)):
 
 def test_a_plain_background_is_sky_below_the_horizon_too() -> None:
     scene = in_a_studio()
-    sky = sky_gaussians(scene, CONFIG)
-    assert sky is not None
+    sky, level = sky_gaussians(scene, CONFIG, plain=True), sky_gaussians(scene, CONFIG)
+    assert sky is not None and level is not None and (level.means @ UP).min() > -0.1 * DISTANCE * scene.extent
     directions = sky.means / np.linalg.norm(sky.means, axis=1, keepdims=True)
     heights = directions @ UP
     # Cameras 0.8 above look down by 0.67 radians; their photos reach 0.54 farther, and the sky 0.5 beyond them.
@@ -238,7 +239,21 @@ def test_a_plain_background_is_sky_below_the_horizon_too() -> None:
     np.testing.assert_allclose(0.5 + 0.28209479 * sky.sh[:, 0], np.broadcast_to(BLUE / 255, (len(sky), 3)), atol=1e-6)
     cells, _, edge = sky_cells(scene.train[0], scene.points, None, BLUE / 255)
     assert cells[0].all() and cells[-1].all() and not cells[20 // edge : 40 // edge, 32 // edge : 48 // edge].any()
-    assert sky_gaussians(in_a_studio((255, 255, 255)), replace(CONFIG, data=DataConfig(background="white"))) is None
+    white = replace(CONFIG, data=DataConfig(background="white"))
+    assert sky_gaussians(in_a_studio((255, 255, 255)), white, plain=True) is None
+
+
+def test_space_is_kept_empty_where_the_configuration_and_the_points_allow_it() -> None:
+    scene = in_a_studio()
+    assert len(empty_space(scene, CONFIG)) == 3
+    assert empty_space(scene, replace(CONFIG, init=InitConfig(sky=False))) == []
+    assert empty_space(scene, replace(CONFIG, strategy="adc")) == [], "it leaves no room for new viewpoints"
+    assert empty_space(replace(scene, points=scene.points[:0], colors=scene.colors[:0]), CONFIG) == []
+    # Points between the cameras and the object: what looks like a background is a surface.
+    for share, count in (0.02, 3), (0.021, 0):
+        points = scene.points.copy()
+        points[: round(share * len(points))] = 0.5 * scene.train[0].camera.position
+        assert len(empty_space(replace(scene, points=points), CONFIG)) == count
 
 
 @pytest.mark.parametrize("iterations", [3, 60], ids=["at the end", "and in rounds"])
