@@ -48,12 +48,13 @@ def test_eval_repeats_the_evaluation_of_the_run(copied: Path, tmp_path: Path) ->
     assert metrics(copied / "eval") == again
 
 
-def test_commands_triangulate_where_the_training_did(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_triangulate_where_the_training_did(copied: Path, tmp_path: Path, monkeypatch) -> None:
     """Near planes of triangulated points would differ from those of a training without them."""
     asked = []
     monkeypatch.setattr("clsplat.dataset.loading.with_points", lambda scene, *_: asked.append(scene) or scene)
     run("eval", copied)
     run("render", copied)
+    run("mesh", copied, "-o", tmp_path / "mesh.ply", "--resolution", 16)
     assert not asked
     config = json.loads((copied / "config.json").read_text())
     config["init"]["triangulate"] = True

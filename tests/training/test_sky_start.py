@@ -256,22 +256,27 @@ def test_space_is_kept_empty_where_the_configuration_and_the_points_allow_it() -
         assert len(empty_space(replace(scene, points=points), CONFIG)) == count
 
 
-@pytest.mark.parametrize("iterations", [3, 60], ids=["at the end", "and in rounds"])
-def test_a_training_leaves_the_space_before_a_plain_background_free(device: Device, tmp_path, iterations) -> None:
+@pytest.mark.parametrize("removal", ["in rounds", "at the end"])
+def test_a_training_leaves_the_space_before_a_plain_background_free(
+    device: Device, tmp_path, monkeypatch: pytest.MonkeyPatch, removal
+) -> None:
     """Gaussians of the background's colour in front of the object are in no photo's way, and in that of others."""
     scene = in_a_studio()
-    away = np.array([view.camera.position for view in scene.train])
-    points = np.concatenate([scene.points, 0.5 * np.repeat(away, 4, axis=0)])
-    colors = np.concatenate([scene.colors, np.tile(BLUE.astype(np.uint8), (len(away) * 4, 1))])
-    points[-len(away) * 4 :] += np.random.default_rng(0).normal(0, 0.02, (len(away) * 4, 3))
+    between = 0.5 * np.repeat([view.camera.position for view in scene.train], 4, axis=0)
+    points = np.concatenate([scene.points, between + np.random.default_rng(0).normal(0, 0.02, between.shape)])
+    colors = np.concatenate([scene.colors, np.tile(BLUE.astype(np.uint8), (len(between), 1))])
     scene, grids, left = replace(scene, points=points, colors=colors), free_space(scene.train), {}
+    if removal == "in rounds":
+        monkeypatch.setattr("clsplat.training.loop.in_free_space", lambda means, grids: np.zeros(len(means), bool))
     for sky in True, False:
         init = InitConfig(sky=sky, dense=False)
-        config = replace(CONFIG, iterations=iterations, size="fixed", max_gaussians=6000, init=init)
-        trained = train(scene, config, tmp_path / str(sky), device)
+        config = replace(CONFIG, iterations=60 if removal == "in rounds" else 3, size="fixed", init=init)
+        trained = train(scene, replace(config, max_gaussians=6000), tmp_path / str(sky), device)
         left[sky] = int(in_free_space(trained.means, grids).sum())
         assert len(trained) > 1000
-    assert left[True] == 0 < left[False]
+        below = trained.means[beyond(trained, scene)] @ UP < -0.5 * DISTANCE * scene.extent
+        assert below.any() == sky
+    assert left[True] < 0.1 * left[False] if removal == "in rounds" else left[True] == 0 < left[False]
 
 
 def test_a_start_without_sky_is_unchanged() -> None:
