@@ -94,7 +94,7 @@ def free_space(views: list[View]) -> list[Grid]:
     from scipy.ndimage import binary_erosion
 
     around = np.ones((3, 3, 3), bool)
-    return [replace(g, free=binary_erosion(g.free, around, border_value=1)) for g in reversed(_compared(views)[0])]
+    return [replace(g, free=binary_erosion(g.free, around)) for g in reversed(_compared(views)[0])]
 
 
 def in_free_space(points: ArrayLike, grids: Sequence[Grid]) -> NDArray[np.bool_]:

@@ -67,8 +67,9 @@ cameras leave the vertical open, as they do if all look into one direction."""
 UNSEEN = 0.5
 """Angle from the sky that photos show to which it continues where no photo looks, radians."""
 
-ON_BACKGROUND = 0.02
-"""Largest fraction of the points that may lie before a plain background, as wrong ones do."""
+ON_BACKGROUND = 0.1
+"""Largest fraction of the points that may lie before a plain background, as wrong ones do, and those that are added
+between the points of thin objects (measured: docs/experiments/strategies.md)."""
 
 DIFFERENCE = 0.02
 """Largest difference of a colour from the background's, from 0 to 1, with which the background is the sky."""

@@ -9,7 +9,7 @@ from PIL import Image
 from clsplat.camera import Camera
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene_with_points
-from clsplat.dataset.outlines import background, free_space, in_free_space, plain_color, points_of_outlines
+from clsplat.dataset.outlines import Grid, background, free_space, in_free_space, plain_color, points_of_outlines
 from clsplat.scene import View
 
 RADIUS, PLACE = 0.5, np.array([3.0, -2.0, 5.0])
@@ -78,6 +78,15 @@ def test_space_before_a_plain_background_is_free() -> None:
     assert not in_free_space(PLACE + 30 * directions, grids).any()
 
 
+def test_the_finest_grid_decides() -> None:
+    """Of two grids around (1, 0, 0), the first of which has one free cell."""
+    centre, fine = np.array([1.0, 0.0, 0.0]), np.zeros((2, 2, 2), bool)
+    fine[1, 0, 1] = True
+    grids = [Grid(centre, 1.0, fine), Grid(centre, 2.0, np.ones((4, 4, 4), bool))]
+    places = [[1.5, -0.5, 0.5], [1.5, 0.5, 0.5], [0.5, -0.5, 0.5], [2.5, 0.0, 0.0], [3.5, 0.0, 0.0]]
+    assert in_free_space(places, grids).tolist() == [True, False, False, True, False]
+
+
 def test_photos_without_a_plain_background_have_no_outlines() -> None:
     rng = np.random.default_rng(1)
     views = [replace(view, image=rng.integers(0, 256, view.image.shape, np.uint8)) for view in around()]
@@ -85,10 +94,10 @@ def test_photos_without_a_plain_background_have_no_outlines() -> None:
     for found in points_of_outlines(views):
         assert found.shape == (0, 3)
     assert free_space(views) == [] and not in_free_space(np.zeros((3, 3)), []).any()
-    # An object that covers half of the photos' edges.
+    # An object that covers more than half of the photos' edges.
     views = around()
     for view in views:
-        view.image[:, :40] = RED
+        view.image[:, :44] = RED
     assert plain_color(views) is None
 
 
@@ -127,12 +136,12 @@ def test_one_photo_alone_does_not_carve() -> None:
 
 
 def test_what_a_mask_hides_is_not_the_background() -> None:
-    """A black edge of the photos that is masked: neither the background, nor in its way."""
+    """An edge of the photos that is masked: neither the background, whose colour it has, nor in its way."""
     views = around()
     masked = []
     for view in views:
         image, mask = view.image.copy(), np.ones(view.image.shape[:2], bool)
-        image[:, :10], mask[:, :10] = 0, False
+        mask[:, :10] = False
         masked.append(replace(view, image=image, mask=mask))
     np.testing.assert_allclose(plain_color(masked), GREY / 255)
     assert not background(masked[0], np.full(3, GREY / 255))[:, :10].any()

@@ -250,7 +250,7 @@ def test_space_is_kept_empty_where_the_configuration_and_the_points_allow_it() -
     assert empty_space(scene, replace(CONFIG, strategy="adc")) == [], "it leaves no room for new viewpoints"
     assert empty_space(replace(scene, points=scene.points[:0], colors=scene.colors[:0]), CONFIG) == []
     # Points between the cameras and the object: what looks like a background is a surface.
-    for share, count in (0.02, 3), (0.021, 0):
+    for share, count in (0.1, 3), (0.101, 0):
         points = scene.points.copy()
         points[: round(share * len(points))] = 0.5 * scene.train[0].camera.position
         assert len(empty_space(replace(scene, points=points), CONFIG)) == count
@@ -266,8 +266,8 @@ def test_a_training_leaves_the_space_before_a_plain_background_free(
     points = np.concatenate([scene.points, between + np.random.default_rng(0).normal(0, 0.02, between.shape)])
     colors = np.concatenate([scene.colors, np.tile(BLUE.astype(np.uint8), (len(between), 1))])
     scene, grids, left = replace(scene, points=points, colors=colors), free_space(scene.train), {}
-    if removal == "in rounds":
-        monkeypatch.setattr("clsplat.training.loop.in_free_space", lambda means, grids: np.zeros(len(means), bool))
+    other = "loop" if removal == "in rounds" else "session"
+    monkeypatch.setattr(f"clsplat.training.{other}.in_free_space", lambda means, grids: np.zeros(len(means), bool))
     for sky in True, False:
         init = InitConfig(sky=sky, dense=False)
         config = replace(CONFIG, iterations=60 if removal == "in rounds" else 3, size="fixed", init=init)
