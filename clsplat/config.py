@@ -268,7 +268,7 @@ class ErrorConfig:
     """Largest fraction of the Gaussians that is replaced in a round, if their removal lowers the error."""
     opacity_penalty: NonNegative = 0.01
     """Weight in the loss of the opacities that a photo shows: their sum, divided by the number of all Gaussians. It
-    removes faint Gaussians that no photo needs and that would show as a haze between the photos' viewpoints."""
+    removes faint Gaussians that no photo needs, which would be a haze in other views."""
 
 
 @dataclass(frozen=True)
@@ -300,8 +300,7 @@ class TrainConfig:
     """Densification strategy; adc is the paper's."""
     size: Literal["auto", "fixed"] = "auto"
     """auto: the number of Gaussians and the degree of the spherical harmonics are chosen from photos that are held
-    back until the choice is made, and train afterwards (size.json explains the choice). fixed: the strategy alone
-    decides, up to the cap."""
+    back until then, and train afterwards (size.json). fixed: the strategy alone decides, up to the cap."""
     size_price: NonNegative = 0.05
     """Gain of quality, dB, that a doubling of the Gaussians or of the bytes must bring; with --size auto. Quality is
     the mean of PSNR and of SSIM in decibels."""
@@ -315,13 +314,14 @@ class TrainConfig:
     """Fraction of the splats left out of each image at the end of the training; it rises from 0."""
     exposure: bool = False
     """Learn an affine map of each training photo's colours, for photos of different exposure or white balance."""
+    even_brightness: bool = True
+    """Even out the brightness of training photos that differ from those taken next to them; not with --exposure."""
     response: bool = False
-    """With --exposure, also learn a contrast curve for each photo and the vignetting that all photos share: for
-    cameras that change the contrast, and for lenses that darken the corners."""
+    """With --exposure, also learn a curve of contrast for each photo, and the dark corners that all photos share."""
     filter_3d: bool = False
     """Keep every Gaussian at least as thick as the photos resolve (Mip-Splatting's 3D filter), for scenes that will
     be seen from closer or at a larger size than they were photographed, and with --mode antialiased also from farther
-    away. Saved scenes contain the filter, so that any viewer shows them right."""
+    away. Saved scenes contain the filter."""
     poses: bool = False
     """Refine the training photos' poses, if they are inaccurate. Held-out photos are then evaluated twice: with their
     given poses, and with each camera aligned with the scene."""

@@ -1,6 +1,6 @@
 """Scenes: photos with their cameras, and sparse points, as `clsplat.dataset` loads them."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -195,6 +195,10 @@ class Scene:
         the origin, as in geo-referenced scenes.
     downscale : int
         Factor by which the edges of the photos were divided.
+    shown : mapping of str to (N,) int
+        Rows of the points whose features a photo has, by its name; empty if they are not known.
+    gains : mapping of str to (3,) float64
+        Factors by which training divides the colours of training photos, by name (`clsplat.dataset.brightness`).
     """
 
     train: list[View]
@@ -203,6 +207,8 @@ class Scene:
     colors: NDArray[np.uint8]
     offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     downscale: int = 1
+    shown: Mapping[str, NDArray[np.intp]] = field(default_factory=dict)
+    gains: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     @property
     def extent(self) -> float:

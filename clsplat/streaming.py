@@ -252,11 +252,11 @@ class StreamedView(View):
 
     @property
     def digests(self) -> tuple[str, str] | None:
-        return super().digests if self._load else self._stream.digests(self.name)
+        """Those of the photo before changes, as `expect` has them, too."""
+        return self._stream.digests(self.name)
 
     def expect(self, digests: tuple[str, str]) -> None:
-        if not self._load:
-            self._stream.expect(self.name, digests)
+        self._stream.expect(self.name, digests)
 
 
 class Files:

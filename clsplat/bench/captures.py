@@ -98,7 +98,8 @@ def with_fewer_points(scene: Scene, fraction: float) -> Scene:
     if not len(scene.points):
         raise InputError(f"points={fraction:g}: expected a scene with sparse points to keep some of, found none")
     kept = np.floor(np.arange(max(1, int(fraction * len(scene.points)))) / fraction).astype(int)
-    return replace(scene, points=scene.points[kept], colors=scene.colors[kept])
+    shown = {name: np.flatnonzero(np.isin(kept, rows)) for name, rows in scene.shown.items()}
+    return replace(scene, points=scene.points[kept], colors=scene.colors[kept], shown=shown)
 
 
 def _checked(scene: Scene, option: str) -> Scene:

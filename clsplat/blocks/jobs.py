@@ -13,9 +13,10 @@ from clsplat.blocks.partition import EVERYWHERE, Box
 from clsplat.blocks.plan import Block
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
+from clsplat.dataset.brightness import divided
 from clsplat.errors import InputError, named
 from clsplat.inputs import Photo
-from clsplat.scene import DIGEST_BYTES, DepthMap, View, digest
+from clsplat.scene import DIGEST_BYTES, DepthMap, Scene, View, digest
 from clsplat.training.checkpoint import without_free
 from clsplat.training.presets import with_settings
 
@@ -37,8 +38,8 @@ class Job:
     Gaussians from which the block starts and that surround it; near: where these are used; far: the index of those
     elsewhere; points: the index of Gaussians at sparse points, which the block trains, too, or empty; box, wide: what
     the block keeps and trains; photos: digests of pixels and mask, by name; cameras: as the scene has them, by name;
-    depths: for photos with a depth map, by name, the digest of its values and its fit to the points; config: settings
-    of the block.
+    depths: for photos with a depth map, by name, the digest of its values and its fit to the points; gains: factors
+    by which the colours of photos are divided, by name; config: settings of the block.
     """
 
     data: str
@@ -51,6 +52,7 @@ class Job:
     photos: dict[str, Photo]
     cameras: dict[str, dict[str, Any]]
     depths: dict[str, dict[str, Any]]
+    gains: dict[str, list[float]]
     config: TrainConfig
 
     @property
@@ -75,6 +77,7 @@ class Job:
             },
             "config": asdict(self.config),
             **({"depths": self.depths} if self.depths else {}),
+            **({"gains": self.gains} if self.gains else {}),
         }
 
     def write(self, folder: Path) -> Path:
@@ -111,7 +114,8 @@ class Job:
                 f"({named(other)}); start a new run in another folder"
             )
         posed = [view.with_camera(_camera(self.cameras[view.name])) for view in chosen]
-        return [view.with_depth(self._depth(view)) for view in posed]
+        with_depths = [view.with_depth(self._depth(view)) for view in posed]
+        return [divided(view, self.gains[view.name]) if view.name in self.gains else view for view in with_depths]
 
     def _depth(self, view: View) -> DepthMap | None:
         """The depth map of a photo as the whole scene is trained with it."""
@@ -127,12 +131,18 @@ class Job:
 
 
 def make_job(
-    data: Path, scene: str, block: Block, views: list[View], photos: dict[str, Photo], config: TrainConfig
+    data: Path,
+    file: str,
+    block: Block,
+    scene: Scene,
+    photos: dict[str, Photo],
+    config: TrainConfig,
 ) -> Job:
     """Make the job of a block in a scene's file, without sparse points.
 
-    views: the photos of the block; photos: digests of all photos; config: settings of the block.
+    scene: with the photos of the block; photos: digests of all photos; config: settings of the block.
     """
+    views = [scene.train[i] for i in block.photos]
     names = [view.name for view in views]
     cameras = {view.name: asdict(view.camera) | {"viewmat": view.camera.viewmat.tolist()} for view in views}
     own = {name: photos[name] for name in names}
@@ -141,7 +151,8 @@ def make_job(
         for view in views
         if (depth := view.depth)
     }
-    return Job(str(data), scene, EVERYWHERE, scene, "", block.box, block.wide, own, cameras, depths, config)
+    gains = {name: scene.gains[name].tolist() for name in names if name in scene.gains}
+    return Job(str(data), file, EVERYWHERE, file, "", block.box, block.wide, own, cameras, depths, gains, config)
 
 
 def read_job(path: Path) -> Job:
@@ -161,8 +172,9 @@ def read_job(path: Path) -> Job:
         photos = {name: Photo(str(p["pixels"]), str(p["mask"]), []) for name, p in content["photos"].items()}
         cameras = {name: dict(p["camera"]) for name, p in content["photos"].items()}
         depths = {str(name): dict(depth) for name, depth in content.get("depths", {}).items()}
+        gains = {str(name): [float(x) for x in factor] for name, factor in content.get("gains", {}).items()}
         config = with_settings(TrainConfig(), content["config"], str(path))
-        job = Job(**scenes, **boxes, photos=photos, cameras=cameras, depths=depths, config=config)
+        job = Job(**scenes, **boxes, photos=photos, cameras=cameras, depths=depths, gains=gains, config=config)
         found = job.digest
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error

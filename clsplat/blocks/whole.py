@@ -108,8 +108,7 @@ def plan_blocks(
     tell(plan.describe(config, scene, seconds * COARSE_FACTOR**2))
     jobs = []
     for block in plan.blocks:
-        views = [scene.train[i] for i in block.photos]
-        job = make_job(data.resolve(), file.name, block, views, photos, block_config(config, scene, block))
+        job = make_job(data.resolve(), file.name, block, scene, photos, block_config(config, scene, block))
         if start := sparse_start(scene, coarse.means, block, config):
             job = replace(job, points=_written(start, folder, config).name)
         jobs.append(job.write(folder))
@@ -158,9 +157,8 @@ def plan_refinement(
         counts += [block.wide.contains(means).sum() for block in blocks]
     photos, coarse, refined = _read_photos(scene), read_job(latest[0]).far, []
     for block, count in zip(blocks, counts.tolist(), strict=True):
-        views = [scene.train[i] for i in block.photos]
         settings = refining_config(config, scene, block, count, length)
-        job = make_job(data.resolve(), coarse, block, views, photos, settings)
+        job = make_job(data.resolve(), coarse, block, scene, photos, settings)
         refined.append(replace(job, scene=index.name, near=block.near).write(folder))
     return refined
 

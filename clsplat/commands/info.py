@@ -168,7 +168,7 @@ def dataset_lines(path: Path) -> list[str]:
     if what == TRANSFORMS and dataset is not None:
         lenses, points, model = [photo.intrinsics for photo in dataset.photos], dataset.points, None
     elif model is not None:
-        cameras, posed, points, _ = colmap.read_model(model)
+        cameras, posed, points, *_ = colmap.read_model(model)
         lenses = [cameras[camera] for _, camera, _ in posed]
     elif photos:
         lenses, points, what = [], np.empty((0, 3)), f"{PHOTOS}: train or sfm recovers them"

@@ -4,7 +4,7 @@ import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +40,19 @@ MODELS: tuple[tuple[str, int], ...] = (
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 """Folders of a dataset that are searched for a model, in this order."""
 
-Model = tuple[
-    dict[int, Intrinsics], list[tuple[str, int, NDArray[np.float64]]], NDArray[np.float64], NDArray[np.uint8]
-]
-"""Content of a model: cameras by id; name, camera id and viewmat of each photo; points (P, 3) in world units; their
-colours (P, 3)."""
+
+class Model(NamedTuple):
+    """Content of a model.
+
+    cameras: by id; photos: name, camera id and viewmat of each; points (P, 3): in world units; colors (P, 3): theirs;
+    shown: rows of the points whose features a photo has, by its name.
+    """
+
+    cameras: dict[int, Intrinsics]
+    photos: list[tuple[str, int, NDArray[np.float64]]]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    shown: dict[str, NDArray[np.intp]]
 
 
 def find_model(root: Path) -> Path | None:
@@ -82,7 +90,7 @@ def read_dataset(root: Path, model: Path, config: DataConfig, photos: Path | Non
     InputError
         If a file is damaged or contradicts another, or a mask is missing; the message names it.
     """
-    cameras, images, points, colors = read_model(model)
+    cameras, images, points, colors, shown = read_model(model)
     names = [name for name, _, _ in images]
     folder = root if photos is None else photos
     faces = config.panoramas == "faces"
@@ -107,6 +115,7 @@ def read_dataset(root: Path, model: Path, config: DataConfig, photos: Path | Non
         reduce,
         downscale,
         upright=photos is not None,
+        shown=shown,
     )
 
 
@@ -130,17 +139,30 @@ def read_model(folder: Path) -> Model:
                 f"{width}x{height}, {params} for camera {number}"
             )
         by_id[number] = Intrinsics(model, params, width, height)
-    posed = []
-    for name, camera, quat, translation in images:
+    posed, by_number = [], {}
+    for number, name, camera, quat, translation in images:
         if camera not in by_id:
             raise InputError(f"{images_path}: expected camera {camera} of photo {name} in {cameras_path.name}")
         posed.append((checked_name(name, images_path), camera, _viewmat(quat, translation, name, images_path)))
+        by_number[number] = name
     if not posed:
         raise InputError(f"{images_path}: expected at least one photo with a pose, found none")
-    rows: NDArray[np.float64] = np.fromiter(points, dtype=np.dtype((np.float64, 6)))
+    found = list(points)
+    rows = np.array([row for row, _ in found]).reshape(-1, 6)
     if not np.isfinite(rows).all() or ((rows[:, 3:] < 0) | (rows[:, 3:] > 255)).any():
         raise InputError(f"{points_path}: expected finite points with colours from 0 to 255, found others")
-    return by_id, posed, rows[:, :3].copy(), rows[:, 3:].astype(np.uint8)
+    shown = _shown([track for _, track in found], by_number)
+    return Model(by_id, posed, rows[:, :3].copy(), rows[:, 3:].astype(np.uint8), shown)
+
+
+def _shown(tracks: list[NDArray[np.int64]], names: dict[int, str]) -> dict[str, NDArray[np.intp]]:
+    """Rows of points by the name of a photo, from the numbers of the photos that show each point."""
+    photos = np.concatenate([np.zeros(0, np.int64), *tracks])
+    rows = np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])
+    order = np.argsort(photos, kind="stable")
+    numbers, starts = np.unique(photos[order], return_index=True)
+    parts = np.split(rows[order], starts[1:])
+    return {names[k]: np.unique(part) for k, part in zip(numbers.tolist(), parts, strict=False) if k in names}
 
 
 def _read(folder: Path, name: str, read_bin: Any, read_txt: Any) -> tuple[Path, Iterator[Any]]:
@@ -184,6 +206,12 @@ class _Bytes:
     def skip(self, size: int) -> None:
         self.at += size
 
+    def integers(self, count: int) -> NDArray[np.int64]:
+        """Unsigned integers of four bytes."""
+        self._expect(4 * count)
+        self.at += 4 * count
+        return np.frombuffer(self.data, "<u4", count, self.at - 4 * count).astype(np.int64)
+
     def text(self) -> str:
         end = self.data.find(b"\0", self.at)
         if end < 0:
@@ -216,24 +244,24 @@ def _cameras_bin(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, 
     file.end()
 
 
-def _images_bin(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
+def _images_bin(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...], tuple[float, ...]]]:
     file = _Bytes(path)
     head = struct.Struct("<I7dI")
     for _ in range(file.count()):
-        _, *pose, camera = file.take(head)
+        number, *pose, camera = file.take(head)
         name = file.text()
         file.skip(24 * file.count())  # keypoints: x, y and id of the point
-        yield name, camera, tuple(pose[:4]), tuple(pose[4:])
+        yield number, name, camera, tuple(pose[:4]), tuple(pose[4:])
     file.end()
 
 
-def _points_bin(path: Path) -> Iterator[tuple[float, ...]]:
+def _points_bin(path: Path) -> Iterator[tuple[tuple[float, ...], NDArray[np.int64]]]:
     file = _Bytes(path)
     head = struct.Struct("<Q3d3Bd")
     for _ in range(file.count()):
         row = file.take(head)
-        file.skip(8 * file.count())  # track: image id and index of the keypoint
-        yield row[1:7]
+        track = file.integers(2 * file.count())  # image id and index of the keypoint
+        yield row[1:7], track[::2]
     file.end()
 
 
@@ -261,27 +289,28 @@ def _cameras_txt(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, 
             yield row
 
 
-def _images_txt(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
+def _images_txt(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...], tuple[float, ...]]]:
     lines = _lines(path)
     for number, line in lines:
         if line and not line.startswith("#"):
             try:
-                _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
+                image, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
                 quat, translation = map(float, (qw, qx, qy, qz)), map(float, (tx, ty, tz))
-                row = name, int(camera), tuple(quat), tuple(translation)
+                row = int(image), name, int(camera), tuple(quat), tuple(translation)
             except ValueError as error:
                 raise _damaged(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from error
             yield row
             next(lines, None)  # the line of its keypoints, which may be empty
 
 
-def _points_txt(path: Path) -> Iterator[tuple[float, ...]]:
+def _points_txt(path: Path) -> Iterator[tuple[tuple[float, ...], NDArray[np.int64]]]:
     for number, line in _lines(path):
         if line and not line.startswith("#"):
-            words = line.split(maxsplit=7)
+            words = line.split()
             try:
                 x, y, z, r, g, b = words[1:7]
                 row = float(x), float(y), float(z), float(int(r)), float(int(g)), float(int(b))
+                track = np.array(words[8::2], np.int64)  # image ids; the indices of keypoints are between them
             except (OverflowError, ValueError) as error:
-                raise _damaged(path, number, "POINT3D_ID X Y Z R G B", line) from error
-            yield row
+                raise _damaged(path, number, "POINT3D_ID X Y Z R G B ERROR (IMAGE_ID POINT2D_IDX)*", line) from error
+            yield row, track

@@ -1,8 +1,9 @@
 """Decode the photos of a dataset to `View` objects: undistorted, reduced, with their masks and cameras."""
 
 import os
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import floor
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -98,6 +99,8 @@ class Dataset:
         Factor by which the photos are smaller than at their full size: `reduce`, or that of the smaller copies.
     upright : bool
         Whether the cameras describe the photos turned by their EXIF orientation, rather than as stored.
+    shown : mapping of str to (N,) int
+        Rows of the points whose features a photo has, by its name; empty if they are not known.
     """
 
     photos: list[PosedPhoto]
@@ -106,6 +109,7 @@ class Dataset:
     reduce: int = 1
     downscale: int = 1
     upright: bool = False
+    shown: Mapping[str, NDArray[np.intp]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,7 +101,7 @@ def load_scene(path: str | Path, config: DataConfig, verbose: bool = False, memo
         for before, view in pairwise(part):  # sorted by name
             if before.name == view.name:
                 raise InputError(f"{path}: expected a camera for each photo, found several for {view.name}")
-    scene = Scene(train, test, dataset.points, dataset.colors, downscale=dataset.downscale)
+    scene = Scene(train, test, dataset.points, dataset.colors, downscale=dataset.downscale, shown=dataset.shown)
     return with_near_planes(_near_origin(scene))
 
 

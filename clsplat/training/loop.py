@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsplat.config import TrainConfig
+from clsplat.dataset.brightness import evened
 from clsplat.dataset.near_planes import with_near_planes
 from clsplat.dataset.outlines import in_free_space
 from clsplat.errors import BuildError, DeviceError, InputError, driver_errors
@@ -97,7 +98,9 @@ def train(
     scene, config = with_near_planes(scene), with_length(config, scene)
     out, device = Path(out), device or open_device(config)
     with held(out):
-        inputs, empty = Inputs.of(scene, device), empty_space(scene, config)
+        inputs, read = Inputs.of(scene, device), scene
+        scene = evened(scene)
+        empty = empty_space(scene, config)
         if resume:
             state = load_state(out / CHECKPOINT, scene.extent, config, inputs)
         else:
@@ -107,7 +110,7 @@ def train(
             gaussians = with_sky(gaussians, start, config, plain=bool(empty))
             state = replace(initial_state(scene, config, gaussians), inputs=inputs)
             state.seconds = time.perf_counter() - started
-        state.inputs.demand(scene)
+        state.inputs.demand(read)
         training = Training(scene, config, device, state, empty=empty)
         return complete(training, out, evaluate=evaluate, evaluate_after=evaluate_after, progress=progress)
 

@@ -6,8 +6,11 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from clsplat.config import CoarseConfig, TrainConfig
 from clsplat.dataset import load_scene, with_depth_maps, with_points
+from clsplat.dataset.brightness import gains
 from clsplat.dataset.finding import mask_folder
 from clsplat.dataset.near_planes import with_near_planes
 from clsplat.errors import InputError
@@ -37,6 +40,7 @@ def prepare(
     """Load a dataset and adapt the configuration to it.
 
     Where the dataset has poses but no points, points are triangulated from its photos (`config.init.triangulate`).
+    Photos that are brighter or darker than their neighbours are found (`config.even_brightness`).
     The number of iterations and the size of the first photos follow the photos, unless they are given. With few
     photos the configuration is adapted to them (`config.few`). `clsplat.training.loop.train` on the result does what
     ``clsplat train`` does.
@@ -87,6 +91,14 @@ def prepare(
         tell(f"start: {found} (--init.no-triangulate: random)")
     if config.data.depth is not None:
         scene = with_depth_maps(scene, path, config.data, tell)
+    if config.even_brightness and not config.exposure:
+        scene = replace(scene, gains=gains(scene))
+        if scene.gains:
+            most = np.expm1(np.abs(np.log(list(scene.gains.values()))).max())
+            tell(
+                f"brightness: {len(scene.gains)} of {len(scene.train)} training photos differ from those taken next "
+                f"to them, by up to {most:.0%}, and are evened out (--no-even-brightness: not)"
+            )
     config = with_length(config, scene)
     few = adapted(config, scene)
     if few != config:

@@ -69,6 +69,8 @@ class TestVariants:
         assert index.tolist() == [0, 10, 20, 30, 40]
         assert (found.colors[:5] == path.colors[index]).all()
         assert found.train is path.train
+        shown = with_fewer_points(replace(path, shown={"a": np.array([0, 5, 10, 21, 30])}), 0.1).shown
+        assert shown["a"].tolist() == [0, 1, 3], "rows of the points that are left"
         some = scene_of(path.train, path.test, path.points[:7])
         assert len(with_fewer_points(some, 0.3).points) == 2
         assert len(with_fewer_points(some, 0.01).points) == 1
@@ -210,6 +212,7 @@ def test_the_command(data, tmp_path, capsys, monkeypatch):
 
     def run_cell(config, scene, device, record, rare):
         figures = {
+            "photos": measures.digest_of(scene),
             "psnr": float(len(scene.train)),
             "ssim": 0.5,
             "flip": None,
@@ -242,5 +245,6 @@ def test_the_command(data, tmp_path, capsys, monkeypatch):
     assert "requires two scenes" in said.out, "both are of the same scene"
     finished = [r for r in records if "failed" not in r]
     run(*arguments, "--seeds", 3, "-o", tmp_path / "out")
+    assert f"{len(finished)} of {len(records)} trainings are already finished" in capsys.readouterr().err
     assert [r for r in read_records(tmp_path / "out" / "results.jsonl") if "failed" not in r] == finished
     assert "no options for a variant" in fails(capsys, "bench", "captures", f"{data / 'one'}:arc=0.1")

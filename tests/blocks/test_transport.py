@@ -18,8 +18,9 @@ from small_plan import CONFIG, Planned, plan
 from clsplat.blocks import cluster, transport
 from clsplat.blocks.block import log_of, result_of, train_block
 from clsplat.blocks.cluster import run_on_cluster
-from clsplat.blocks.jobs import make_job
+from clsplat.blocks.jobs import make_job, read_job
 from clsplat.blocks.transport import Cache, Desk
+from clsplat.dataset.brightness import evened
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.inputs import photos_of
@@ -153,11 +154,13 @@ def test_photos_arrive_with_all_their_layers(
     ]
     config = replace(CONFIG, memory_limit=memory)
     block = planned.plan.blocks[0]._replace(photos=np.arange(len(views)))
-    job = make_job(tmp_path, "scene", block, views, photos_of(views, np.zeros(3)), config)
+    scene = replace(planned.scene, train=views, gains={views[1].name: np.array([2.0, 1.0, 1.0])})
+    job = make_job(tmp_path, "scene", block, scene, photos_of(views, np.zeros(3)), config)
+    assert read_job(job.write(tmp_path)).gains == job.gains == {views[1].name: [2.0, 1.0, 1.0]}
     with Desk(None, tmp_path, views) as desk:
         found = Cache(tmp_path / "cache", desk.name).photos(job)
     assert all((view.ahead > 0) == (memory is not None) for view in found)
-    for view, expected in zip(job.views(found), views, strict=True):
+    for view, expected in zip(job.views(found), evened(scene).train, strict=True):
         view = view.loaded()
         for layer in ("image", "mask", "clear"):
             np.testing.assert_array_equal(getattr(view, layer), getattr(expected, layer))

@@ -77,7 +77,7 @@ def ending(request):
 
 def test_both_encodings_say_the_same(tmp_path, ending):
     WRITERS[ending](tmp_path)
-    cameras, images, points, colors = read_model(tmp_path)
+    cameras, images, points, colors, shown = read_model(tmp_path)
     assert cameras == {number: Intrinsics(model, params, w, h) for number, model, w, h, params in CAMERAS}
     assert [(name, camera) for name, camera, _ in images] == [(name, camera) for name, camera, _, _ in IMAGES]
     np.testing.assert_allclose(images[0][2], np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]))
@@ -87,6 +87,19 @@ def test_both_encodings_say_the_same(tmp_path, ending):
     np.testing.assert_array_equal(points, [xyz for xyz, _ in POINTS])
     np.testing.assert_array_equal(colors, [rgb for _, rgb in POINTS])
     assert colors.dtype == np.uint8
+    assert {name: rows.tolist() for name, rows in shown.items()} == {"a.png": [0, 1]}
+
+
+def test_photos_without_points_and_unknown_photos_show_none(tmp_path, ending):
+    """Tracks may have numbers of photos that the model lacks: they are left out."""
+    WRITERS[ending](tmp_path)
+    if ending == "bin":
+        one = struct.pack("<Q3d3Bd", 1, 0, 0, 0, 1, 2, 3, 0.5) + struct.pack("<Q8I", 4, 3, 0, 99, 5, 1, 2, 3, 7)
+        (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 1) + one)
+    else:
+        (tmp_path / "points3D.txt").write_text("1 0 0 0 1 2 3 0.5 3 0 99 5 1 2 3 7\n")
+    shown = read_model(tmp_path).shown
+    assert {name: rows.tolist() for name, rows in shown.items()} == {"a.png": [0], "c.png": [0]}
 
 
 def test_a_byte_order_mark_is_skipped(tmp_path):
@@ -94,7 +107,7 @@ def test_a_byte_order_mark_is_skipped(tmp_path):
     write_txt(tmp_path)
     for path in tmp_path.glob("*.txt"):
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().removeprefix(b"# a comment\n"))
-    cameras, images, points, _ = read_model(tmp_path)
+    cameras, images, points, *_ = read_model(tmp_path)
     assert (len(cameras), len(images), len(points)) == (2, 3, 2)
 
 
@@ -228,8 +241,8 @@ def test_missing_files_are_named(tmp_path, name, ending):
 
 def test_a_model_without_points_has_none(tmp_path, ending):
     WRITERS[ending](tmp_path, points=[])
-    _, _, points, colors = read_model(tmp_path)
-    assert points.shape == colors.shape == (0, 3)
+    model = read_model(tmp_path)
+    assert model.points.shape == model.colors.shape == (0, 3) and not model.shown
 
 
 def test_photos_without_a_file_are_counted_in_one_warning(tmp_path):
@@ -270,7 +283,7 @@ def test_our_parser_agrees_with_colmaps(shared, tmp_path, name, ending):
     if ending == "txt":
         theirs.write_text(tmp_path)
         model = tmp_path
-    cameras, images, points, colors = read_model(model)
+    cameras, images, points, colors, shown = read_model(model)
     for number, camera in theirs.cameras.items():
         ours = cameras[number]
         assert (ours.model, ours.width, ours.height) == (camera.model.name, camera.width, camera.height)
@@ -284,6 +297,11 @@ def test_our_parser_agrees_with_colmaps(shared, tmp_path, name, ending):
     ours = sorted(np.hstack([points, colors]).tolist())
     rows = sorted([*point.xyz.tolist(), *point.color.tolist()] for point in theirs.points3D.values())
     np.testing.assert_allclose(ours, rows, rtol=1e-14)
+    for image in theirs.images.values():
+        seen = [theirs.points3D[p.point3D_id].xyz for p in image.points2D if p.has_point3D()]
+        np.testing.assert_allclose(
+            np.unique(points[shown[image.name]], axis=0), np.unique(np.array(seen), axis=0), rtol=1e-14
+        )
 
 
 def sampled(image, pixels):

@@ -159,7 +159,7 @@ def test_of_two_models_the_larger_is_taken(photos, tmp_path):
         Image.fromarray(photo).save(tmp_path / f"a{k}.png")
     for k, photo in enumerate(photos):
         Image.fromarray(photo).save(tmp_path / f"b{k}.png")
-    _, images, _, _ = read_model(reconstruct(tmp_path, CONFIG))
+    _, images, *_ = read_model(reconstruct(tmp_path, CONFIG))
     assert sorted(name for name, _, _ in images) == ["b0.png", "b1.png", "b2.png", "b3.png"]
 
 
@@ -222,7 +222,7 @@ def test_portrait_and_landscape_are_two_cameras(tmp_path, photos):
     """A single COLMAP camera has one size; COLMAP silently drops photos of another size."""
     for k, photo in enumerate(photos):
         Image.fromarray(photo[:, 40:280] if k in (1, 2) else photo).save(tmp_path / f"{k}.png")
-    cameras, images, _, _ = read_model(reconstruct(tmp_path, CONFIG))
+    cameras, images, *_ = read_model(reconstruct(tmp_path, CONFIG))
     assert sorted((camera.width, camera.height) for camera in cameras.values()) == [(240, 240), (320, 240)]
     assert len(images) == 4
 

@@ -152,7 +152,7 @@ def test_damaged_colmap_models(folder, cases, ending, name):
         # The error on a missing camera comes from the photos, and names both files.
         found = read(lambda: colmap.read_model(model), f"{model.name}/")
         if found is not None:
-            _, images, points, _ = found
+            _, images, points, *_ = found
             assert images and np.isfinite(points).all()
             for _, _, viewmat in images:
                 rotation = viewmat[:3, :3]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cli_runs import run, write_dataset
 from PIL import Image
+from test_brightness import alternating, scene_of
 from test_triangulation import POINTS_TARGET, posed, write_transforms  # noqa: F401  (a fixture)
 
 from clsplat import TrainConfig, prepare, save_gaussians, train
@@ -19,6 +20,7 @@ from clsplat.evaluate import evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.scene import View
 from clsplat.training.preparation import open_device
+from clsplat.training.presets import load_preset
 
 
 def from_python(data: Path, config: TrainConfig, out: Path) -> bytes:
@@ -53,6 +55,17 @@ def test_poses_without_points(posed: list[View], tmp_path: Path) -> None:
     told: list[str] = []
     scene, _ = prepare(path, config, tell=told.append)
     assert len(scene.points) == POINTS_TARGET and f"start: {POINTS_TARGET} points, from photos and poses" in told[1]
+
+
+def test_photos_brighter_than_those_next_to_them_are_evened_out(tmp_path: Path) -> None:
+    """Unless each photo's exposure is learned, or the presets of papers are used."""
+    scene = scene_of(np.exp(alternating()))
+    told: list[str] = []
+    found, _ = prepare(tmp_path, TrainConfig(iterations=5), scene=scene, tell=told.append)
+    assert len(found.gains) > len(scene.train) / 2
+    assert f"brightness: {len(found.gains)} of {len(scene.train)} training photos differ" in "\n".join(told)
+    for config in (TrainConfig(even_brightness=False), TrainConfig(exposure=True), load_preset("paper-7k")):
+        assert not prepare(tmp_path, replace(config, iterations=5), scene=scene)[0].gains
 
 
 def test_photos_that_are_reduced_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
