@@ -197,12 +197,12 @@ def with_points(scene: Scene, path: str | Path, config: DataConfig, verbose: boo
     photos = _faces_of({view.name for view in scene.train}, dataset, config)
     views = (load_view(photo, dataset, config) for photo in photos)
     moved = (replace(view, camera=view.camera.translated(scene.offset)) for view in views)
-    points, colors = triangulate(moved, verbose)
+    points, colors, shown = triangulate(moved, verbose)
     points, colors = filled(points, colors) if len(points) else points_of_outlines(scene.train)
     if not len(points):
         return scene
     train, test = ([v.with_camera(replace(v.camera, near=None)) for v in part] for part in (scene.train, scene.test))
-    return with_near_planes(replace(scene, train=train, test=test, points=points, colors=colors))
+    return with_near_planes(replace(scene, train=train, test=test, points=points, colors=colors, shown=shown))
 
 
 def with_depth_maps(scene: Scene, path: str | Path, config: DataConfig, tell: Callable[[str], None]) -> Scene:

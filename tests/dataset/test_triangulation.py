@@ -12,6 +12,7 @@ from clsplat.camera import Camera
 from clsplat.cli import main
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene, with_points
+from clsplat.dataset.coverage import projected
 from clsplat.dataset.near_planes import near_plane
 from clsplat.dataset.sfm.triangulation import NEIGHBOURS, POINTS_TARGET, TRIANGULATED_MIN, filled, pairs, triangulate
 from clsplat.errors import InputError
@@ -53,7 +54,7 @@ def write_transforms(folder, views, **more):
 
 
 def test_points_lie_on_the_planes_and_have_their_colours(posed):
-    points, colors = triangulate(posed)
+    points, colors, _ = triangulate(posed)
     assert points.dtype == np.float64 and colors.dtype == np.uint8 and points.shape == colors.shape
     assert len(points) > 3 * TRIANGULATED_MIN
     # Features are located to a fraction of a pixel; 11 degrees between two photos make the error in depth 5 times
@@ -74,6 +75,16 @@ def test_the_same_photos_give_the_same_points(posed):
     first, second = triangulate(posed), triangulate(iter(posed))
     np.testing.assert_array_equal(first[0], second[0])
     np.testing.assert_array_equal(first[1], second[1])
+    assert first.shown.keys() == second.shown.keys()
+
+
+def test_photos_show_the_points_of_their_features(posed):
+    points, _, shown = triangulate(posed)
+    assert shown.keys() == {view.name for view in posed}
+    assert (np.bincount(np.concatenate(list(shown.values())), minlength=len(points)) >= 2).all()
+    for view in posed:
+        _, _, inside = projected(view.camera, points[shown[view.name]])
+        assert inside.mean() > 0.99, "a feature may lie on the edge"
 
 
 def test_masked_pixels_make_no_points(posed):
@@ -83,7 +94,7 @@ def test_masked_pixels_make_no_points(posed):
         rays = view.camera.rays(x, y) @ view.camera.viewmat[:3, :3]
         reach = np.where(rays < 0, -view.camera.position / rays, np.inf)
         masked.append(replace(view, mask=reach.argmin(axis=-1) != 2))  # not the floor
-    points, _ = triangulate(masked)
+    points, *_ = triangulate(masked)
     on_floor, unmasked = (np.mean(p[:, 2] < 4 * PIXEL) for p in (points, triangulate(posed)[0]))
     # A feature covers several pixels, so that its centre can lie beyond the edge of the mask.
     assert len(points) > TRIANGULATED_MIN and on_floor < 0.05 < unmasked
@@ -93,13 +104,13 @@ def test_masked_pixels_make_no_points(posed):
 
 def test_fisheyes_are_projected_as_such():
     fisheyes = [replace(c, model="fisheye", distortion=(0.1, -0.05, 0.02, 0.0)) for c in cameras()]
-    points, _ = triangulate(views(take_photos(0, fisheyes), fisheyes))
+    points, *_ = triangulate(views(take_photos(0, fisheyes), fisheyes))
     assert len(points) > 3 * TRIANGULATED_MIN and np.median(off_the_corner(points)) < 0.3 * PIXEL
 
 
 def test_photos_that_show_nothing_make_no_points(posed):
     for photos in (posed[:1], [replace(v, image=np.full_like(v.image, 90)) for v in posed]):
-        points, colors = triangulate(photos)
+        points, colors, _ = triangulate(photos)
         assert points.shape == colors.shape == (0, 3)
 
 
@@ -153,7 +164,7 @@ def test_a_dataset_of_poses_gets_points_from_photos_of_full_size(posed, tmp_path
     scene = load_scene(path, config)
     assert not len(scene.points) and scene.train[0].image.shape == (60, 80, 3)
     found = with_points(scene, path, config)
-    points, colors = triangulate(load_scene(path, DataConfig(test_every=0)).train)
+    points, colors, _ = triangulate(load_scene(path, DataConfig(test_every=0)).train)
     assert len(points) < POINTS_TARGET == len(found.points) == len(found.colors)
     np.testing.assert_array_equal(found.points[: len(points)], points)
     np.testing.assert_array_equal(found.colors[: len(points)], colors)
@@ -170,7 +181,7 @@ def test_only_photos_that_train_make_points(posed, tmp_path):
     path = write_transforms(tmp_path, posed)
     scene = load_scene(path, config)
     assert [view.name for view in scene.train] == ["1.png", "2.png", "3.png"]
-    points, _ = triangulate(scene.train)
+    points, *_ = triangulate(scene.train)
     assert len(points) >= TRIANGULATED_MIN
     np.testing.assert_array_equal(with_points(scene, path, config).points[: len(points)], points)
 
@@ -197,7 +208,7 @@ def test_panoramas_that_train_whole_make_points_by_their_faces(tmp_path, monkeyp
 
 
 def test_points_are_filled_up_between_neighbours(posed):
-    points, colors = triangulate(posed)
+    points, colors, _ = triangulate(posed)
     more, blended = filled(points, colors)
     assert more.shape == blended.shape == (POINTS_TARGET, 3) and blended.dtype == np.uint8
     np.testing.assert_array_equal(more[: len(points)], points)

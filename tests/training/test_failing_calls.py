@@ -120,5 +120,5 @@ def test_triangulation_does_not_need_to_remove_its_files(tmp_path: Path, monkeyp
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with monkeypatch.context() as patch:
         patch.setattr(os, "rmdir", refused)
-        points, _ = triangulate([view()])
+        points, *_ = triangulate([view()])
     assert len(points) == 0 and list(tmp_path.iterdir()) != []

@@ -7,6 +7,7 @@ Features and matches are those of `clsplat.dataset.sfm.matching`; the poses are 
 from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,19 @@ def pairs(cameras: list[Camera]) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+class Triangulated(NamedTuple):
+    """Points that were triangulated.
+
+    points (P, 3): positions in world units; P is 0 if fewer than `TRIANGULATED_MIN` were found; colors (P, 3): mean
+    RGB of the points in the photos; shown: rows of the points whose features a photo has, by its name.
+    """
+
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    shown: dict[str, NDArray[np.intp]]
+
+
+def triangulate(views: Iterable[View], verbose: bool = False) -> Triangulated:
     """Triangulate points from photos with known poses.
 
     Parameters
@@ -87,10 +100,7 @@ def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[n
 
     Returns
     -------
-    points : (P, 3) float64
-        Positions in world units; P is 0 if fewer than `TRIANGULATED_MIN` were found.
-    colors : (P, 3) uint8
-        Mean RGB of the points in the photos.
+    Triangulated
 
     Raises
     ------
@@ -101,14 +111,19 @@ def triangulate(views: Iterable[View], verbose: bool = False) -> tuple[NDArray[n
         work = Path(folder)
         if problem := unwritable(work):
             raise InputError(f"cannot triangulate points: {work.parent} takes no files: {problem}")
-        cameras = _write_photos(views, work)
-        chosen = pairs(list(cameras.values()))
+        written = _write_photos(views, work)
+        chosen = pairs([camera for _, camera in written.values()])
         if not chosen:
-            return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-        photos = [(name, *_lens(camera), camera.viewmat.tolist()) for name, camera in cameras.items()]
+            return Triangulated(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), {})
+        photos = [(file, *_lens(camera), camera.viewmat.tolist()) for file, (_, camera) in written.items()]
         apart("triangulate points", f"{__name__}:solve", work, photos=photos, chosen=chosen, verbose=verbose)
         with np.load(work / POINTS) as found:
-            return found["points"], found["colors"]
+            features = zip(found["files"].tolist(), found["rows"].tolist(), strict=True)
+            shown: dict[str, set[int]] = {}
+            for file, row in features:
+                shown.setdefault(written[file][0], set()).add(row)
+            rows = {name: np.array(sorted(each), np.intp) for name, each in shown.items()}
+            return Triangulated(found["points"], found["colors"], rows)
 
 
 def solve(work: Path, photos: list[Photo], chosen: list[tuple[int, int]], verbose: bool) -> None:
@@ -154,10 +169,13 @@ def solve(work: Path, photos: list[Photo], chosen: list[tuple[int, int]], verbos
         model = pycolmap.triangulate_points(model, database, work, work / "model", options=options)
     points = [point for _, point in sorted(model.points3D.items())]
     kept = points if len(points) >= TRIANGULATED_MIN else []
+    seen = [(model.images[e.image_id].name, row) for row, point in enumerate(kept) for e in point.track.elements]
     np.savez(
         work / POINTS,
         points=np.array([point.xyz for point in kept]).reshape(-1, 3),
         colors=np.array([point.color for point in kept], np.uint8).reshape(-1, 3),
+        files=np.array([file for file, _ in seen], str),
+        rows=np.array([row for _, row in seen], int),
     )
 
 
@@ -199,15 +217,15 @@ def _lens(camera: Camera) -> tuple[str, list[float]]:
     return "OPENCV_FISHEYE" if fisheye else "PINHOLE", params
 
 
-def _write_photos(views: Iterable[View], work: Path) -> dict[str, Camera]:
+def _write_photos(views: Iterable[View], work: Path) -> dict[str, tuple[str, Camera]]:
     """Write photos and masks as files for COLMAP.
 
     Returns
     -------
-    dict of Camera
-        Cameras by the name of the file.
+    dict of (str, Camera)
+        Names and cameras of the photos by the name of the file.
     """
-    cameras: dict[str, Camera] = {}
+    written: dict[str, tuple[str, Camera]] = {}
     (work / "masks").mkdir()
     for number, view in enumerate(views):
         name, camera = f"{number:06}.png", view.camera
@@ -223,5 +241,5 @@ def _write_photos(views: Iterable[View], work: Path) -> dict[str, Camera]:
             raise InputError(
                 f"cannot triangulate points: cannot write to {work.parent}: {error.strerror or error}"
             ) from error
-        cameras[name] = camera
-    return cameras
+        written[name] = view.name, camera
+    return written
