@@ -29,9 +29,9 @@ FEWEST_PHOTOS = 8
 MOST_PHOTOS = 300
 """Largest number of photos by which the Gaussian process is fitted, evenly spaced, which bounds the time."""
 
-FEWEST_POINTS = 20
-"""Fewest points by which the brightness of a photo is known to a hundredth: the colours of one differ by some
-hundredths."""
+FEWEST_POINTS = 100
+"""Fewest points by which the brightness of a photo is known to a hundredth: the logarithms of a point's colours in
+several photos differ by 0.05 to 0.1."""
 
 WINDOW = 2
 """Half edge of the square of pixels whose mean is a point's colour, px: points are off by up to a pixel."""
@@ -43,7 +43,7 @@ CLIPPED = 254
 """Value from which a channel counts as clipped: the scene may be brighter there, so that it is not made darker."""
 
 ROUNDS = 20
-"""Rounds of the robust fit; the weights change by less than 1 % in the last ones."""
+"""Rounds of the robust fit."""
 
 PRIOR = 0.3
 """Standard deviation of the logarithm of a photo's brightness before it is measured: some tenths in photos with

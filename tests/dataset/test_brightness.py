@@ -12,7 +12,7 @@ from clsplat.dataset.coverage import projected
 from clsplat.scene import Scene, View
 
 PHOTOS = 16
-COUNT = 120
+COUNT = 250
 
 
 def path(count: int = PHOTOS) -> NDArray[np.float64]:
@@ -34,9 +34,9 @@ def scene_of(factors: NDArray[np.float64]) -> Scene:
     colors = rng.uniform(40, 160, (COUNT, 3))
     views, shown = [], {}
     for k, (place, factor) in enumerate(zip(path(len(factors)), factors, strict=True)):
-        camera = Camera.look_at(place, [0, 0, 0], [0, 0, 1], 200, 160, 120)
+        camera = Camera.look_at(place, [0, 0, 0], [0, 0, 1], 400, 320, 240)
         places, depths, inside = projected(camera, points)
-        image = np.full((120, 160, 3), 100.0) * factor
+        image = np.full((240, 320, 3), 100.0) * factor
         for row in np.argsort(-depths):
             column, line = places[row].astype(int)
             image[max(0, line - 3) : line + 4, max(0, column - 3) : column + 4] = colors[row] * factor
@@ -93,15 +93,15 @@ def test_equal_photos_have_no_gains() -> None:
 
 
 def test_hidden_points_and_masks_do_not_count() -> None:
-    """A third of the tracks is wrong, and half of a photo shows something else behind a mask."""
+    """A third of the tracks is wrong, and a third of a photo shows something else behind a mask."""
     jump = alternating()
     scene = scene_of(np.exp(jump))
     rng = np.random.default_rng(3)
     wrong = {name: np.unique([*rows, *rng.integers(0, COUNT, len(rows) // 2)]) for name, rows in scene.shown.items()}
     image = scene.train[5].image.copy()
-    image[:, :80] = rng.integers(20, 230, 3)
+    image[:, :100] = rng.integers(20, 230, 3)
     mask = np.ones(image.shape[:2], bool)
-    mask[:, :80] = False
+    mask[:, :100] = False
     views = [*scene.train[:5], replace(scene.train[5], image=image, mask=mask), *scene.train[6:]]
     found = logs(replace(scene, train=views, shown=wrong))
     np.testing.assert_allclose(found[:, 0] - found[:, 0].mean(), jump - jump.mean(), atol=0.06)
@@ -111,7 +111,7 @@ def test_without_tracks_or_with_few_photos_there_are_no_gains() -> None:
     scene = scene_of(np.exp(alternating()))
     assert gains(scene) and gains(replace(scene, shown={})) == {}
     assert gains(replace(scene, train=scene.train[: FEWEST_PHOTOS - 1])) == {}
-    assert gains(replace(scene, shown={name: rows[:5] for name, rows in scene.shown.items()})) == {}
+    assert gains(replace(scene, shown={name: rows[:50] for name, rows in scene.shown.items()})) == {}
 
 
 def test_colors_are_divided_except_where_they_are_clipped() -> None:
