@@ -29,6 +29,7 @@ from clsplat.bench.quality_summary import METRICS
 from clsplat.bench.results import KEYS, Record, append_record, read_records, write_records
 from clsplat.config import BACKGROUNDS, DataConfig, TrainConfig
 from clsplat.dataset import load_scene
+from clsplat.dataset.brightness import evened
 from clsplat.dataset.coverage import rare_pixels
 from clsplat.device import Device
 from clsplat.errors import ClsplatError, InputError
@@ -225,7 +226,7 @@ def run_cell(
                 scene, config, out, device, evaluate=evaluate, evaluate_after=set(at[:-1]), progress=progress
             )
         values = sample(config.iterations, gaussians)
-        values |= training_psnr(gaussians, scene.train, renderer)
+        values |= training_psnr(gaussians, evened(scene).train, renderer)
         values |= {"fps": frames_per_second(gaussians, scene.test, renderer)}
         record(values)
     return values

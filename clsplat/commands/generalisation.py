@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.bench.measures import training_psnr
+from clsplat.dataset.brightness import evened
 from clsplat.dataset.coverage import VIEWS_MIN, rare_pixels
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def generalisation(
     str
         One paragraph.
     """
-    trained = training_psnr(gaussians, scene.train, renderer)["train_psnr"]
+    trained = training_psnr(gaussians, evened(scene).train, renderer)["train_psnr"]
     held, fitted = report["mean"]["psnr"], report["mean"]["psnr_fitted"]
     if held is None or trained is None:
         return f"{len(scene.test)} held-out photos, without errors in at least one"

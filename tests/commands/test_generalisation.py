@@ -56,6 +56,15 @@ def test_exposures_are_named_where_a_fit_of_colours_gains(scene, device):
     assert "--exposure" not in generalisation(*scene, report(25.0, 15.0, fitted=20.9), Renderer(device), False)
 
 
+def test_training_photos_count_as_they_trained(scene, device):
+    gaussians, photos = scene
+    dark = [replace(view, image=np.rint(view.image / 2).astype(np.uint8)) for view in photos.train]
+    even = replace(photos, train=dark, gains={view.name: np.full(3, 0.5) for view in dark})
+    texts = [generalisation(gaussians, s, report(25.0, 15.0), Renderer(device), False) for s in (photos, even)]
+    levels = [float(text.split("training photos ")[1].split()[0]) for text in texts]
+    assert levels[1] > 40 < levels[0], "no error but those of rounding"
+
+
 @pytest.mark.parametrize(
     ("pixels", "side"), [((0, 15), "at the top"), ((0, -15), "at the bottom"), ((20, 0), "on the left")]
 )
