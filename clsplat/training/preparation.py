@@ -96,8 +96,8 @@ def prepare(
         if scene.gains:
             most = np.expm1(np.abs(np.log(list(scene.gains.values()))).max())
             tell(
-                f"brightness: {len(scene.gains)} of {len(scene.train)} training photos differ from those taken next "
-                f"to them, by up to {most:.0%}, and are evened out (--no-even-brightness: not)"
+                f"brightness: training photos differ from those taken next to them by up to {most:.0%}, and are "
+                "evened out (--no-even-brightness: not)"
             )
     config = with_length(config, scene)
     few = adapted(config, scene)

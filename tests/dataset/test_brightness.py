@@ -12,7 +12,7 @@ from clsplat.dataset.coverage import projected
 from clsplat.scene import Scene, View
 
 PHOTOS = 16
-COUNT = 250
+COUNT = 300
 
 
 def path(count: int = PHOTOS) -> NDArray[np.float64]:
@@ -88,8 +88,10 @@ def test_gains_are_those_of_the_photos() -> None:
     np.testing.assert_allclose(found[:, 0] - found[:, 0].mean(), jump - jump.mean(), atol=2 * LEAST)
 
 
-def test_equal_photos_have_no_gains() -> None:
+def test_photos_that_hardly_differ_have_no_gains() -> None:
     assert gains(scene_of(np.ones(PHOTOS))) == {}
+    assert gains(scene_of(np.exp(alternating(size=LEAST / 2)))) == {}
+    assert len(gains(scene_of(np.exp(alternating(size=2 * LEAST))))) == PHOTOS
 
 
 def test_hidden_points_and_masks_do_not_count() -> None:
