@@ -34,9 +34,9 @@ def scene_of(factors: NDArray[np.float64]) -> Scene:
     colors = rng.uniform(40, 160, (COUNT, 3))
     views, shown = [], {}
     for k, (place, factor) in enumerate(zip(path(len(factors)), factors, strict=True)):
-        camera = Camera.look_at(place, [0, 0, 0], [0, 0, 1], 400, 320, 240)
+        camera = Camera.look_at(place, [0, 0, 0], [0, 0, 1], 600, 480, 360)
         places, depths, inside = projected(camera, points)
-        image = np.full((240, 320, 3), 100.0) * factor
+        image = np.full((360, 480, 3), 100.0) * factor
         for row in np.argsort(-depths):
             column, line = places[row].astype(int)
             image[max(0, line - 3) : line + 4, max(0, column - 3) : column + 4] = colors[row] * factor
@@ -101,9 +101,9 @@ def test_hidden_points_and_masks_do_not_count() -> None:
     rng = np.random.default_rng(3)
     wrong = {name: np.unique([*rows, *rng.integers(0, COUNT, len(rows) // 2)]) for name, rows in scene.shown.items()}
     image = scene.train[5].image.copy()
-    image[:, :100] = rng.integers(20, 230, 3)
+    image[:, :150] = rng.integers(20, 230, 3)
     mask = np.ones(image.shape[:2], bool)
-    mask[:, :100] = False
+    mask[:, :150] = False
     views = [*scene.train[:5], replace(scene.train[5], image=image, mask=mask), *scene.train[6:]]
     found = logs(replace(scene, train=views, shown=wrong))
     np.testing.assert_allclose(found[:, 0] - found[:, 0].mean(), jump - jump.mean(), atol=0.06)
