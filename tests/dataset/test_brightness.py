@@ -113,6 +113,14 @@ def test_what_masks_hide_does_not_count() -> None:
     np.testing.assert_allclose(found[:, 0] - found[:, 0].mean(), jump - jump.mean(), atol=2 * LEAST)
 
 
+def test_photos_that_are_hidden_or_clipped_have_no_factor() -> None:
+    scene = scene_of(np.exp(alternating()))
+    everywhere = slice(0, 480)
+    scene = changed(scene, 3, everywhere, 1.0, masked=True)
+    scene = changed(changed(scene, 6, everywhere, np.full(3, 255, np.uint8)), 9, everywhere, 0.05)
+    assert {view.name for view in scene.train} - gains(scene).keys() == {"03.png", "06.png", "09.png"}
+
+
 def test_hidden_points_do_not_count() -> None:
     """A third of a photo shows something bright before its points."""
     jump = alternating()
