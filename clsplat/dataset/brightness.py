@@ -7,8 +7,8 @@ follow what jumps from one photo to the next: training explains that by haze. On
 The brightness of a photo is that of the scene's points in it, compared with the same points in other photos, as the
 photos of a panorama are evened out (Brown and Lowe 2007, "Automatic panoramic image stitching using invariant
 features", section 6). The slow part is a Gaussian process over the positions of the cameras, and the jumps are its
-noise (Rasmussen and Williams 2006, "Gaussian processes for machine learning", sections 2.2, 4.2 and 5.4). Measured:
-docs/experiments/strategies.md.
+noise (Rasmussen and Williams 2006, "Gaussian processes for machine learning", sections 2.2, 2.7, 4.2 and 5.4).
+Measured: docs/experiments/strategies.md.
 """
 
 from dataclasses import replace
@@ -55,9 +55,6 @@ the jumps; over longer ones nothing changes."""
 
 RATIOS = (0.0, *(2.0 ** (k / 2) for k in range(-12, 9)))
 """Standard deviations of the jumps that are compared, as factors on that of the slow part."""
-
-UNKNOWN = 100.0
-"""Variance of the common mean, as a factor on that of the slow part: it is not known."""
 
 SMALL = 1e-9
 """Added to the variances, as a fraction, so that places of photos that nearly agree can be told apart."""
@@ -160,8 +157,9 @@ def _brightness(photos: NDArray[np.intp], points: NDArray[np.intp], colors: Arra
 def jumps(logs: Array, places: Array) -> Array:
     """The part of values (V, K) at places (V, 3) that changes from one to the next: the noise of a Gaussian process.
 
-    Its covariance is Matern's of order 3/2, and its length and noise are the most likely ones for the means of the
-    values. The result is 0 if half of the places are those of others, as those of the faces of panoramas are.
+    Its mean is not known, its covariance is Matern's of order 3/2, and its length and noise are the most likely ones
+    for the means of the channels. The result is 0 if half of the places are those of others, as those of the faces of
+    panoramas are.
     """
     from scipy.spatial import cKDTree
     from scipy.spatial.distance import cdist
@@ -170,17 +168,22 @@ def jumps(logs: Array, places: Array) -> Array:
     if not nearest:
         return np.zeros_like(logs)
     chosen = np.linspace(0, len(places) - 1, min(len(places), MOST_PHOTOS)).round().astype(int)
-    means, distances = logs.mean(axis=1), cdist(places, places) / nearest
+    distances = cdist(places, places) / nearest
 
-    def covariance(length: float, ratio: float, rows: NDArray[np.intp]) -> Array:
+    def whitened(length: float, ratio: float, rows: NDArray[np.intp], values: Array) -> tuple[Array, Array, float]:
+        """Values (V, K) less their mean, by the root of the covariance; this root; and how well it tells the mean."""
         scaled = np.sqrt(3) * distances[np.ix_(rows, rows)] / length
-        return (1 + scaled) * np.exp(-scaled) + UNKNOWN + (ratio**2 + SMALL) * np.eye(len(rows))
+        root = np.linalg.cholesky((1 + scaled) * np.exp(-scaled) + (ratio**2 + SMALL) * np.eye(len(rows)))
+        both = np.linalg.solve(root, np.column_stack([np.ones(len(rows)), values]))
+        ones, rest = both[:, 0], both[:, 1:]
+        return rest - np.outer(ones, ones @ rest) / (ones @ ones), root, float(np.log(ones @ ones))
 
     def cost(numbers: tuple[float, float]) -> float:
-        """The negative logarithm of the likelihood, with the most likely size of the slow part."""
-        root = np.linalg.cholesky(covariance(*numbers, chosen))
-        whitened = np.linalg.solve(root, means[chosen])
-        return float(len(chosen) / 2 * np.log(whitened @ whitened + SMALL) + np.log(np.diag(root)).sum())
+        """The negative logarithm of the likelihood, with the most likely size of the slow part and any mean."""
+        rest, root, known = whitened(*numbers, chosen, logs[chosen].mean(axis=1))
+        size = max(float((rest**2).sum()), SMALL**2)
+        return float((len(chosen) - 1) / 2 * np.log(size) + np.log(np.diag(root)).sum() + known / 2)
 
     length, ratio = min(product(LENGTHS, RATIOS), key=cost)
-    return np.asarray(ratio**2 * np.linalg.solve(covariance(length, ratio, np.arange(len(places))), logs))
+    rest, root, _ = whitened(length, ratio, np.arange(len(places)), logs)
+    return np.asarray(ratio**2 * np.linalg.solve(root.T, rest))
