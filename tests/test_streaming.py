@@ -16,7 +16,6 @@ from small_run import CONFIG, same
 
 from clsplat.config import CoarseConfig, DataConfig, InitConfig
 from clsplat.dataset import load_scene
-from clsplat.dataset.brightness import evened
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.evaluate import evaluate, mean_metrics
@@ -74,7 +73,6 @@ RUNS = {
     "masks": replace(SHORT, data=DataConfig(masks="masks")),
     "downscaled": replace(SHORT, data=DataConfig(downscale=2)),
     "depths": replace(SHORT, coarse=CoarseConfig(factor=2)),
-    "brightness": SHORT,
 }
 
 
@@ -98,17 +96,8 @@ def test_two_photos_in_memory_make_the_same_bytes_as_all(
     if kind == "depths":
         whole, stream = with_depths(whole), with_depths(stream)
         assert all(isinstance(view, StreamedView) and view.loaded().depth is view.depth for view in stream.train)
-    if kind == "brightness":
-        gains = {view.name: np.array([1.2, 1.1, 0.9]) for view in whole.train[::2]}
-        plain = train(whole, config, tmp_path / "plain", device)
-        whole, stream = replace(whole, gains=gains), replace(stream, gains=gains)
     expected, found = (train(s, config, tmp_path / n, device) for s, n in ((whole, "whole"), (stream, "stream")))
     assert same(found, expected)
-    if kind == "brightness":
-        assert not same(expected, plain)
-        assert same(expected, train(evened(whole), config, tmp_path / "evened", device))
-        # Checkpoints recognise the photos of the files, not those that were changed.
-        assert same(train(whole, config, tmp_path / "stream", device, resume=True), expected)
     reports = [evaluate(expected, s.test, tmp_path / n) for s, n in ((whole, "whole"), (stream, "stream"))]
     assert reports[0] == reports[1]
 

@@ -13,7 +13,7 @@ from clsplat.blocks.partition import EVERYWHERE, Box
 from clsplat.blocks.plan import Block
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
-from clsplat.dataset.brightness import divided
+from clsplat.dataset.brightness import even
 from clsplat.errors import InputError, named
 from clsplat.inputs import Photo
 from clsplat.scene import DIGEST_BYTES, DepthMap, Scene, View, digest
@@ -114,8 +114,7 @@ class Job:
                 f"({named(other)}); start a new run in another folder"
             )
         posed = [view.with_camera(_camera(self.cameras[view.name])) for view in chosen]
-        with_depths = [view.with_depth(self._depth(view)) for view in posed]
-        return [divided(view, self.gains[view.name]) if view.name in self.gains else view for view in with_depths]
+        return even([view.with_depth(self._depth(view)) for view in posed], self.gains)
 
     def _depth(self, view: View) -> DepthMap | None:
         """The depth map of a photo as the whole scene is trained with it."""
@@ -130,17 +129,11 @@ class Job:
         return replace(view.depth, **fit)
 
 
-def make_job(
-    data: Path,
-    file: str,
-    block: Block,
-    scene: Scene,
-    photos: dict[str, Photo],
-    config: TrainConfig,
-) -> Job:
+def make_job(data: Path, file: str, block: Block, scene: Scene, photos: dict[str, Photo], config: TrainConfig) -> Job:
     """Make the job of a block in a scene's file, without sparse points.
 
-    scene: with the photos of the block; photos: digests of all photos; config: settings of the block.
+    file: name of the index of the Gaussians; scene: with the photos of the block; photos: digests of all photos;
+    config: settings of the block.
     """
     views = [scene.train[i] for i in block.photos]
     names = [view.name for view in views]

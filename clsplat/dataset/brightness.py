@@ -11,6 +11,7 @@ noise (Rasmussen and Williams 2006, "Gaussian processes for machine learning", s
 Measured: docs/experiments/strategies.md.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -94,8 +95,12 @@ def gains(scene: Scene) -> dict[str, Array]:
 
 def evened(scene: Scene) -> Scene:
     """The scene with its training photos divided by their factors (`Scene.gains`)."""
-    views = [divided(view, scene.gains[view.name]) if view.name in scene.gains else view for view in scene.train]
-    return replace(scene, train=views, gains={})
+    return replace(scene, train=even(scene.train, scene.gains), gains={})
+
+
+def even(views: list[View], factors: Mapping[str, ArrayLike]) -> list[View]:
+    """Views divided by their factors, by name; those without a factor stay as they are."""
+    return [divided(view, factors[view.name]) if view.name in factors else view for view in views]
 
 
 def divided(view: View, factor: ArrayLike) -> View:
