@@ -316,12 +316,13 @@ class TrainConfig:
     """Learn an affine map of each training photo's colours, for photos of different exposure or white balance."""
     even_brightness: bool = True
     """Even out the brightness of training photos that differ from those taken next to them; not with --exposure."""
+    mask_moving: bool = True
+    """Leave out pixels of training photos that the other photos contradict, such as people who walk by."""
     response: bool = False
     """With --exposure, also learn a curve of contrast for each photo, and the dark corners that all photos share."""
     filter_3d: bool = False
-    """Keep every Gaussian at least as thick as the photos resolve (Mip-Splatting's 3D filter), for scenes that will
-    be seen from closer or at a larger size than they were photographed, and with --mode antialiased also from farther
-    away. Saved scenes contain the filter."""
+    """Keep every Gaussian at least as thick as the photos resolve (Mip-Splatting's 3D filter), for views from closer
+    or at a larger size than photos, and with --mode antialiased also from farther away. Saved scenes contain it."""
     poses: bool = False
     """Refine the training photos' poses, if they are inaccurate. Held-out photos are then evaluated twice: with their
     given poses, and with each camera aligned with the scene."""
@@ -332,9 +333,8 @@ class TrainConfig:
     device: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Part of the platform's or device's name. Default: PYOPENCL_CTX, or the first GPU, accelerator or CPU."""
     memory_limit: Annotated[str | None, byte_size()] = None
-    """Limit of device memory, such as 4GB or 512MiB (default: all memory of the device). The number of Gaussians
-    stops growing before it exceeds the limit. Photos that do not fit are uploaded each time they are needed. The same
-    limit holds for decoded photos in the machine's memory (default: half of it); others stream from the disk."""
+    """Limit of device memory, such as 4GB or 512MiB (default: all of it). Near it, Gaussians stop growing and photos
+    are no longer kept there. It also limits the machine's memory for photos (default: half of it); others stream."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     init: InitConfig = field(default_factory=InitConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)

@@ -39,6 +39,8 @@ from clsplat.ranges import parse_bytes
 from clsplat.renderer import Renderer, fetch
 from clsplat.scene import Scene
 from clsplat.training.loop import train
+from clsplat.training.moving import still
+from clsplat.training.moving_files import load_masks
 from clsplat.training.preparation import prepare
 
 WARM_UP = 4
@@ -226,7 +228,7 @@ def run_cell(
                 scene, config, out, device, evaluate=evaluate, evaluate_after=set(at[:-1]), progress=progress
             )
         values = sample(config.iterations, gaussians)
-        values |= training_psnr(gaussians, evened(scene).train, renderer)
+        values |= training_psnr(gaussians, still(evened(scene).train, load_masks(out)), renderer)
         values |= {"fps": frames_per_second(gaussians, scene.test, renderer)}
         record(values)
     return values

@@ -280,6 +280,7 @@ def report(
     from clsplat.training.outcome import failure
 
     say(f"{out / SCENE}: {len(gaussians)} Gaussians")
+    scene = say_moving(scene, out)
     failed = failure(gaussians, scene.train, renderer)
     if failed:
         warn(failed)
@@ -288,6 +289,22 @@ def report(
         say_size(scene, out)
     if scene.test:
         evaluate_held_out(gaussians, scene, config, renderer, out)
+
+
+def say_moving(scene: "Scene", out: Path) -> "Scene":
+    """Report what training has left out because it moves, and draw it. Returns the scene without it."""
+    from clsplat.show.moving_sheet import moving_sheet
+    from clsplat.training.moving import still
+    from clsplat.training.moving_files import load_masks
+
+    if not (found := load_masks(out)):
+        return scene
+    moving_sheet(out / "moving.png", scene.train, found)
+    say(
+        f"moving: {len(found)} of {len(scene.train)} training photos show what the others contradict, such as people "
+        f"who walk by; it was left out ({out / 'moving.png'} shows where, --no-mask-moving trains on all)"
+    )
+    return replace(scene, train=still(scene.train, found))
 
 
 def say_size(scene: "Scene", out: Path) -> None:

@@ -26,6 +26,7 @@ from clsplat.scene import Scene
 from clsplat.training import photo_exposures, photo_poses
 from clsplat.training.autosize.rule import Candidate, Search, SmallSide
 from clsplat.training.densify import STRATEGIES
+from clsplat.training.moving_files import packed, unpacked
 from clsplat.training.optimizer import Moments
 from clsplat.training.photo_parameters import PerPhoto
 from clsplat.training.photo_poses import refined
@@ -63,7 +64,7 @@ def save_state(path: Path, state: State, config: TrainConfig) -> None:
             arrays |= _rows_arrays(search.small_side.rows, "small_side.")
         arrays["search"] = json.dumps(about)
     with replacing(path) as file:
-        np.savez(file, **arrays)
+        np.savez(file, **arrays, **packed(state.moving))
 
 
 def _rows_arrays(rows: Rows, prefix: str) -> dict[str, Any]:
@@ -206,6 +207,7 @@ def _to_state(arrays: Arrays, extent: float, config: TrainConfig) -> State:
         exposures=_to_photo_parameters(arrays, "exposures.", exposures_of) if config.exposure else None,
         poses=_to_photo_parameters(arrays, "poses.", photo_poses.start) if config.poses else None,
         filter=SmoothingFilter(pixels) if config.filter_3d else None,
+        moving=unpacked(arrays),
     )
 
 

@@ -25,6 +25,8 @@ from clsplat.training.autosize.validation import split
 from clsplat.training.checkpoint import load_state, write_photos
 from clsplat.training.dense_start import first_points
 from clsplat.training.initialize import initialize
+from clsplat.training.moving import still
+from clsplat.training.moving_files import save_masks
 from clsplat.training.preparation import check_settings, open_device
 from clsplat.training.recorder import Recorder
 from clsplat.training.run_folder import held
@@ -167,12 +169,14 @@ def finish(training: Training, out: Path) -> Gaussians:
     state, scene = training.state, training.scene
     if state.exposures or state.poses:
         write_photos(out / "photos.json", state, scene)
+    save_masks(out, state.moving)
     gaussians = fetch(state.shown(training.renderer))
     state.move(None)  # what follows needs the device's memory
     if state.search:
         held = [view.name for view in split(scene.train)[1]]
         write_report(out / "size.json", state.search, training.config, held)
-        gaussians = without_useless_bands(gaussians, state.corrected(scene.train), training.renderer)
+        views = still(state.corrected(scene.train), state.moving)
+        gaussians = without_useless_bands(gaussians, views, training.renderer)
     if state.strategy.leaves_room and training.renderer.backdrop is None:  # other photos may show those of a block
         cameras = [view.camera for view in state.corrected(scene.train)]
         shown = shown_by_any(gaussians, cameras, training.renderer)

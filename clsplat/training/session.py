@@ -25,6 +25,7 @@ from clsplat.training.contributions import contributions
 from clsplat.training.corrections import compare, example, learn_pose
 from clsplat.training.densify import Contributions, Edit
 from clsplat.training.memory import INTERSECTIONS, Footprint, Photos
+from clsplat.training.moving import due, moving, still
 from clsplat.training.optimizer import Optimizer, adam_settings
 from clsplat.training.rows import without_harmonics
 from clsplat.training.sky_start import BEYOND
@@ -64,8 +65,8 @@ class Training:
         self.renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background], backdrop)
         self.optimizer = Optimizer(self.renderer, config.optimizer)
         self.photos = Photos(device)
-        self._views: list[View] = scene.train
-        self._views_of = 1, False  # the divisor of their edges, and whether some are held back
+        self._views: list[View] = []
+        self._views_of = 0, False  # the divisor of their edges, and whether some are held back
         if state.filter and state.filter.pixels is not None:  # of a checkpoint
             state.filter.pixels = self.renderer.upload("pixel sizes", state.filter.pixels)
 
@@ -107,6 +108,8 @@ class Training:
         self.photos.keep_within(self.device.memory_limit - in_use)
         self.refresh_filter()
         loss = step(self, self._view(iteration))
+        if self.config.mask_moving and due(iteration, self.config.iterations, bool(self.state.moving)):
+            self._look_for_motion()
         if self.state.strategy.due(iteration):
             self.densify(self._cap())
         if self.state.filter and self.state.filter.due(iteration):
@@ -127,7 +130,14 @@ class Training:
         if self._views_of != wanted:
             factor, holds_back = self._views_of = wanted
             views = split(self.scene.train)[0] if holds_back else self.scene.train
+            views = still(views, self.state.moving)
             self._views, self.photos = [shrunk(view, factor) for view in views], Photos(self.device)
+
+    def _look_for_motion(self) -> None:
+        """Find what moves in the training photos, which trains no more."""
+        state, degree = self.state, self.state.sh_degree(self.state.iteration, self.config)
+        state.moving = moving(self.renderer, state.shown(self.renderer), state.corrected(self.scene.train), degree)
+        self._views_of = 0, False
 
     def refresh_filter(self) -> None:
         """Measure the pixel sizes of the 3D filter, if there is one and its rows have changed."""

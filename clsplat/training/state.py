@@ -17,6 +17,7 @@ from clsplat.training.autosize import rule
 from clsplat.training.autosize.validation import can_validate
 from clsplat.training.densify import STRATEGIES, Strategy
 from clsplat.training.initialize import initialize
+from clsplat.training.moving import Masks
 from clsplat.training.optimizer import Moments, sh_degree_at
 from clsplat.training.photo_parameters import PerPhoto
 from clsplat.training.rows import Rows
@@ -35,6 +36,7 @@ class State:
     the growth where memory does. losses: those of the iterations since the last line of the log. search: for the
     number of Gaussians; None where that is fixed. exposures, poses: parameters of the photos; None where they are not
     learned. filter: the 3D filter, if there is one. inputs: what the run trains on; iterations do not change it.
+    moving: pixels of photos that do not train, as `clsplat.training.moving` finds them.
     """
 
     iteration: int
@@ -48,6 +50,7 @@ class State:
     poses: PerPhoto | None = None
     filter: SmoothingFilter | None = None
     inputs: Inputs = field(default_factory=Inputs)
+    moving: Masks = field(default_factory=dict)
 
     @property
     def gaussians(self) -> Gaussians:

@@ -26,6 +26,7 @@ from clsplat.training.autosize.rule import (
 )
 from clsplat.training.autosize.validation import split, validate
 from clsplat.training.coarse_to_fine import factor_at
+from clsplat.training.moving import still
 from clsplat.training.session import Training
 from clsplat.training.smoothing_filter import SmoothingFilter
 from clsplat.training.state import State
@@ -136,7 +137,8 @@ def _train_pruned(training: Training, iteration: int, after: After) -> SmallSide
     """Fork a training, prune the fork, and train it to the end of the trial. The rows of the training are on the
     host."""
     state, config = training.state, training.config
-    gaussians, views = fetch(state.shown(training.renderer)), state.corrected(training.scene.train)
+    gaussians = fetch(state.shown(training.renderer))
+    views = state.corrected(still(training.scene.train, state.moving))
     rows = costliest_rows(gaussians, HALVING, views, training.renderer)
     side = training.fork(state.fork(state.rows.take(rows)))
     validated = []
@@ -159,7 +161,7 @@ def _validate(training: Training, sh_degree: int | None = None) -> list[float]:
     state, renderer = training.state, training.renderer
     if sh_degree is None:
         sh_degree = _trained_degree(training)
-    held = split(training.scene.train)[1]
+    held = still(split(training.scene.train)[1], state.moving)
     training.refresh_filter()
     return validate(state.shown(renderer), held, renderer, sh_degree, fitted=state.exposures is not None)
 
