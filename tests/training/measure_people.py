@@ -1,6 +1,6 @@
 """Photos in which people walk by: what leaving them out of a training makes up for.
 
-python tests/training/measure_people.py DATA TEXTURES OUT
+python tests/training/measure_people.py DATA TEXTURES OUT 4
 clsplat train OUT -o RUN --downscale 4    # and with --no-mask-moving, and with --masks true
 
 In half of the training photos are one to three silhouettes of people, at random places, with the colours of parts of
@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from clsplat.config import DataConfig
-
-DOWNSCALE = 4
-"""Factor by which the photos' edges are divided."""
 
 SHARE = 0.5
 """Fraction of the training photos with people."""
@@ -40,28 +37,32 @@ def silhouette(width: int, height: int, rng: np.random.Generator) -> NDArray[np.
     return np.asarray(image.resize((width, height), Image.Resampling.BOX), float) / 255
 
 
-def reduced(path: Path) -> NDArray[np.float64]:
-    """A photo (H, W, 3), 0 to 255, reduced by `DOWNSCALE`."""
+def reduced(path: Path, factor: int) -> NDArray[np.float64]:
+    """A photo (H, W, 3), 0 to 255, its edges divided by a factor."""
     with Image.open(path) as photo:
         pixels = np.asarray(photo.convert("RGB"), float)
-    height, width = (edge // DOWNSCALE for edge in pixels.shape[:2])
-    whole = pixels[: height * DOWNSCALE, : width * DOWNSCALE]
-    return whole.reshape(height, DOWNSCALE, width, DOWNSCALE, 3).mean(axis=(1, 3))
+    height, width = (edge // factor for edge in pixels.shape[:2])
+    whole = pixels[: height * factor, : width * factor]
+    return whole.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
 
 
 def with_person(
-    image: NDArray[np.float64], covered: NDArray[np.float64], textures: list[Path], rng: np.random.Generator
+    image: NDArray[np.float64],
+    covered: NDArray[np.float64],
+    textures: list[Path],
+    factor: int,
+    rng: np.random.Generator,
 ) -> None:
-    """Put a person into a photo, and its coverage into `covered`, both in place."""
+    """Put a person into a reduced photo, and its coverage into `covered`, both in place."""
     h, w = covered.shape
     height = int(h * rng.uniform(0.2, 0.5))
     width = int(height * rng.uniform(0.35, 0.55))
     y, x = int(rng.uniform(0.35 * h, 0.95 * h - height * 0.6)), int(rng.uniform(-width / 2, w - width / 2))
     with Image.open(textures[rng.integers(len(textures))]) as photo:
         texture = photo.convert("RGB")
-    left = int(rng.integers(0, max(1, texture.width - width * DOWNSCALE)))
-    top = int(rng.integers(0, max(1, texture.height - height * DOWNSCALE)))
-    box = left, top, left + width * DOWNSCALE, top + height * DOWNSCALE
+    left = int(rng.integers(0, max(1, texture.width - width * factor)))
+    top = int(rng.integers(0, max(1, texture.height - height * factor)))
+    box = left, top, left + width * factor, top + height * factor
     clothes = np.asarray(texture.crop(box).resize((width, height), Image.Resampling.BOX), float)
     clothes = np.clip(clothes * rng.uniform(0.5, 1.1, 3), 0, 255)
     person = silhouette(width, height, rng)
@@ -74,24 +75,25 @@ def with_person(
     covered[rows, columns] = np.maximum(covered[rows, columns], person[own])
 
 
-def main(data: Path, textures: Path, out: Path) -> None:
+def main(data: Path, textures: Path, out: Path, factor: int) -> None:
     """Write reduced photos of a COLMAP dataset with people, and masks of these in the folder `true`."""
-    copies, masks = out / f"images_{DOWNSCALE}", out / "true"
+    copies, masks = out / ("images" if factor == 1 else f"images_{factor}"), out / "true"
     for folder in copies, masks:
         folder.mkdir(parents=True)
     for name in ("images", "sparse"):
-        (out / name).symlink_to((data / name).resolve())
+        if not (out / name).exists():
+            (out / name).symlink_to((data / name).resolve())
     others = sorted((textures / "images").iterdir())
     rng = np.random.default_rng(11)
     for number, path in enumerate(sorted((data / "images").iterdir())):
-        image = reduced(path)
+        image = reduced(path, factor)
         covered = np.zeros(image.shape[:2])
         if number % DataConfig().test_every and rng.random() < SHARE:
             for _ in range(rng.integers(1, 4)):
-                with_person(image, covered, others, rng)
+                with_person(image, covered, others, factor, rng)
         Image.fromarray(np.rint(image).astype(np.uint8)).save(copies / path.name, format="PNG")
         Image.fromarray(np.where(covered > 0.05, 0, 255).astype(np.uint8)).save(masks / f"{path.stem}.png")
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:4]))
+    main(*map(Path, sys.argv[1:4]), int(sys.argv[4]))
