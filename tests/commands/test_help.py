@@ -47,7 +47,7 @@ def test_all_help_has_every_setting_and_brief_help_the_common_ones(capsys: pytes
     for name in COMMON:
         assert f"--{name.replace('_', '-')} " in brief, name
     assert "--help-all shows every setting" in brief and "--help-all" not in whole
-    assert "Photos that do not fit" in whole and "Photos that do not fit" not in brief
+    assert "others stream" in whole and "others stream" not in brief
 
 
 def test_every_common_setting_exists() -> None:

@@ -33,7 +33,7 @@ def test_a_trial_is_validated_up_to_its_end(monkeypatch: pytest.MonkeyPatch) -> 
 
     rows = SimpleNamespace(take=lambda kept: kept)
     state = SimpleNamespace(
-        shown=lambda renderer: None, corrected=lambda views: views, rows=rows, fork=lambda rows: None
+        shown=lambda renderer: None, corrected=lambda views: views, rows=rows, fork=lambda rows: None, moving={}
     )
     training: Any = SimpleNamespace(
         state=state, config=TrainConfig(), renderer=None, scene=SimpleNamespace(train=[]), fork=lambda state: Fork()

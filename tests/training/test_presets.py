@@ -50,7 +50,8 @@ def test_the_papers_presets_are_its_strategy_and_iterations():
         sh_degree_every=1000,
     )
     start, few = InitConfig(triangulate=False, dense=False, sky=False), FewViewsConfig(below=0)
-    paper = TrainConfig(strategy="adc", size="fixed", even_brightness=False, init=start, few=few, optim=rates)
+    added = {"even_brightness": False, "mask_moving": False}
+    paper = TrainConfig(strategy="adc", size="fixed", init=start, few=few, optim=rates, **added)
     assert load_preset("paper-7k") == replace(paper, iterations=7000)
     assert load_preset("paper-30k") == replace(paper, iterations=30_000)
 
