@@ -66,9 +66,9 @@ motion, up to 0.008 are seeds, in few of them."""
 WHOLE = 0.5
 """Fraction of a photo's pixels beyond which its exposure or pose is wrong, and nothing is left out."""
 
-LEAST = 0.005
-"""Least fraction of all pixels that must be seeds: otherwise nothing is left out of any photo. It is 0.0005 to 0.004
-where nothing moves (docs/experiments/moving.md)."""
+LEAST = (0.005, 0.002)
+"""Least fraction of all pixels that must be seeds, at the first time and later: otherwise nothing is left out of any
+photo. At first, what is not trained yet seems to move, too (docs/experiments/moving.md)."""
 
 SHOWN = 0.5
 """Sum of the compositing weights, in pixels of the reduced photos, from which a photo shows a Gaussian."""
@@ -90,14 +90,19 @@ class Evidence(NamedTuple):
     others: Array
 
 
-def due(iteration: int, iterations: int, found: bool) -> bool:
-    """Whether photos are looked through after an iteration. If nothing moved at the first time, they are no more."""
+def due(iteration: int, iterations: int, found: bool) -> float | None:
+    """Least fraction of seeds for the look through the photos after an iteration; None if none is due.
+
+    The third time and later are only for photos in which something was `found`.
+    """
     times = [max(EARLIEST, round(time * iterations)) for time in TIMES]
-    return iteration < iterations and iteration in (times if found else times[:1])
+    if iteration >= iterations or iteration not in (times if found else times[: len(LEAST)]):
+        return None
+    return LEAST[iteration > times[0]]
 
 
 def moving(
-    renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int
+    renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int, least: float
 ) -> dict[str, NDArray[np.bool_]]:
     """Find what moves in photos of a scene that is being trained.
 
@@ -110,18 +115,20 @@ def moving(
         All training photos, with all pixels that may train.
     sh_degree : int
         Highest degree of the spherical harmonics evaluated.
+    least : float
+        Least fraction of all pixels that must be seeds.
 
     Returns
     -------
     dict of str to (H, W) bool
         Pixels that show what moves, by the name of the photo, which is reduced; without photos where nothing moves.
     """
-    found = _moving(renderer, gaussians, evenly_spaced(views, SAMPLE), sh_degree)
-    return found if not found or len(views) <= SAMPLE else _moving(renderer, gaussians, views, sh_degree)
+    found = _moving(renderer, gaussians, evenly_spaced(views, SAMPLE), sh_degree, least)
+    return found if not found or len(views) <= SAMPLE else _moving(renderer, gaussians, views, sh_degree, least)
 
 
 def _moving(
-    renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int
+    renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int, least: float
 ) -> dict[str, NDArray[np.bool_]]:
     parts, found = [], {}
     for view, evidence in zip(views, evidence_of(renderer, gaussians, views, sh_degree), strict=True):
@@ -129,7 +136,7 @@ def _moving(
         parts.append(seeds.mean())
         if PART <= seeds.mean() <= WHOLE:
             found[view.name] = grown(seeds, evidence)
-    return found if np.mean(parts) >= LEAST else {}
+    return found if np.mean(parts) >= least else {}
 
 
 def evidence_of(renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int) -> Iterator[Evidence]:
