@@ -24,9 +24,9 @@ from clsplat.training.coarse_to_fine import shrunk
 Array = NDArray[np.float64]
 Masks = Mapping[str, NDArray[np.bool_]]
 
-TIMES = (0.1, 0.2, 0.3, 0.4, 0.6)
+TIMES = (0.2, 0.3, 0.4, 0.6)
 """Fractions of the iterations after which photos are looked through. Each time decides anew, from all their pixels:
-what seemed to move because it was not trained yet comes back."""
+what seemed to move because it was not trained yet comes back. After a tenth, this would be up to 0.8 % of them."""
 
 EARLIEST = 100
 """First iteration after which photos are looked through: before, the scene has learned too little."""
@@ -66,9 +66,9 @@ motion, up to 0.008 are seeds, in few of them."""
 WHOLE = 0.5
 """Fraction of a photo's pixels beyond which its exposure or pose is wrong, and nothing is left out."""
 
-LEAST = (0.005, 0.002)
-"""Least fraction of all pixels that must be seeds, at the first time and later: otherwise nothing is left out of any
-photo. At first, what is not trained yet seems to move, too (docs/experiments/moving.md)."""
+LEAST = 0.006
+"""Least fraction of all pixels that must be seeds: otherwise nothing is left out of any photo. It is up to 0.005
+where nothing moves (docs/experiments/moving.md)."""
 
 SHOWN = 0.5
 """Sum of the compositing weights, in pixels of the reduced photos, from which a photo shows a Gaussian."""
@@ -90,19 +90,14 @@ class Evidence(NamedTuple):
     others: Array
 
 
-def due(iteration: int, iterations: int, found: bool) -> float | None:
-    """Least fraction of seeds for the look through the photos after an iteration; None if none is due.
-
-    The third time and later are only for photos in which something was `found`.
-    """
+def due(iteration: int, iterations: int, found: bool) -> bool:
+    """Whether photos are looked through after an iteration; after the first time only if something was found."""
     times = [max(EARLIEST, round(time * iterations)) for time in TIMES]
-    if iteration >= iterations or iteration not in (times if found else times[: len(LEAST)]):
-        return None
-    return LEAST[iteration > times[0]]
+    return iteration < iterations and iteration in (times if found else times[:1])
 
 
 def moving(
-    renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int, least: float
+    renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int
 ) -> dict[str, NDArray[np.bool_]]:
     """Find what moves in photos of a scene that is being trained.
 
@@ -115,20 +110,18 @@ def moving(
         All training photos, with all pixels that may train.
     sh_degree : int
         Highest degree of the spherical harmonics evaluated.
-    least : float
-        Least fraction of all pixels that must be seeds.
 
     Returns
     -------
     dict of str to (H, W) bool
         Pixels that show what moves, by the name of the photo, which is reduced; without photos where nothing moves.
     """
-    found = _moving(renderer, gaussians, evenly_spaced(views, SAMPLE), sh_degree, least)
-    return found if not found or len(views) <= SAMPLE else _moving(renderer, gaussians, views, sh_degree, least)
+    found = _moving(renderer, gaussians, evenly_spaced(views, SAMPLE), sh_degree)
+    return found if not found or len(views) <= SAMPLE else _moving(renderer, gaussians, views, sh_degree)
 
 
 def _moving(
-    renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int, least: float
+    renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int
 ) -> dict[str, NDArray[np.bool_]]:
     parts, found = [], {}
     for view, evidence in zip(views, evidence_of(renderer, gaussians, views, sh_degree), strict=True):
@@ -136,7 +129,7 @@ def _moving(
         parts.append(seeds.mean())
         if PART <= seeds.mean() <= WHOLE:
             found[view.name] = grown(seeds, evidence)
-    return found if np.mean(parts) >= least else {}
+    return found if np.mean(parts) >= LEAST else {}
 
 
 def evidence_of(renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int) -> Iterator[Evidence]:

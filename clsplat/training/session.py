@@ -108,9 +108,8 @@ class Training:
         self.photos.keep_within(self.device.memory_limit - in_use)
         self.refresh_filter()
         loss = step(self, self._view(iteration))
-        least = due(iteration, self.config.iterations, bool(self.state.moving)) if self.config.mask_moving else None
-        if least is not None:
-            self._look_for_motion(least)
+        if self.config.mask_moving and due(iteration, self.config.iterations, bool(self.state.moving)):
+            self._look_for_motion()
         if self.state.strategy.due(iteration):
             self.densify(self._cap())
         if self.state.filter and self.state.filter.due(iteration):
@@ -134,11 +133,11 @@ class Training:
             views = still(views, self.state.moving)
             self._views, self.photos = [shrunk(view, factor) for view in views], Photos(self.device)
 
-    def _look_for_motion(self, least: float) -> None:
+    def _look_for_motion(self) -> None:
         """Find what moves in the training photos, which trains no more."""
         state, renderer = self.state, self.renderer
         degree = state.sh_degree(state.iteration, self.config)
-        state.moving = moving(renderer, state.shown(renderer), state.corrected(self.scene.train), degree, least)
+        state.moving = moving(renderer, state.shown(renderer), state.corrected(self.scene.train), degree)
         self._views_of = 0, False
 
     def refresh_filter(self) -> None:

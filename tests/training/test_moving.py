@@ -25,7 +25,6 @@ from clsplat.training import moving as module
 from clsplat.training.loop import train
 from clsplat.training.moving import (
     EARLIEST,
-    LEAST,
     MOST_OTHERS,
     SHOWN,
     Evidence,
@@ -148,10 +147,11 @@ def test_photos_of_which_too_little_or_too_much_moves_are_left(
         return [evidence(differences if int(view.name) < 3 else 0 * differences) for view in views]
 
     monkeypatch.setattr(module, "evidence_of", found)
-    result = moving(Renderer("reference"), synthetic_scene(3)[0], views, 0, LEAST[0])
+    result = moving(Renderer("reference"), synthetic_scene(3)[0], views, 0)
     assert set(result) == ({"0", "1", "2"} if fraction else set())
     assert all(mask.mean() > 0.05 for mask in result.values())
-    assert moving(Renderer("reference"), synthetic_scene(3)[0], views, 0, 0.05) == {}, "of all photos together"
+    monkeypatch.setattr(module, "LEAST", 0.05)
+    assert moving(Renderer("reference"), synthetic_scene(3)[0], views, 0) == {}, "of all photos together"
 
 
 def test_of_many_photos_some_decide_whether_all_are_looked_through(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,10 +165,10 @@ def test_of_many_photos_some_decide_whether_all_are_looked_through(monkeypatch: 
     camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 100, 160, 100)
     views = [View(f"{k}", camera, np.zeros((100, 160, 3), np.uint8)) for k in range(119)]
     moves = {f"{k}" for k in range(1, 119, 2)}  # between those of the sample
-    assert moving(Renderer("reference"), synthetic_scene(3)[0], views, 0, LEAST[0]) == {}
+    assert moving(Renderer("reference"), synthetic_scene(3)[0], views, 0) == {}
     assert asked == [[f"{k}" for k in range(0, 119, 2)]]
     moves = {f"{k}" for k in range(0, 119, 3)}
-    assert set(moving(Renderer("reference"), synthetic_scene(3)[0], views, 0, LEAST[0])) == moves
+    assert set(moving(Renderer("reference"), synthetic_scene(3)[0], views, 0)) == moves
     assert [len(names) for names in asked] == [60, 60, 119]
 
 
@@ -181,11 +181,9 @@ def test_large_photos_are_reduced(device: Device) -> None:
 
 
 def test_times_of_looking() -> None:
-    first, later = LEAST
-    expected = {300: first, 600: later, 900: later, 1200: later, 1800: later}
-    assert {i: least for i in range(3001) if (least := due(i, 3000, True))} == expected
-    assert {i: least for i in range(3001) if (least := due(i, 3000, False))} == {300: first, 600: later}
-    assert [i for i in range(501) if due(i, 500, True)] == [EARLIEST, 150, 200, 300]
+    assert [i for i in range(3001) if due(i, 3000, True)] == [600, 900, 1200, 1800]
+    assert [i for i in range(3001) if due(i, 3000, False)] == [600]
+    assert [i for i in range(401) if due(i, 400, True)] == [EARLIEST, 120, 160, 240]
     assert not any(due(i, EARLIEST, True) for i in range(EARLIEST + 1))
 
 
