@@ -16,13 +16,13 @@ def test_the_sheet_shows_the_photos_in_which_most_moves(tmp_path: Path) -> None:
     views = [
         View(f"{k}.png", camera, np.full((camera.height, camera.width, 3), 8 * k, np.uint8)) for k in range(MOST + 3)
     ]
-    found = {view.name: np.zeros((16, 20), bool) for view in views[1:]}
+    found = {view.name: np.zeros((16, 200), bool) for view in views[1:]}
     for k, mask in enumerate(found.values()):
         mask[: k % 13 + 1] = True
     moving_sheet(tmp_path / "moving.png", views, found)
     sheet = np.asarray(Image.open(tmp_path / "moving.png"))
-    assert (sheet == COLOR).all(axis=2).sum() == 20 * sum(sorted(k % 13 + 1 for k in range(MOST + 2))[2:])
-    assert sheet.shape[1] == COLUMNS * 28 + 8 and sheet.shape[0] == MOST // COLUMNS * 40 + 8
+    assert (sheet == COLOR).all(axis=2).sum() == 200 * sum(sorted(k % 13 + 1 for k in range(MOST + 2))[2:])
+    assert sheet.shape[1] == COLUMNS * 208 + 8 and sheet.shape[0] == MOST // COLUMNS * 40 + 8
 
 
 def test_a_sheet_of_photos_of_two_sizes(tmp_path: Path) -> None:
@@ -34,5 +34,6 @@ def test_a_sheet_of_photos_of_two_sizes(tmp_path: Path) -> None:
     found["tall"][:2] = True
     moving_sheet(tmp_path / "moving.png", views, found)
     sheet = np.asarray(Image.open(tmp_path / "moving.png"))
-    assert (sheet == COLOR).all(axis=2).sum() == 16 * 20 + 2 * 16 and (sheet == 90).all(axis=2).sum() == 18 * 16
-    assert sheet.shape[1] == 2 * 28 + 8
+    assert (sheet == COLOR).all(axis=2).sum() == 100 * (16 * 20 + 2 * 16), "ten times as large"
+    assert (sheet == 90).all(axis=2).sum() >= 100 * 18 * 16, "and some pixels of letters"
+    assert sheet.shape[1] == 2 * 208 + 8
