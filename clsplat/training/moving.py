@@ -38,20 +38,21 @@ EDGE = 400
 """Longest edge of the reduced photos, px: people who matter are larger than the pixels of these."""
 
 WINDOW = 1 / 32
-"""Edge of the square whose mean difference is a seed, in longer edges of the photo: edges that are a pixel off have a
-mean near zero."""
+"""Edge of the squares over which differences are averaged, in longer edges of the photo: at the edge of an object
+that is a pixel off, their mean is near zero."""
 
 SMALLEST = 8
-"""Least edge of this square, px: in tiny photos, the fraction would be a few pixels, which is no mean."""
+"""Least edge of these squares, px: in tiny photos, the fraction would be a few pixels, which is no mean."""
 
 SEED = 0.05
-"""Least square of the mean difference of a seed, summed over RGB in [0, 1]: 33 of 255 levels in each channel."""
+"""Least square of the mean difference at a seed, the centre of such a square, summed over RGB in [0, 1]: 33 of 255
+levels in each channel."""
 
 CONTRADICTED = 3.0
 """Least ratio of this square to the squared difference that the Gaussians of the pixel have in other photos."""
 
 AROUND = 0.02
-"""Least squared difference, summed over RGB, of pixels that belong to a seed next to them."""
+"""Least squared difference, summed over RGB, of the pixels around a seed that are left out with it."""
 
 NEIGHBOURS = 3
 """Edge of the square over which the squared differences around a seed are averaged, px."""
@@ -175,10 +176,10 @@ def _contributions(renderer: Renderer, run: Pass, view: View) -> Array:
 
     The derivative of a pixel by a Gaussian's colour is its weight: one backward pass gives both, as two channels.
     """
-    seeds = np.zeros((*view.counts.shape, 3))
-    seeds[:, :, 0] = view.counts
-    seeds[:, :, 1] = (_differences(run, view) ** 2).sum(axis=2)
-    v_image = Image(renderer.upload("v_image", seeds), renderer.no_alpha_gradient(run.camera))
+    channels = np.zeros((*view.counts.shape, 3))
+    channels[:, :, 0] = view.counts
+    channels[:, :, 1] = (_differences(run, view) ** 2).sum(axis=2)
+    v_image = Image(renderer.upload("v_image", channels), renderer.no_alpha_gradient(run.camera))
     return np.asarray(download(renderer.backward_to_splats(run, v_image).colors)[:, :2], np.float64)
 
 
