@@ -25,7 +25,6 @@ from clsplat.training import moving as module
 from clsplat.training.loop import train
 from clsplat.training.moving import (
     EARLIEST,
-    MOST_OTHERS,
     SHOWN,
     Evidence,
     due,
@@ -68,7 +67,10 @@ def weights(gaussians: Gaussians, camera: Camera) -> Array:
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("exact", [False, True], ids=["device", "reference"])
-def test_the_evidence_is_that_of_the_other_photos(device: Device, masked: bool, exact: bool) -> None:
+def test_the_evidence_is_that_of_the_other_photos(
+    device: Device, monkeypatch: pytest.MonkeyPatch, masked: bool, exact: bool
+) -> None:
+    monkeypatch.setattr(module, "MOST_OTHERS", 3)
     gaussians, views = photos(5, masked)
     found = evidence_of(Renderer("reference" if exact else device), gaussians, views, 3)
     all_weights = [weights(gaussians, view.camera) for view in views]
@@ -84,13 +86,13 @@ def test_the_evidence_is_that_of_the_other_photos(device: Device, masked: bool, 
             error += (all_weights[j] * (differences[j] ** 2).sum(axis=2)).sum(axis=(1, 2))
             shown += counted > SHOWN
         expected = np.einsum("nhw,n->hw", all_weights[k], error / np.maximum(total, 1e-9))
-        others = np.einsum("nhw,n->hw", all_weights[k], np.minimum(shown, MOST_OTHERS))
+        others = np.einsum("nhw,n->hw", all_weights[k], np.minimum(shown, 3))
         # float32: a splat's footprint ends where its opacity falls below ALPHA_MIN, a pixel earlier or later.
         tolerance = {"atol": 1e-9} if exact else {"atol": 2 * ALPHA_MIN, "rtol": 1e-3}
         np.testing.assert_allclose(one.differences, differences[k], **tolerance)
         np.testing.assert_allclose(one.expected, expected, **tolerance)
-        np.testing.assert_allclose(one.others, others, atol=tolerance["atol"] * MOST_OTHERS, rtol=1e-3)
-        assert expected.max() > 0.05 and others.max() > 3
+        np.testing.assert_allclose(one.others, others, atol=tolerance["atol"] * 3, rtol=1e-3)
+        assert expected.max() > 0.05 and others.max() > 2
 
 
 def evidence(differences: Array, expected: float = 0.001, others: float = 5) -> Evidence:
@@ -112,6 +114,10 @@ def test_seeds_are_where_a_photo_differs_on_average() -> None:
     assert not seeds_of(evidence(patch(), expected=0.041)).any(), "its Gaussians differ in other photos, too"
     assert seeds_of(evidence(patch(), expected=0.039)).any()
     assert not seeds_of(evidence(patch(), others=2)).any(), "too few other photos show it"
+    for size, found in (160, True), (384, False):
+        small = np.zeros((100, size, 3))
+        small[50:59, 60:69] = 0.2
+        assert seeds_of(evidence(small)).any() == found, "over a part of the photo, and 8 pixels at least"
     checks = np.where(np.indices((100, 160)).sum(axis=0) % 2, 1.0, -1.0)[:, :, None]
     assert not seeds_of(evidence(patch(0.8) * checks)).any(), "its mean is near zero, as beside an edge"
 
@@ -122,10 +128,11 @@ def test_what_belongs_to_a_seed_is_added() -> None:
     checks = np.where(np.indices((100, 160)).sum(axis=0) % 2, 0.3, -0.3)
     differences[70:90, 50:80] = checks[70:90, 50:80, None]
     differences[10:20, 120:150] = checks[10:20, 120:150, None]
+    differences[78:83, 62:67] = 0
     found = evidence(differences)
     result = grown(seeds_of(found), found)
     assert result[39:91, 50:80].all() and not result[:30].any() and not result[:, 90:].any()
-    assert result[:, 49].any(), "the rim"
+    assert result[50, 48], "a rim beside the pixels whose neighbours differ"
     unknown = Evidence(
         found.differences, found.expected, np.where(np.arange(100)[:, None] < 70, 5.0, 1.0 + np.zeros(160))
     )
@@ -134,7 +141,7 @@ def test_what_belongs_to_a_seed_is_added() -> None:
     assert not grown(seeds_of(hard), hard)[78:].any()
 
 
-@pytest.mark.parametrize("size, fraction", [((30, 30), 0.3), ((6, 6), 0.0), ((95, 150), 0.0)])
+@pytest.mark.parametrize("size, fraction", [((30, 30), 0.3), ((5, 5), 0.0), ((95, 150), 0.0)])
 def test_photos_of_which_too_little_or_too_much_moves_are_left(
     monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], fraction: float
 ) -> None:
@@ -147,6 +154,8 @@ def test_photos_of_which_too_little_or_too_much_moves_are_left(
         return [evidence(differences if int(view.name) < 3 else 0 * differences) for view in views]
 
     monkeypatch.setattr(module, "evidence_of", found)
+    monkeypatch.setattr(module, "LEAST", 0)
+    assert seeds_of(evidence(differences)).any()
     result = moving(Renderer("reference"), synthetic_scene(3)[0], views, 0)
     assert set(result) == ({"0", "1", "2"} if fraction else set())
     assert all(mask.mean() > 0.05 for mask in result.values())
