@@ -61,15 +61,18 @@ OTHERS = 2.0
 """Number of other photos that must show the Gaussians of a pixel, on average, to contradict it."""
 
 PART = 0.005
-"""Fraction of a photo's pixels from which seeds are taken for something that moves. In photos of a scene without
-motion, up to 0.008 are seeds, in few of them."""
+"""Fraction of a photo's pixels from which seeds are taken for something that moves."""
 
 WHOLE = 0.5
 """Fraction of a photo's pixels beyond which its exposure or pose is wrong, and nothing is left out."""
 
-LEAST = 0.006
-"""Least fraction of all pixels that must be seeds: otherwise nothing is left out of any photo. It is up to 0.005
-where nothing moves (docs/experiments/moving.md)."""
+LEAST = 0.004
+"""Least fraction of all pixels that must be seeds: otherwise nothing is left out of any photo (where nothing moves:
+docs/experiments/moving.md)."""
+
+BROAD = 0.1
+"""Largest extent of a splat, in longer edges of the photo, that is evidence for a seed. Where a scene has only
+broader ones, it is not trained yet: other photos show them, but not at this place."""
 
 SHOWN = 0.5
 """Sum of the compositing weights, in pixels of the reduced photos, from which a photo shows a Gaussian."""
@@ -83,12 +86,14 @@ class Evidence(NamedTuple):
     """What a photo and the others say about its pixels.
 
     differences (H, W, 3): the render less the photo; expected (H, W): the squared difference, summed over RGB, that
-    the Gaussians of a pixel have in the other photos; others (H, W): the number of other photos that show them.
+    the Gaussians of a pixel have in the other photos; others (H, W): the number of other photos that show them;
+    narrow (H, W): the same of those whose splats are not `BROAD`, where the other Gaussians count as 0.
     """
 
     differences: Array
     expected: Array
     others: Array
+    narrow: Array
 
 
 def due(iteration: int, iterations: int, found: bool) -> bool:
@@ -158,8 +163,12 @@ def evidence_of(renderer: Renderer, gaussians: Gaussians, views: list[View], sh_
         colors = np.zeros((len(run.drawn.depths), 3))
         colors[: len(own), 0] = np.divide(errors, weights, out=np.zeros_like(errors), where=weights > 0)
         colors[: len(own), 1] = np.minimum(shown - (own[:, 0] > SHOWN), MOST_OTHERS)
+        extents = download(run.splats.extents).max(axis=1)
+        colors[: len(own), 2] = colors[: len(own), 1] * (
+            extents <= BROAD * max(view.camera.width, view.camera.height)
+        )
         image = download(renderer.recolored(run, renderer.upload("colors", colors)).rgb)
-        yield Evidence(_differences(run, view), image[:, :, 0], image[:, :, 1])
+        yield Evidence(_differences(run, view), *np.moveaxis(image, 2, 0))
 
 
 def _small(view: View) -> View:
@@ -187,7 +196,7 @@ def seeds_of(evidence: Evidence) -> NDArray[np.bool_]:
     """Pixels (H, W) around which a photo differs on average, and by more than its Gaussians do in other photos."""
     window = _window(evidence)
     square = (_mean(evidence.differences, window) ** 2).sum(axis=2)
-    known = _mean(evidence.others, window) > OTHERS
+    known = _mean(evidence.narrow, window) > OTHERS
     return known & (square > SEED) & (square > CONTRADICTED * _mean(evidence.expected, window))
 
 

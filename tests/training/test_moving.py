@@ -71,6 +71,7 @@ def test_the_evidence_is_that_of_the_other_photos(
     device: Device, monkeypatch: pytest.MonkeyPatch, masked: bool, exact: bool
 ) -> None:
     monkeypatch.setattr(module, "MOST_OTHERS", 3)
+    monkeypatch.setattr(module, "BROAD", 0.2)
     gaussians, views = photos(5, masked)
     found = evidence_of(Renderer("reference" if exact else device), gaussians, views, 3)
     all_weights = [weights(gaussians, view.camera) for view in views]
@@ -87,17 +88,22 @@ def test_the_evidence_is_that_of_the_other_photos(
             shown += counted > SHOWN
         expected = np.einsum("nhw,n->hw", all_weights[k], error / np.maximum(total, 1e-9))
         others = np.einsum("nhw,n->hw", all_weights[k], np.minimum(shown, 3))
+        splats = Renderer("reference").forward(gaussians, views[k].camera, 3).splats
+        small = splats.extents.max(axis=1) <= 0.2 * max(differences[k].shape)
+        narrow = np.einsum("nhw,n->hw", all_weights[k], np.minimum(shown, 3) * small)
         # float32: a splat's footprint ends where its opacity falls below ALPHA_MIN, a pixel earlier or later.
         tolerance = {"atol": 1e-9} if exact else {"atol": 2 * ALPHA_MIN, "rtol": 1e-3}
         np.testing.assert_allclose(one.differences, differences[k], **tolerance)
         np.testing.assert_allclose(one.expected, expected, **tolerance)
         np.testing.assert_allclose(one.others, others, atol=tolerance["atol"] * 3, rtol=1e-3)
+        np.testing.assert_allclose(one.narrow, narrow, atol=tolerance["atol"] * 3, rtol=1e-3)
+        assert 0 < narrow.sum() < 0.9 * others.sum()
         assert expected.max() > 0.05 and others.max() > 2
 
 
 def evidence(differences: Array, expected: float = 0.001, others: float = 5) -> Evidence:
     shape = differences.shape[:2]
-    return Evidence(differences, np.full(shape, expected), np.full(shape, float(others)))
+    return Evidence(differences, np.full(shape, expected), *[np.full(shape, float(others))] * 2)
 
 
 def patch(value: float = 0.2) -> Array:
@@ -113,7 +119,8 @@ def test_seeds_are_where_a_photo_differs_on_average() -> None:
     assert not seeds_of(evidence(patch(0.12))).any(), "too little"
     assert not seeds_of(evidence(patch(), expected=0.041)).any(), "its Gaussians differ in other photos, too"
     assert seeds_of(evidence(patch(), expected=0.039)).any()
-    assert not seeds_of(evidence(patch(), others=2)).any(), "too few other photos show it"
+    broad = evidence(patch())._replace(narrow=np.full((100, 160), 2.0))
+    assert not seeds_of(broad).any(), "too few other photos show it by Gaussians of this place"
     for size, found in (160, True), (384, False):
         small = np.zeros((100, size, 3))
         small[50:59, 60:69] = 0.2
@@ -133,11 +140,9 @@ def test_what_belongs_to_a_seed_is_added() -> None:
     result = grown(seeds_of(found), found)
     assert result[39:91, 50:80].all() and not result[:30].any() and not result[:, 90:].any()
     assert result[50, 48], "a rim beside the pixels whose neighbours differ"
-    unknown = Evidence(
-        found.differences, found.expected, np.where(np.arange(100)[:, None] < 70, 5.0, 1.0 + np.zeros(160))
-    )
+    unknown = found._replace(others=np.where(np.arange(100)[:, None] < 70, 5.0, 1.0 + np.zeros(160)))
     assert not grown(seeds_of(unknown), unknown)[78:].any()
-    hard = Evidence(found.differences, np.where(np.arange(100)[:, None] < 70, 0.0, 0.5 + np.zeros(160)), found.others)
+    hard = found._replace(expected=np.where(np.arange(100)[:, None] < 70, 0.0, 0.5 + np.zeros(160)))
     assert not grown(seeds_of(hard), hard)[78:].any()
 
 
@@ -269,6 +274,13 @@ def walked_by(scene: Scene) -> tuple[Scene, dict[str, NDArray[np.bool_]]]:
     return replace(scene, train=views), true
 
 
+@pytest.fixture
+def broad_balls(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the balls for evidence: their splats reach over a quarter of these small photos."""
+    monkeypatch.setattr(module, "BROAD", 0.3)
+
+
+@pytest.mark.usefixtures("broad_balls")
 def test_a_training_leaves_out_what_moves(device: Device, tmp_path: Path) -> None:
     scene, true = walked_by(balls(device))
     scores = {}
@@ -285,12 +297,14 @@ def test_a_training_leaves_out_what_moves(device: Device, tmp_path: Path) -> Non
     assert scores[True] > scores[False] + 0.5, scores
 
 
+@pytest.mark.usefixtures("broad_balls")
 def test_nothing_is_left_out_where_nothing_moves(device: Device, tmp_path: Path) -> None:
     scene = balls(device)
     trained = [train(scene, replace(LONG, mask_moving=on), tmp_path / str(on), device) for on in (True, False)]
     assert same(*trained) and load_masks(tmp_path / "True") == {}
 
 
+@pytest.mark.usefixtures("broad_balls")
 def test_a_killed_run_resumes_with_what_it_left_out(device: Device, tmp_path: Path) -> None:
     scene, _ = walked_by(balls(device))
     expected = train(scene, LONG, tmp_path / "whole", device)
