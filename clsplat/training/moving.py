@@ -26,7 +26,7 @@ Masks = Mapping[str, NDArray[np.bool_]]
 
 TIMES = (0.2, 0.3, 0.4, 0.6)
 """Fractions of the iterations after which photos are looked through. Each time decides anew, from all their pixels:
-what seemed to move because it was not trained yet comes back. After a tenth, this would be up to 0.8 % of them."""
+what seemed to move because it was not trained yet comes back."""
 
 EARLIEST = 100
 """First iteration after which photos are looked through: before, the scene has learned too little."""
@@ -154,21 +154,22 @@ def evidence_of(renderer: Renderer, gaussians: Gaussians, views: list[View], sh_
     placed, small = renderer.place(gaussians), [_small(view) for view in views]
     sums, shown = np.zeros((len(gaussians), 2)), np.zeros(len(gaussians))
     for view in in_turn(small):
-        part = _contributions(renderer, renderer.forward(placed, view.camera, sh_degree), view)
+        run = renderer.forward(placed, view.camera, sh_degree)
+        part = _contributions(renderer, run, view.counts, _differences(run, view))
         sums, shown = sums + part, shown + (part[:, 0] > SHOWN)
+    # The contributions of each photo are computed again: those of all photos to all Gaussians would fill the memory.
     for view in in_turn(small):
         run = renderer.forward(placed, view.camera, sh_degree)
-        own = _contributions(renderer, run, view)
+        differences = _differences(run, view)
+        own = _contributions(renderer, run, view.counts, differences)
         weights, errors = np.maximum(sums - own, 0).T
         colors = np.zeros((len(run.drawn.depths), 3))
         colors[: len(own), 0] = np.divide(errors, weights, out=np.zeros_like(errors), where=weights > 0)
         colors[: len(own), 1] = np.minimum(shown - (own[:, 0] > SHOWN), MOST_OTHERS)
-        extents = download(run.splats.extents).max(axis=1)
-        colors[: len(own), 2] = colors[: len(own), 1] * (
-            extents <= BROAD * max(view.camera.width, view.camera.height)
-        )
+        narrow = download(run.splats.extents).max(axis=1) <= BROAD * max(view.camera.width, view.camera.height)
+        colors[: len(own), 2] = colors[: len(own), 1] * narrow
         image = download(renderer.recolored(run, renderer.upload("colors", colors)).rgb)
-        yield Evidence(_differences(run, view), *np.moveaxis(image, 2, 0))
+        yield Evidence(differences, *np.moveaxis(image, 2, 0))
 
 
 def _small(view: View) -> View:
@@ -180,14 +181,14 @@ def _differences(run: Pass, view: View) -> Array:
     return (download(run.image.rgb)[:, :, :3].astype(np.float64) - view.image / 255) * view.counts[:, :, None]
 
 
-def _contributions(renderer: Renderer, run: Pass, view: View) -> Array:
+def _contributions(renderer: Renderer, run: Pass, counts: NDArray[np.bool_], differences: Array) -> Array:
     """Sums over pixels (N, 2) of each Gaussian's weight, and of its weight times the squared difference.
 
     The derivative of a pixel by a Gaussian's colour is its weight: one backward pass gives both, as two channels.
     """
-    channels = np.zeros((*view.counts.shape, 3))
-    channels[:, :, 0] = view.counts
-    channels[:, :, 1] = (_differences(run, view) ** 2).sum(axis=2)
+    channels = np.zeros((*counts.shape, 3))
+    channels[:, :, 0] = counts
+    channels[:, :, 1] = (differences**2).sum(axis=2)
     v_image = Image(renderer.upload("v_image", channels), renderer.no_alpha_gradient(run.camera))
     return np.asarray(download(renderer.backward_to_splats(run, v_image).colors)[:, :2], np.float64)
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from measure_people import reduced
 from PIL import Image
 
 from clsplat.config import DataConfig
@@ -27,15 +28,10 @@ def main(data: Path, out: Path) -> None:
         (out / folder).symlink_to((data / folder).resolve())
     rng = np.random.default_rng(7)
     for number, path in enumerate(sorted((data / "images").iterdir())):
-        with Image.open(path) as photo:
-            pixels = np.asarray(photo.convert("RGB"), float)
-        height, width = (edge // DOWNSCALE for edge in pixels.shape[:2])
-        whole = pixels[: height * DOWNSCALE, : width * DOWNSCALE]
-        small = whole.reshape(height, DOWNSCALE, width, DOWNSCALE, 3).mean(axis=(1, 3))
         factor = np.exp(SPREAD * rng.normal())
         if number % DataConfig().test_every == 0:
             factor = 1.0
-        image = np.rint(np.clip(factor * small, 0, 255)).astype(np.uint8)
+        image = np.rint(np.clip(factor * reduced(path, DOWNSCALE), 0, 255)).astype(np.uint8)
         Image.fromarray(image).save(copies / path.name, format="PNG")
 
 
