@@ -67,6 +67,11 @@ cameras leave the vertical open, as they do if all look into one direction."""
 UNSEEN = 0.5
 """Angle from the sky that photos show to which it continues where no photo looks, radians."""
 
+AGREED = 0.045
+"""Least solid angle that is sky in each of at least two photos, steradians, if splats are left out at random. These
+are never splats of the sky, which would take the place of walls that one photo takes for it (measured:
+docs/experiments/strategies.md)."""
+
 ON_BACKGROUND = 0.1
 """Largest fraction of the points that may lie before a plain background, as wrong ones do, and those that are added
 between the points of thin objects (measured: docs/experiments/strategies.md)."""
@@ -137,8 +142,8 @@ def sky_gaussians(scene: Scene, config: TrainConfig, plain: bool = False) -> Gau
     """Make the Gaussians of the sky; None if the photos show no sky.
 
     They lie on a sphere around the cameras, in all directions that are sky in each photo that looks there, of at most
-    `MOST_PHOTOS`, and in directions nearby into which no photo looks. A plain background is sky below the horizon,
-    too.
+    `MOST_PHOTOS`, and in directions nearby into which no photo looks. If splats are left out at random, there is no
+    sky unless photos agree on enough of it. A plain background is sky below the horizon, too.
     """
     from scipy.spatial import cKDTree
 
@@ -163,6 +168,8 @@ def sky_gaussians(scene: Scene, config: TrainConfig, plain: bool = False) -> Gau
         as_sky[rows[sky]] += 1
         colors[rows[sky]] += averages[row[sky], column[sky]]
     kept = (as_sky > 0) & (as_sky == shown)
+    if up is not None and config.dropout and SPACING**2 * (kept & (shown > 1)).sum() < AGREED:
+        return None
     colors[kept] /= as_sky[kept, None]
     kept &= np.abs(colors - BACKGROUNDS[config.data.background]).max(axis=1) > DIFFERENCE
     if not kept.any():

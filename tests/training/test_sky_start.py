@@ -202,6 +202,25 @@ def test_the_sky_continues_a_little_where_no_photo_looks() -> None:
     assert beside.sum() > 20 and (directions[beside] @ UP).min() > 0
 
 
+@pytest.mark.parametrize(("columns", "enough"), [(0, False), (4, False), (12, True)])
+def test_with_dropout_photos_must_agree_on_the_sky(columns: int, enough: bool) -> None:
+    """A second photo, from the same place, shows sky in some columns: about 0.01 steradians each."""
+    view, without, dropout = ring()[0], CONFIG, replace(CONFIG, dropout=0.1)
+    image = np.random.default_rng(9).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    image[: HEIGHT // 2, 20 : 20 + columns] = BLUE
+    away = [outdoors(camera(target=(0.0, 0.0, -1.0)), 5)] if not columns else []  # a sky that this one alone shows
+    views = [view, replace(view, name="2.png", image=image), *away]
+    assert sky_gaussians(square(views), without) is not None
+    assert (sky_gaussians(square(views), dropout) is not None) == enough
+
+
+def test_with_dropout_a_plain_background_is_the_sky_of_one_photo() -> None:
+    image = np.full((HEIGHT, WIDTH, 3), 200, np.uint8)
+    image[20:40, 30:50] = np.random.default_rng(9).integers(0, 256, (20, 20, 3))
+    scene = square([View("0.png", camera(), image)])
+    assert sky_gaussians(scene, replace(CONFIG, dropout=0.1), plain=True) is not None
+
+
 def test_the_background_needs_no_sky() -> None:
     views = ring()
     white = replace(CONFIG, data=DataConfig(background="white"))
