@@ -9,6 +9,7 @@ docs/experiments/strategies.md.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +34,13 @@ TOLERANCE = 0.06
 PLAIN = 0.6
 """Least fraction of the pixels on the photos' edges that have the background's colour: an object may reach beyond the
 edges, but a room has no such colour."""
+
+PLAIN_EDGE = 0.5
+"""Least fraction of the pixels on each of the four edges that has the background's colour (measured:
+docs/experiments/strategies.md)."""
+
+EDGES: tuple[Any, ...] = (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1])
+"""The four edges of a photo."""
 
 SHOWN = 0.5
 """Least fraction of the photos that have a point of the hull in their frames."""
@@ -149,14 +157,19 @@ def _compared(views: list[View]) -> tuple[list[Grid], Array, NDArray[np.uint8]]:
 def plain_color(views: list[View]) -> Array | None:
     """Find the colour (3,) of the background, RGB from 0 to 1: that of most pixels on the photos' edges.
 
-    None if there is no such colour.
+    None if there is no such colour, or if one of the four edges has too little of it: below the sky is the ground.
     """
-    edges = [view.image[_rim(view)] for view in in_turn(views)]
-    pixels = np.concatenate(edges) / 255
-    if not len(pixels):
+    edges: list[list[Array]] = [[] for _ in EDGES]
+    for view in in_turn(views):
+        for found, edge in zip(edges, EDGES, strict=True):
+            found.append(view.image[edge][view.counts[edge]])
+    pixels = [np.concatenate(found) / 255 for found in edges]
+    if not sum(map(len, pixels)):
         return None
-    color = np.median(pixels, axis=0)
-    return color if (np.abs(pixels - color).max(axis=1) < TOLERANCE).mean() >= PLAIN else None
+    color = np.median(np.concatenate(pixels), axis=0)
+    alike = [np.abs(each - color).max(axis=1) < TOLERANCE for each in pixels if len(each)]
+    plain = np.concatenate(alike).mean() >= PLAIN and all(each.mean() >= PLAIN_EDGE for each in alike)
+    return color if plain else None
 
 
 def background(view: View, color: Array) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from clsplat.camera import Camera
@@ -99,6 +100,17 @@ def test_photos_without_a_plain_background_have_no_outlines() -> None:
     for view in views:
         view.image[:, :44] = RED
     assert plain_color(views) is None
+
+
+@pytest.mark.parametrize(("ground", "plain"), [(0.48, True), (0.52, False)])
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_sky_above_the_ground_is_no_plain_background(ground: float, plain: bool, turned: bool) -> None:
+    """Half of one edge is something else; of all four it is an eighth."""
+    views = around()
+    for view in views:
+        edge = view.image[:, 0] if turned else view.image[-1]
+        edge[: round(ground * len(edge))] = RED
+    assert (plain_color(views) is not None) == plain
 
 
 def test_photos_of_the_background_alone_have_no_points() -> None:
