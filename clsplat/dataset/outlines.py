@@ -157,9 +157,9 @@ def _compared(views: list[View]) -> tuple[list[Grid], Array, NDArray[np.uint8]]:
 def plain_color(views: list[View]) -> Array | None:
     """Find the colour (3,) of the background, RGB from 0 to 1: that of most pixels on the photos' edges.
 
-    None if there is no such colour, or if one of the four edges has too little of it: below the sky is the ground.
+    None if there is no such colour, or if one of the four edges has too little of it, as with a sky above the ground.
     """
-    edges: list[list[Array]] = [[] for _ in EDGES]
+    edges: list[list[NDArray[np.uint8]]] = [[] for _ in EDGES]
     for view in in_turn(views):
         for found, edge in zip(edges, EDGES, strict=True):
             found.append(view.image[edge][view.counts[edge]])

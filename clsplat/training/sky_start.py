@@ -68,8 +68,8 @@ UNSEEN = 0.5
 """Angle from the sky that photos show to which it continues where no photo looks, radians."""
 
 AGREED = 0.045
-"""Least solid angle that is sky in each of at least two photos, steradians, if splats are left out at random. These
-are never splats of the sky, which would take the place of walls that one photo takes for it (measured:
+"""Least solid angle, steradians, that at least two photos show as sky, if splats are left out at random. Those of the
+sky never are: a false sky would take the place of the wall that a photo takes for it (measured:
 docs/experiments/strategies.md)."""
 
 ON_BACKGROUND = 0.1
