@@ -280,6 +280,15 @@ static inline void find_blocks(const Outlines *outlines, uint g, int x0, int y0,
     _Pragma("unroll") for (int h = 0; h < HALVES; ++h) batch->halves[h][g] = halves[h];
 }
 
+// Prefetches the splat of entry i of a list that ends at `end`. Most splats span two cache lines. To be called between
+// the splats of the batch before: of many requests at once, most would wait for others.
+static inline void fetch_splat(const __global Splat *splats, const __global uint *gauss_ids, uint i, uint end) {
+    if (i < end) {
+        FETCH_TO_READ(&splats[gauss_ids[i]]);
+        FETCH_TO_READ(&splats[gauss_ids[i]].color[CHANNELS - 1]);
+    }
+}
+
 // Loads up to BATCH splats, beginning with the entry `first` of the list. Returns their number.
 static inline uint load_batch(const __global Splat *splats, const __global uint *gauss_ids, uint first, uint end,
                               int x0, int y0, Batch *batch) {
@@ -289,11 +298,6 @@ static inline uint load_batch(const __global Splat *splats, const __global uint 
     for (uint j = 0; j < count; ++j) {
         batch->splats[j] = splats[gauss_ids[first + j]];
         set_outline(&outlines, j, &batch->splats[j]);
-    }
-    for (uint j = first + BATCH; j < LESSER(end, first + 2 * BATCH); ++j) {
-        // Most of them span two cache lines.
-        FETCH_TO_READ(&splats[gauss_ids[j]]);
-        FETCH_TO_READ(&splats[gauss_ids[j]].color[CHANNELS - 1]);
     }
     for (uint g = 0; g * LANES < count; ++g)
         find_blocks(&outlines, g, x0, y0, batch);
@@ -327,6 +331,7 @@ static inline void composite_tile(const Grid *grid, const __global Splat *splats
             break;
         const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, &batch);
         for (uint j = 0; j < count; ++j) {
+            fetch_splat(splats, gauss_ids, first + BATCH + j, end);
             const Splat *s = &batch.splats[j];
             const Corner corner = corner_from(s, x0, y0);
             for (Blocks blocks = unfinished & blocks_of(&batch, j); blocks;) {

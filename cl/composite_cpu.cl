@@ -61,6 +61,9 @@ __kernel void composite_fwd(const int width, const int height, const __global Sp
     }
 }
 
+// Number of splats between the prefetch of a record and its writing.
+#define AHEAD 8
+
 // The pixels of a block in the backward pass.
 typedef struct {
     REALV transmittance, behind, v_color[CHANNELS];
@@ -106,9 +109,13 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
         if (!unfinished)
             break;
         const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, &batch);
-        for (uint j = 0; j < count; ++j)
-            FETCH_TO_WRITE(&records[(size_t)RECORD * slots[first + j]]);
         for (uint j = 0; j < count; ++j) {
+            fetch_splat(splats, gauss_ids, first + BATCH + j, end);
+            if (first + j + AHEAD < end) {
+                __global real *later = records + (size_t)RECORD * slots[first + j + AHEAD];
+                FETCH_TO_WRITE(later);
+                FETCH_TO_WRITE(later + RECORD - 1);
+            }
             const Splat *s = &batch.splats[j];
             const Corner corner = corner_from(s, x0, y0);
             Moments sums = NO_MOMENTS;

@@ -76,19 +76,28 @@ static inline real lane_sum(reals v) {
 #endif
 }
 
+// Prefetches the chunks of the work-item after the next one, of `count` chunks each. The arrays are more than a processor
+// follows, and each of them is soon at the end of a page.
+static inline void fetch_ahead(const __global real *x, int count) {
+#if LANES == 8
+#pragma unroll
+    for (int k = 0; k < LANES * count; k += FETCHED)
+        FETCH_TO_READ(x + 2 * LANES * count + k);
+#endif
+}
+
 // Chunks of adjacent numbers from x[begin] on. Those from x[end] on are not read: they are 0.
 static inline void load_chunks(const __global real *x, size_t begin, size_t end, int count, reals *chunks) {
 #if LANES == 8
-    for (int k = 0; k < count; ++k, begin += LANES) {
-        if (begin + LANES <= end) {
-            chunks[k] = load8(x + begin);
-        } else {
-            reals rest = 0;
-            for (size_t i = begin; i < end; ++i)
-                ((real *)&rest)[i - begin] = x[i];
-            chunks[k] = rest;
-        }
+    if (begin + LANES * count <= end) {
+        fetch_ahead(x + begin, count);
+#pragma unroll
+        for (int k = 0; k < count; ++k)
+            chunks[k] = load8(x + begin + LANES * k);
+        return;
     }
+    for (int k = 0; k < LANES * count; ++k)
+        ((real *)chunks)[k] = begin + k < end ? x[begin + k] : 0;
 #else
     for (int k = 0; k < count; ++k)
         chunks[k] = begin + k < end ? x[begin + k] : 0;
@@ -98,14 +107,14 @@ static inline void load_chunks(const __global real *x, size_t begin, size_t end,
 // Stores chunks to x[begin] and the following. x[end] and what follows it are left as they are.
 static inline void store_chunks(__global real *x, size_t begin, size_t end, int count, const reals *chunks) {
 #if LANES == 8
-    for (int k = 0; k < count; ++k, begin += LANES) {
-        if (begin + LANES <= end) {
-            store8(x + begin, chunks[k]);
-        } else {
-            for (size_t i = begin; i < end; ++i)
-                x[i] = LANE(chunks[k], i - begin);
-        }
+    if (begin + LANES * count <= end) {
+#pragma unroll
+        for (int k = 0; k < count; ++k)
+            store8(x + begin + LANES * k, chunks[k]);
+        return;
     }
+    for (int k = 0; k < LANES * count && begin + k < end; ++k)
+        x[begin + k] = ((const real *)chunks)[k];
 #else
     for (int k = 0; k < count && begin + k < end; ++k)
         x[begin + k] = chunks[k];
@@ -182,14 +191,18 @@ static inline void scattered4(reals4 v, reals *c) {
 static inline void transpose(reals *c) {
 #if LANES == 8
     reals a[8], b[8];
+#pragma unroll
     for (int k = 0; k < 4; ++k) {
         a[k] = (reals)(c[k].lo, c[k + 4].lo);
         a[k + 4] = (reals)(c[k].hi, c[k + 4].hi);
     }
-    for (int k = 0; k < 6; k += k == 1 ? 3 : 1) {
+#pragma unroll
+    for (int j = 0; j < 4; ++j) {
+        const int k = j < 2 ? j : j + 2;
         b[k] = (reals)(a[k].s01, a[k + 2].s01, a[k].s45, a[k + 2].s45);
         b[k + 2] = (reals)(a[k].s23, a[k + 2].s23, a[k].s67, a[k + 2].s67);
     }
+#pragma unroll
     for (int k = 0; k < 8; k += 2) {
         c[k] = (reals)(b[k].s0, b[k + 1].s0, b[k].s2, b[k + 1].s2, b[k].s4, b[k + 1].s4, b[k].s6, b[k + 1].s6);
         c[k + 1] = (reals)(b[k].s1, b[k + 1].s1, b[k].s3, b[k + 1].s3, b[k].s5, b[k + 1].s5, b[k].s7, b[k + 1].s7);

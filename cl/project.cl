@@ -230,7 +230,9 @@ static inline void load_coefficients(const __global real *sh, size_t i, size_t n
     // Without the tests of each chunk: loads go straight to the registers that are transposed.
     if (i + LANES <= n && last - first == COEFFICIENTS) {
         const __global real *row = sh + 3 * (i * stride + first);
+#pragma unroll
         for (int k = 0; k < CHUNKS; ++k) {
+#pragma unroll
             for (int lane = 0; lane < LANES; ++lane)
                 values[LANES * k + lane] = load8(row + 3 * lane * stride + LANES * k);
             transpose(values + LANES * k);
@@ -251,6 +253,19 @@ static inline int coefficients_of(int sh_degree) {
     return (sh_degree + 1) * (sh_degree + 1);
 }
 
+// Prefetches the first `count` coefficients of the Gaussians of the work-item after the next one.
+static inline void fetch_coefficients(const __global real *sh, size_t i, size_t n, int stride, int count) {
+#if LANES == 8
+    if (i + 3 * LANES > n)
+        return;
+    for (int lane = 0; lane < LANES; ++lane) {
+        const __global real *row = sh + 3 * (i + 2 * LANES + lane) * stride;
+        for (int k = 0; k < 3 * count; k += FETCHED)
+            FETCH_TO_READ(row + k);
+    }
+#endif
+}
+
 __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int sh_stride, const int sh_degree,
                                   const __global real *means, const __global real *log_scales,
                                   const __global real *quats, const __global real *logit_opacities,
@@ -266,6 +281,8 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
     if (i >= n)
         return;
 
+    const int active = coefficients_of(sh_degree);
+    fetch_coefficients(sh, i, n, sh_stride, active);
     const reals3 mean = load_vectors3(means, i, n);
     const reals4 quat = load_vectors4(quats, i, n);
     const reals norm2 = dot4(quat, quat), zero = 0;
@@ -286,7 +303,6 @@ __kernel VECTORS void project_fwd(const uint n, const Camera camera, const int s
     reals basis[16];
     sh_basis(normalized3(lens_offset(&camera, mean)), sh_degree, basis);
     reals3 color = {(real)0.5, (real)0.5, (real)0.5};
-    const int active = coefficients_of(sh_degree);
 #if LANES == 1
 #pragma unroll
 #endif
@@ -637,11 +653,20 @@ static inline void update_chunk(const Adam *adam, reals rates, reals g, size_t b
     }
 }
 
+// Updates the `count` parameters of each Gaussian from i on; g: their gradients, in chunks.
+static inline void update_chunks(const Adam *adam, real rate, const reals *g, int count, size_t i, size_t n,
+                                 AdamArrays a) {
+    fetch_ahead(a.first + count * i, count);
+    fetch_ahead(a.second + count * i, count);
+#pragma unroll
+    for (int k = 0; k < count; ++k)
+        update_chunk(adam, rate, g[k], count * i + LANES * k, count * n, a);
+}
+
 static inline void update_vectors3(const Adam *adam, real rate, reals3 g, size_t i, size_t n, AdamArrays a) {
     reals c[3];
     scattered3(g, c);
-    for (int k = 0; k < 3; ++k)
-        update_chunk(adam, rate, c[k], 3 * i + LANES * k, 3 * n, a);
+    update_chunks(adam, rate, c, 3, i, n, a);
 }
 
 #if LANES == 1
@@ -714,6 +739,10 @@ project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const i
         v_opacities,
         v_colors
     };
+    const int active = coefficients_of(sh_degree);
+    fetch_coefficients(sh, i, n, sh_stride, active);
+    fetch_coefficients(sh_1, i, n, sh_stride, active);
+    fetch_coefficients(sh_2, i, n, sh_stride, active);
     reals basis[16];
     GaussianGrad v = gaussian_vjp(i, n, &camera, sh_stride, sh_degree, gaussians, splats, basis);
 #if CAMERA_GRAD
@@ -724,7 +753,7 @@ project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const i
 #if LANES == 1
     __local real rows[ROW * GROUP];
     share_row(basis, v.color, rows);
-    update_coefficients(&adam, rows, n, sh_stride, coefficients_of(sh_degree), of_sh);
+    update_coefficients(&adam, rows, n, sh_stride, active, of_sh);
 #endif
     if (i >= n)
         return;
@@ -757,12 +786,10 @@ project_bwd_adam(const uint n, const Camera camera, const int sh_stride, const i
     update_vectors3(&adam, adam.log_scales, v.log_scales, i, n, of_scales);
     reals quat[4];
     scattered4(v.quat, quat);
-    for (int k = 0; k < 4; ++k)
-        update_chunk(&adam, adam.quats, quat[k], 4 * i + LANES * k, 4 * n, of_quats);
-    update_chunk(&adam, adam.logit_opacities, v.logit_opacity, i, n, of_opacities);
+    update_chunks(&adam, adam.quats, quat, 4, i, n, of_quats);
+    update_chunks(&adam, adam.logit_opacities, &v.logit_opacity, 1, i, n, of_opacities);
 
 #if LANES == 8
-    const int active = coefficients_of(sh_degree);
     const reals sh0 = adam.sh0, sh_rest = adam.sh_rest;
     FOR_COEFFICIENTS(first, active) {
         reals values[3 * COEFFICIENTS];

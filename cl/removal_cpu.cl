@@ -80,6 +80,7 @@ __kernel void removal(const int width, const int height, const __global Splat *s
             break;
         const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, &batch);
         for (uint j = 0; j < count; ++j) {
+            fetch_splat(splats, gauss_ids, first + BATCH + j, end);
             const Splat *s = &batch.splats[j];
             const Corner corner = corner_from(s, x0, y0);
             REALV difference = 0, agreement = 0, weights = 0, squares = 0, shares = 0, pairs = 0;
