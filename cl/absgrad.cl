@@ -66,17 +66,18 @@ absgrad_tiles(const int width, const int height, const __global Splat *splats, c
                 Bend bend;
                 const real t = splat_exponent(&s, &offset, &bend);
                 if (splat_seen(&s, t)) {
-                    real opacity = exp2(t), after = transmittance[p], part = behind[p], u = 0;
+                    const real opacity = splat_alpha(1, exp2(t));
+                    real after = transmittance[p], part = behind[p], u = 0;
                     int live;
-                    const real weight = splat_over(1, TRANSMITTANCE_MIN, &opacity, &live, &after);
+                    const real weight = splat_over(opacity, TRANSMITTANCE_MIN, &live, &after);
                     for (int k = 0; k < CHANNELS; ++k)
                         u += s.color[k] * v_pixels[k][p];
                     const real v_sigma = splat_over_vjp(opacity, live, weight, u, &part);
                     transmittance[p] = after;
                     behind[p] = part;
-                    // t has the exponent in units of ln 2, with the sign of -sigma.
-                    total.x += ABSOLUTE(v_sigma * (2 * s.a * offset.dx + s.b * offset.dy));
-                    total.y += ABSOLUTE(v_sigma * (s.b * offset.dx + 2 * s.c * offset.dy));
+                    // sigma is u^2 + v^2 in units of ln 2.
+                    total.x += ABSOLUTE(2 * v_sigma * s.u_x * offset.u);
+                    total.y += ABSOLUTE(2 * v_sigma * (s.u_y * offset.u + s.v_y * offset.v));
                 }
             }
             hand_on();

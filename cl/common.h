@@ -28,6 +28,7 @@ typedef double16 real16;
 typedef long4 mask4; // result of comparing two real4
 typedef long8 mask8;
 typedef long16 mask16;
+#define EPSILON DBL_EPSILON
 #else
 typedef float real;
 typedef float2 real2;
@@ -38,6 +39,7 @@ typedef float16 real16;
 typedef int4 mask4;
 typedef int8 mask8;
 typedef int16 mask16;
+#define EPSILON FLT_EPSILON
 #endif
 
 #define CONCATENATE_(a, b) a##b

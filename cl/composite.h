@@ -8,7 +8,7 @@
 // With -DRAYS, sigma is that along the pixel's ray (composite_rays.h).
 //
 // Splats are packed for exponents of two: alpha = 2^t, t = log2(opacity) - sigma log2(e). A splat is visible where
-// sigma >= 0, which only the rounding of a needle's conic violates, and alpha >= ALPHA_MIN. Both are tests of t.
+// alpha >= ALPHA_MIN and sigma >= 0, which along rays rounding can violate. Both are tests of t.
 #ifndef CLSPLAT_COMPOSITE_H
 #define CLSPLAT_COMPOSITE_H
 
@@ -27,20 +27,29 @@
 #include "composite_rays.h"
 #else
 
-// A splat: t = level + a dx^2 + b dx dy + c dy^2. Padded to whole quarters of a cache line of 64 bytes.
+// A splat: t = level - u^2 - v^2, with u = u_x dx + u_y dy and v = v_y dy. The triangle of u_x, u_y and v_y is the
+// Cholesky factor of the conic times log2(e)/2. So t takes two multiply-adds, no rounding makes it larger than `level`,
+// and the large terms of a needle's conic do not cancel in each pixel. Padded to whole quarters of a cache line of 64
+// bytes.
 #define SPLAT_REALS ((8 + CHANNELS + 3) / 4 * 4)
 typedef struct {
     real x, y;                  // centre, px
-    real a, b, c;               // px^-2
+    real u_x, u_y, v_y;         // px^-1
     real level;                 // log2(opacity)
     real half_height, at_right; // extent along y, and y of the rightmost point from the centre, px
     real color[SPLAT_REALS - 8];
 } Splat;
 
-// Position of a pixel relative to the splat's centre, px.
+// Position of a pixel relative to the splat's centre, in the splat's own coordinates.
 typedef struct {
-    REALV dx, dy;
+    REALV u, v;
 } Offset;
+
+// The pixel at (dx, dy) from the centre, px.
+static inline Offset offset_at(const Splat *s, REALV dx, REALV dy) {
+    const Offset o = {s->u_x * dx + s->u_y * dy, s->v_y * dy};
+    return o;
+}
 
 // Nothing, but what composite_rays.h needs for gradients. A struct has a member.
 typedef struct {
@@ -49,46 +58,49 @@ typedef struct {
 
 // t of the splat at an offset from its centre.
 static inline REALV splat_exponent(const Splat *s, const Offset *o, Bend *bend) {
-    return o->dx * (s->a * o->dx + s->b * o->dy) + (s->c * o->dy * o->dy + s->level);
+    return s->level - o->u * o->u - o->v * o->v;
 }
 
-// Sums over pixels of v_sigma, v_sigma dx, ..., from which all gradients of a splat follow (composite_splats.h).
+static inline MASKV splat_seen(const Splat *s, REALV t) {
+    return t >= (REALV)LOG2_ALPHA_MIN;
+}
+
+// Sums over pixels of v_sigma, v_sigma u, ..., from which all gradients of a splat follow (composite_splats.h).
 typedef struct {
-    REALV m, mx, my, mxx, mxy, myy;
+    REALV m, mu, mv, muu, muv, mvv;
 } Moments;
 
 #define NO_MOMENTS                                                                                                   \
     { 0, 0, 0, 0, 0, 0 }
 
 static inline void add_moments(const Offset *o, const Bend *bend, REALV v_sigma, Moments *m) {
-    const REALV x_sigma = o->dx * v_sigma, y_sigma = o->dy * v_sigma;
+    const REALV u_sigma = o->u * v_sigma, v_sigma_v = o->v * v_sigma;
     m->m += v_sigma;
-    m->mx += x_sigma;
-    m->my += y_sigma;
-    m->mxx += o->dx * x_sigma;
-    m->mxy += o->dx * y_sigma;
-    m->myy += o->dy * y_sigma;
+    m->mu += u_sigma;
+    m->mv += v_sigma_v;
+    m->muu += o->u * u_sigma;
+    m->muv += o->u * v_sigma_v;
+    m->mvv += o->v * v_sigma_v;
 }
 
 // A record holds the sums of one splat and one tile: the moments, then those of weight v_image.
 #define MOMENTS 6
 #define RECORD  (MOMENTS + CHANNELS)
 #define MOMENTS_OF(sums)                                                                                             \
-    { (sums).m, (sums).mx, (sums).my, (sums).mxx, (sums).mxy, (sums).myy }
+    { (sums).m, (sums).mu, (sums).mv, (sums).muu, (sums).muv, (sums).mvv }
 #endif
 
-static inline MASKV splat_seen(const Splat *s, REALV t) {
-    return (t <= (REALV)(s->level + (real)EXPONENT_SLACK)) & (t >= (REALV)LOG2_ALPHA_MIN);
+// The alpha of a splat from 2^t: clamped, and 0 where the splat is not visible.
+static inline REALV splat_alpha(MASKV seen, REALV power) {
+    const REALV clamped = LESSER(power, (REALV)ALPHA_MAX);
+    return seen ? clamped : (REALV)0;
 }
 
-// Composites a splat over a group of pixels. alpha is clamped, and set to 0 where the splat is not visible. A pixel
-// whose transmittance would fall to `stop` or below is finished: its transmittance stays the same, and is stored
+// Composites a splat over a group of pixels. A pixel whose transmittance would fall to `stop` or below is finished: its transmittance stays the same, and is stored
 // negated from then on. (Other pixels have a transmittance above `stop`.) Returns the weight alpha T, which is 0
 // where the splat is not drawn. *live: the pixels that are not finished.
-static inline REALV splat_over(MASKV seen, real stop, REALV *alpha, MASKV *live, REALV *transmittance) {
-    const REALV clamped = LESSER(*alpha, (REALV)ALPHA_MAX), before = *transmittance;
-    *alpha = seen ? clamped : (REALV)0;
-    const REALV weight = *alpha * before, behind = before - weight;
+static inline REALV splat_over(REALV alpha, real stop, MASKV *live, REALV *transmittance) {
+    const REALV before = *transmittance, weight = alpha * before, behind = before - weight;
     *live = behind > (REALV)stop;
     *transmittance = *live ? behind : MINUS_ABSOLUTE(before);
     return *live ? weight : (REALV)0;

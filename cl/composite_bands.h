@@ -11,16 +11,16 @@ typedef struct {
 
 #if !RAYS
 // Outlines of splats with these numbers of Splat; (x, y) counts from the tile's corner.
-static inline BandOutline band_outline(REALV x, REALV y, REALV half_height, REALV at_right, REALV a, REALV b,
+static inline BandOutline band_outline(REALV x, REALV y, REALV half_height, REALV at_right, REALV u_x, REALV u_y,
                                        REALV level) {
-    const REALV inv_a = 1 / a;
+    const REALV inv = 1 / u_x;
     const BandOutline o = {x,
                            y,
                            half_height,
                            1 / half_height,
                            at_right,
-                           (real)-0.5 * b * inv_a,
-                           ((real)(LOG2_ALPHA_MIN - LOG2_E * EXTENT_SLACK) - level) * inv_a};
+                           -u_y * inv,
+                           (level - (real)(LOG2_ALPHA_MIN - LOG2_E * EXTENT_SLACK)) * inv * inv};
     return o;
 }
 #endif

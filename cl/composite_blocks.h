@@ -43,6 +43,9 @@
 #define PIXEL_Y ((real8)(0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5))
 #endif
 
+// Lane i of a vector in memory.
+#define LANE(vector, i) (((const real *)&(vector))[i])
+
 // A set of blocks: bit b is that of block b. In halves of 32 bits, a row of blocks lies within one.
 typedef ulong Blocks;
 #define HALVES ((BLOCKS + 31) / 32)
@@ -79,33 +82,113 @@ static inline real8 sum_lanes8(REALV v0, REALV v1, REALV v2, REALV v3, REALV v4,
     return neighbour_sums(v0415, neighbour_sums(pair_sums(v2, v6), pair_sums(v3, v7)));
 }
 
-static inline bool any_lane(MASKV mask) {
+// The bits that are set in any lane.
+static inline uint bits_of_lanes(MASKV bits) {
 #if LANES == 16
-    const mask8 m8 = mask.lo | mask.hi;
+    const mask8 m8 = bits.lo | bits.hi;
     const mask4 m4 = m8.lo | m8.hi;
 #else
-    const mask4 m4 = mask.lo | mask.hi;
+    const mask4 m4 = bits.lo | bits.hi;
 #endif
     return m4.x | m4.y | m4.z | m4.w;
 }
 
-// Lane i of a vector in memory.
-#define LANE(vector, i) (((const real *)&(vector))[i])
-
-// Block and lane of pixel (x, y) of a tile.
-static inline int block_of(int x, int y) {
-    return y / BLOCK_ROWS * COLUMNS + x / 4;
+static inline bool any_lane(MASKV mask) {
+    return bits_of_lanes(mask) != 0;
 }
 
-static inline int lane_of(int x, int y) {
-    return y % BLOCK_ROWS * 4 + x % 4;
+// A tile: its first pixel, and the size of its part inside the image.
+typedef struct {
+    int x0, y0, columns, rows;
+} Box;
+
+static inline Box tile_box(uint tile, int width, int height) {
+    const int tiles_x = (width + TILE - 1) / TILE;
+    const int x0 = tile % tiles_x * TILE, y0 = tile / tiles_x * TILE;
+    const Box box = {x0, y0, LESSER(TILE, width - x0), LESSER(TILE, height - y0)};
+    return box;
+}
+
+// Whether a lane of block b lies inside the image; if the last one does, all do.
+static inline bool lane_inside(const Box *box, uint b, int lane) {
+    return 4 * (int)(b % COLUMNS) + lane % 4 < box->columns && BLOCK_ROWS * (int)(b / COLUMNS) + lane / 4 < box->rows;
+}
+
+// Index of its pixel.
+static inline size_t lane_pixel(const Box *box, int width, uint b, int lane) {
+    const int x = box->x0 + 4 * (int)(b % COLUMNS) + lane % 4;
+    const int y = box->y0 + BLOCK_ROWS * (int)(b / COLUMNS) + lane / 4;
+    return (size_t)y * width + x;
+}
+
+// Copies the `count` numbers of a pixel.
+static inline void load_lane(const __global real *pixel, int count, int lane, REALV *block) {
+    _Pragma("unroll") for (int k = 0; k < count; ++k)((real *)&block[k])[lane] = pixel[k];
+}
+
+static inline void store_lane(const REALV *block, int count, int lane, __global real *pixel) {
+    _Pragma("unroll") for (int k = 0; k < count; ++k) pixel[k] = LANE(block[k], lane);
+}
+
+// Reads `count` numbers of each pixel of a block; those of pixels outside the image are 0.
+static inline void load_block(const __global real *values, int count, const Box *box, int width, uint b,
+                              REALV *block) {
+    if (lane_inside(box, b, LANES - 1)) {
+        _Pragma("unroll") for (int lane = 0; lane < LANES; ++lane)
+            load_lane(values + count * lane_pixel(box, width, b, lane), count, lane, block);
+        return;
+    }
+    for (int k = 0; k < count; ++k)
+        block[k] = 0;
+    for (int lane = 0; lane < LANES; ++lane) {
+        if (lane_inside(box, b, lane))
+            load_lane(values + count * lane_pixel(box, width, b, lane), count, lane, block);
+    }
+}
+
+static inline void store_block(const REALV *block, int count, const Box *box, int width, uint b,
+                               __global real *values) {
+    if (lane_inside(box, b, LANES - 1)) {
+        _Pragma("unroll") for (int lane = 0; lane < LANES; ++lane)
+            store_lane(block, count, lane, values + count * lane_pixel(box, width, b, lane));
+        return;
+    }
+    for (int lane = 0; lane < LANES; ++lane) {
+        if (lane_inside(box, b, lane))
+            store_lane(block, count, lane, values + count * lane_pixel(box, width, b, lane));
+    }
+}
+
+// Writes the image and its alpha in a block of composited pixels.
+static inline void store_pixels(REALV transmittance, const REALV *sums, const __global real *background,
+                                const Box *box, int width, uint b, __global real *image, __global real *alpha_image) {
+    const REALV left = ABSOLUTE(transmittance), alpha = 1 - left;
+    REALV color[CHANNELS];
+    _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) color[k] = sums[k] + left * background[k];
+    store_block(color, CHANNELS, box, width, b, image);
+    store_block(&alpha, 1, box, width, b, alpha_image);
+}
+
+// Reads the gradients of a block of the image into v_color. Returns S of each pixel before the first splat
+// (composite_cpu.cl).
+static inline REALV load_v_pixels(const __global real *image, const __global real *alpha_image,
+                                  const __global real *v_image, const __global real *v_alpha_image, const Box *box,
+                                  int width, uint b, REALV *v_color) {
+    REALV color[CHANNELS], alpha, v_alpha;
+    load_block(image, CHANNELS, box, width, b, color);
+    load_block(alpha_image, 1, box, width, b, &alpha);
+    load_block(v_image, CHANNELS, box, width, b, v_color);
+    load_block(v_alpha_image, 1, box, width, b, &v_alpha);
+    REALV behind = (alpha - 1) * v_alpha;
+    _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) behind += color[k] * v_color[k];
+    return behind;
 }
 
 // Corners of the blocks relative to the tile's, px.
 typedef struct {
     real x[BLOCKS], y[BLOCKS];
 #if RAYS == 2
-    REALV rays[BLOCKS][3]; // directions of the pixels' rays
+    REALV rays[BLOCKS][3]; // directions of the pixels' rays; 0 outside the image, where gradients are 0
 #endif
 } Grid;
 
@@ -114,11 +197,6 @@ static inline Grid pixel_grid(void) {
     for (int b = 0; b < BLOCKS; ++b) {
         grid.x[b] = 4 * (b % COLUMNS);
         grid.y[b] = BLOCK_ROWS * (b / COLUMNS);
-#if RAYS == 2
-        // Pixels outside the image have no directions. Their gradients are 0 times what follows from these.
-        for (int k = 0; k < 3; ++k)
-            grid.rays[b][k] = 0;
-#endif
     }
     return grid;
 }
@@ -126,51 +204,56 @@ static inline Grid pixel_grid(void) {
 // Arguments of a kernel that reads the directions of the pixels' rays, and their loading.
 #if RAYS == 2
 #define DIRECTIONS , const __global real *directions
-#define LOAD_DIRECTIONS(grid)                                                                                        \
-    for (int r = 0; r < rows; ++r) {                                                                                 \
-        for (int x = 0; x < columns; ++x) {                                                                          \
-            const size_t p = (size_t)(y0 + r) * width + x0 + x;                                                      \
-            for (int k = 0; k < 3; ++k)                                                                              \
-                ((real *)&(grid).rays[block_of(x, r)][k])[lane_of(x, r)] = directions[3 * p + k];                    \
-        }                                                                                                            \
-    }
+#define LOAD_DIRECTIONS(grid, box)                                                                                   \
+    for (int b = 0; b < BLOCKS; ++b)                                                                                 \
+        load_block(directions, 3, box, width, b, (grid).rays[b]);
 #else
 #define DIRECTIONS
-#define LOAD_DIRECTIONS(grid)
+#define LOAD_DIRECTIONS(grid, box)
 #endif
 
-// The pixels of the tile's first block as seen from a splat, px.
+// The blocks of a tile as seen from a splat: the pixels of the first one, and what the columns and rows of blocks add to
+// it. So a block takes additions only.
 typedef struct {
-    REALV x, y;
-} Corner;
-
-static inline Corner corner_from(const Splat *s, int x0, int y0) {
-#if RAYS == 2
-    const Corner corner = {0, 0};
-#else
-    const Corner corner = {PIXEL_X + (x0 - s->x), PIXEL_Y + (y0 - s->y)};
+#if RAYS != 2
+    Offset corner;
 #endif
-    return corner;
+#if !RAYS
+    real8 u_columns, u_rows, v_rows;
+#endif
+} Sight;
+
+static inline Sight sight_from(const Splat *s, const Box *box) {
+    Sight sight;
+#if RAYS != 2
+    sight.corner = offset_at(s, PIXEL_X + (box->x0 - s->x), PIXEL_Y + (box->y0 - s->y));
+#endif
+#if !RAYS
+    const real8 numbers = (real8)(0, 1, 2, 3, 4, 5, 6, 7);
+    sight.u_columns = s->u_x * (4 * numbers);
+    sight.u_rows = s->u_y * (BLOCK_ROWS * numbers);
+    sight.v_rows = s->v_y * (BLOCK_ROWS * numbers);
+#endif
+    return sight;
 }
 
-static inline Offset offset_in(const Grid *grid, uint b, const Splat *s, Corner corner) {
+static inline Offset offset_in(const Grid *grid, uint b, const Splat *s, const Sight *sight) {
 #if RAYS == 2
     const REALV x = grid->rays[b][0], y = grid->rays[b][1], z = grid->rays[b][2];
     const Offset o = {s->axis0[0] * x + s->axis0[1] * y + s->axis0[2] * z,
                       s->axis1[0] * x + s->axis1[1] * y + s->axis1[2] * z,
                       s->axis2[0] * x + s->axis2[1] * y + s->axis2[2] * z};
+#elif RAYS
+    const Offset o = {sight->corner.dx + grid->x[b], sight->corner.dy + grid->y[b], 1};
 #else
-    Offset o;
-    o.dx = corner.x + grid->x[b];
-    o.dy = corner.y + grid->y[b];
-#if RAYS
-    o.along = 1;
-#endif
+    const uint column = b % COLUMNS, row = b / COLUMNS;
+    const Offset o = {sight->corner.u + LANE(sight->u_columns, column) + LANE(sight->u_rows, row),
+                      sight->corner.v + LANE(sight->v_rows, row)};
 #endif
     return o;
 }
 
-#define SQRTV(x) CONCATENATE(OF, LANES)(sqrt, x)
+#define SQRTV CONCATENATE(ROOT, LANES)
 #if LANES == 16
 DEFINE_POWER(16)
 #define POWERV power16
@@ -201,8 +284,12 @@ static inline uint take_block(Blocks *blocks) {
 // The blocks with an unfinished pixel. The transmittances of neighbouring blocks are `stride` vectors apart.
 static inline Blocks unfinished_blocks(const REALV *transmittance, uint stride) {
     Blocks blocks = 0;
-    for (int b = 0; b < BLOCKS; ++b)
-        blocks |= (Blocks)any_lane(transmittance[b * stride] > 0) << b;
+    for (int h = 0; h < HALVES; ++h) {
+        MASKV bits = 0; // of 32 blocks, for each lane
+        _Pragma("unroll") for (int b = 0; b < LESSER(BLOCKS, 32); ++b) bits |=
+            (transmittance[(32 * h + b) * stride] > 0) & ((MASKV)1 << b);
+        blocks |= (Blocks)bits_of_lanes(bits) << 32 * h;
+    }
     return blocks;
 }
 
@@ -232,7 +319,7 @@ typedef struct {
 #if RAYS
     REALV inv_half_height[BATCH / LANES], slope[BATCH / LANES], half_sq[BATCH / LANES];
 #else
-    REALV a[BATCH / LANES], b[BATCH / LANES], level[BATCH / LANES];
+    REALV u_x[BATCH / LANES], u_y[BATCH / LANES], level[BATCH / LANES];
 #endif
 } Outlines;
 
@@ -244,8 +331,8 @@ static inline void set_outline(Outlines *outlines, uint j, const Splat *s) {
     ((real *)outlines->half_sq)[j] = e->half_sq;
 #else
     const Splat *e = s;
-    ((real *)outlines->a)[j] = s->a;
-    ((real *)outlines->b)[j] = s->b;
+    ((real *)outlines->u_x)[j] = s->u_x;
+    ((real *)outlines->u_y)[j] = s->u_y;
     ((real *)outlines->level)[j] = s->level;
 #endif
     ((real *)outlines->x)[j] = e->x;
@@ -254,9 +341,9 @@ static inline void set_outline(Outlines *outlines, uint j, const Splat *s) {
     ((real *)outlines->at_right)[j] = e->at_right;
 }
 
-// Finds the blocks of the tile with corner (x0, y0) whose pixel centres the ellipses of LANES splats meet.
-static inline void find_blocks(const Outlines *outlines, uint g, int x0, int y0, Batch *batch) {
-    const REALV x = outlines->x[g] - (real)x0, y = outlines->y[g] - (real)y0;
+// Finds the blocks of the tile whose pixel centres the ellipses of LANES splats meet.
+static inline void find_blocks(const Outlines *outlines, uint g, const Box *box, Batch *batch) {
+    const REALV x = outlines->x[g] - (real)box->x0, y = outlines->y[g] - (real)box->y0;
 #if RAYS
     const BandOutline outline = {x,
                                  y,
@@ -266,8 +353,8 @@ static inline void find_blocks(const Outlines *outlines, uint g, int x0, int y0,
                                  outlines->slope[g],
                                  outlines->half_sq[g]};
 #else
-    const BandOutline outline = band_outline(x, y, outlines->half_height[g], outlines->at_right[g], outlines->a[g],
-                                             outlines->b[g], outlines->level[g]);
+    const BandOutline outline = band_outline(x, y, outlines->half_height[g], outlines->at_right[g], outlines->u_x[g],
+                                             outlines->u_y[g], outlines->level[g]);
 #endif
     INTV halves[HALVES];
     _Pragma("unroll") for (int h = 0; h < HALVES; ++h) halves[h] = 0;
@@ -291,7 +378,7 @@ static inline void fetch_splat(const __global Splat *splats, const __global uint
 
 // Loads up to BATCH splats, beginning with the entry `first` of the list. Returns their number.
 static inline uint load_batch(const __global Splat *splats, const __global uint *gauss_ids, uint first, uint end,
-                              int x0, int y0, Batch *batch) {
+                              const Box *box, Batch *batch) {
     const uint count = LESSER((uint)BATCH, end - first);
     Outlines outlines;
     // All loads come first, so that cache misses overlap.
@@ -300,13 +387,13 @@ static inline uint load_batch(const __global Splat *splats, const __global uint 
         set_outline(&outlines, j, &batch->splats[j]);
     }
     for (uint g = 0; g * LANES < count; ++g)
-        find_blocks(&outlines, g, x0, y0, batch);
+        find_blocks(&outlines, g, box, batch);
     return count;
 }
 
 // Transmittance 1 inside the image. Pixels outside count as finished.
-static inline REALV transmittance_at_first(const Grid *grid, int b, int rows, int columns) {
-    const MASKV inside = (PIXEL_X < (REALV)(columns - grid->x[b])) & (PIXEL_Y < (REALV)(rows - grid->y[b]));
+static inline REALV transmittance_at_first(const Grid *grid, int b, const Box *box) {
+    const MASKV inside = (PIXEL_X < (REALV)(box->columns - grid->x[b])) & (PIXEL_Y < (REALV)(box->rows - grid->y[b]));
     return inside ? (REALV)1 : (REALV)-1;
 }
 
@@ -315,34 +402,49 @@ typedef struct {
     REALV transmittance, color[CHANNELS];
 } BlockPixels;
 
-static inline BlockPixels pixels_at_first(const Grid *grid, int b, int rows, int columns) {
-    BlockPixels pixels = {transmittance_at_first(grid, b, rows, columns), {0}};
+static inline BlockPixels pixels_at_first(const Grid *grid, int b, const Box *box) {
+    BlockPixels pixels = {transmittance_at_first(grid, b, box), {0}};
     return pixels;
+}
+
+// A splat in a block of pixels.
+typedef struct {
+    uint block;
+    Offset offset;
+    Bend bend;
+    REALV alpha;
+} Visit;
+
+// The visit of the next block of a set that is not empty.
+static inline Visit next_visit(const Grid *grid, const Splat *s, const Sight *sight, Blocks *blocks) {
+    Visit visit;
+    visit.block = take_block(blocks);
+    visit.offset = offset_in(grid, visit.block, s, sight);
+    const REALV t = splat_exponent(s, &visit.offset, &visit.bend);
+    visit.alpha = splat_alpha(splat_seen(s, t), POWERV(t));
+    return visit;
 }
 
 // Composites the entries [begin, end) of a tile's list over its blocks. A pixel is finished where the transmittance
 // would fall to `stop` or below.
 static inline void composite_tile(const Grid *grid, const __global Splat *splats, const __global uint *gauss_ids,
-                                  uint begin, uint end, int x0, int y0, real stop, BlockPixels *pixels) {
+                                  uint begin, uint end, const Box *box, real stop, BlockPixels *pixels) {
     Batch batch;
     for (uint first = begin; first < end; first += BATCH) {
         const Blocks unfinished = unfinished_blocks(&pixels->transmittance, sizeof(BlockPixels) / sizeof(REALV));
         if (!unfinished)
             break;
-        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, &batch);
+        const uint count = load_batch(splats, gauss_ids, first, end, box, &batch);
         for (uint j = 0; j < count; ++j) {
             fetch_splat(splats, gauss_ids, first + BATCH + j, end);
             const Splat *s = &batch.splats[j];
-            const Corner corner = corner_from(s, x0, y0);
+            const Sight sight = sight_from(s, box);
             for (Blocks blocks = unfinished & blocks_of(&batch, j); blocks;) {
-                const uint b = take_block(&blocks);
-                const Offset o = offset_in(grid, b, s, corner);
-                Bend bend;
-                const REALV t = splat_exponent(s, &o, &bend);
-                REALV alpha = POWERV(t);
+                const Visit visit = next_visit(grid, s, &sight, &blocks);
+                BlockPixels *here = &pixels[visit.block];
                 MASKV live;
-                const REALV weight = splat_over(splat_seen(s, t), stop, &alpha, &live, &pixels[b].transmittance);
-                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pixels[b].color[k] += weight * s->color[k];
+                const REALV weight = splat_over(visit.alpha, stop, &live, &here->transmittance);
+                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) here->color[k] += weight * s->color[k];
             }
         }
     }

@@ -36,29 +36,19 @@ __kernel void composite_fwd(const int width, const int height, const __global Sp
                             const __global real *background, __global real *image,
                             __global real *alpha_image DIRECTIONS) {
     const uint t = get_global_id(0);
-    const int tiles_x = (width + TILE - 1) / TILE;
-    const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
-    const int rows = LESSER(TILE, height - y0), columns = LESSER(TILE, width - x0);
+    const Box box = tile_box(t, width, height);
 
     Grid grid = pixel_grid();
-    LOAD_DIRECTIONS(grid)
+    LOAD_DIRECTIONS(grid, &box)
     BlockPixels pixels[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b)
-        pixels[b] = pixels_at_first(&grid, b, rows, columns);
+        pixels[b] = pixels_at_first(&grid, b, &box);
 
-    composite_tile(&grid, splats, gauss_ids, tile_ranges[2 * t], tile_ranges[2 * t + 1], x0, y0, TRANSMITTANCE_MIN,
+    composite_tile(&grid, splats, gauss_ids, tile_ranges[2 * t], tile_ranges[2 * t + 1], &box, TRANSMITTANCE_MIN,
                    pixels);
 
-    for (int r = 0; r < rows; ++r) {
-        const size_t first = (size_t)(y0 + r) * width + x0;
-        for (int x = 0; x < columns; ++x) {
-            const int b = block_of(x, r), lane = lane_of(x, r);
-            const real left = ABSOLUTE(LANE(pixels[b].transmittance, lane));
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) image[CHANNELS * (first + x) + k] =
-                LANE(pixels[b].color[k], lane) + left * background[k];
-            alpha_image[first + x] = 1 - left;
-        }
-    }
+    for (int b = 0; b < BLOCKS; ++b)
+        store_pixels(pixels[b].transmittance, pixels[b].color, background, &box, width, b, image, alpha_image);
 }
 
 // Number of splats between the prefetch of a record and its writing.
@@ -69,36 +59,47 @@ typedef struct {
     REALV transmittance, behind, v_color[CHANNELS];
 } GradPixels;
 
+// Sums of a splat over the pixels of a tile, lane by lane.
+typedef struct {
+    Moments moments;
+    REALV v_colors[CHANNELS];
+} SplatSums;
+
+#define NO_SUMS                                                                                                      \
+    {                                                                                                                \
+        NO_MOMENTS, {                                                                                                \
+            0                                                                                                        \
+        }                                                                                                            \
+    }
+
+static inline void visit_vjp(const Splat *s, const Visit *visit, GradPixels *pixels, SplatSums *sums) {
+    GradPixels *here = &pixels[visit->block];
+    MASKV live;
+    const REALV weight = splat_over(visit->alpha, TRANSMITTANCE_MIN, &live, &here->transmittance);
+    REALV u = 0;
+    _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
+        u += s->color[k] * here->v_color[k];
+        sums->v_colors[k] += weight * here->v_color[k];
+    }
+    const REALV v_sigma = splat_over_vjp(visit->alpha, live, weight, u, &here->behind);
+    add_moments(&visit->offset, &visit->bend, v_sigma, &sums->moments);
+}
+
 __kernel void composite_bwd(const int width, const int height, const __global Splat *splats,
                             const __global uint *gauss_ids, const __global uint *tile_ranges,
                             const __global uint *slots, const __global real *image, const __global real *alpha_image,
                             const __global real *v_image, const __global real *v_alpha_image,
                             __global real *records DIRECTIONS) {
     const uint t = get_global_id(0);
-    const int tiles_x = (width + TILE - 1) / TILE;
-    const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
-    const int rows = LESSER(TILE, height - y0), columns = LESSER(TILE, width - x0);
+    const Box box = tile_box(t, width, height);
 
     Grid grid = pixel_grid();
-    LOAD_DIRECTIONS(grid)
+    LOAD_DIRECTIONS(grid, &box)
     GradPixels pixels[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) {
-        pixels[b].transmittance = transmittance_at_first(&grid, b, rows, columns);
-        pixels[b].behind = 0;
-        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pixels[b].v_color[k] = 0;
-    }
-    for (int r = 0; r < rows; ++r) {
-        const size_t first = (size_t)(y0 + r) * width + x0;
-        for (int x = 0; x < columns; ++x) {
-            const int b = block_of(x, r), lane = lane_of(x, r);
-            real sum = (alpha_image[first + x] - 1) * v_alpha_image[first + x];
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
-                const real v = v_image[CHANNELS * (first + x) + k];
-                sum += image[CHANNELS * (first + x) + k] * v;
-                ((real *)&pixels[b].v_color[k])[lane] = v;
-            }
-            ((real *)&pixels[b].behind)[lane] = sum;
-        }
+        pixels[b].transmittance = transmittance_at_first(&grid, b, &box);
+        pixels[b].behind =
+            load_v_pixels(image, alpha_image, v_image, v_alpha_image, &box, width, b, pixels[b].v_color);
     }
 
     const uint begin = tile_ranges[2 * t], end = tile_ranges[2 * t + 1];
@@ -108,7 +109,7 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
         const Blocks unfinished = unfinished_blocks(&pixels->transmittance, sizeof(GradPixels) / sizeof(REALV));
         if (!unfinished)
             break;
-        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, &batch);
+        const uint count = load_batch(splats, gauss_ids, first, end, &box, &batch);
         for (uint j = 0; j < count; ++j) {
             fetch_splat(splats, gauss_ids, first + BATCH + j, end);
             if (first + j + AHEAD < end) {
@@ -117,41 +118,35 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
                 FETCH_TO_WRITE(later + RECORD - 1);
             }
             const Splat *s = &batch.splats[j];
-            const Corner corner = corner_from(s, x0, y0);
-            Moments sums = NO_MOMENTS;
-            REALV v_colors[CHANNELS];
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) v_colors[k] = 0;
-            for (Blocks blocks = unfinished & blocks_of(&batch, j); blocks;) {
-                const uint b = take_block(&blocks);
-                const Offset o = offset_in(&grid, b, s, corner);
-                Bend bend;
-                const REALV t = splat_exponent(s, &o, &bend);
-                REALV alpha = POWERV(t);
-                MASKV live;
-                const REALV weight =
-                    splat_over(splat_seen(s, t), TRANSMITTANCE_MIN, &alpha, &live, &pixels[b].transmittance);
-                REALV u = 0;
-                _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
-                    u += s->color[k] * pixels[b].v_color[k];
-                    v_colors[k] += weight * pixels[b].v_color[k];
+            Blocks blocks = unfinished & blocks_of(&batch, j);
+            SplatSums sums = NO_SUMS;
+            if (blocks) {
+                // The next visit begins before this one ends: a processor has too few places for operations that wait to
+                // overlap the two without that.
+                const Sight sight = sight_from(s, &box);
+                Visit visit = next_visit(&grid, s, &sight, &blocks);
+                while (blocks) {
+                    const Visit next = next_visit(&grid, s, &sight, &blocks);
+                    visit_vjp(s, &visit, pixels, &sums);
+                    visit = next;
                 }
-                const REALV v_sigma = splat_over_vjp(alpha, live, weight, u, &pixels[b].behind);
-                add_moments(&o, &bend, v_sigma, &sums);
+                visit_vjp(s, &visit, pixels, &sums);
             }
+            const Moments *m = &sums.moments;
             __global real *record = records + (size_t)RECORD * slots[first + j];
 #if RAYS
-            store8(record, sum_lanes8(sums.m, sums.mx, sums.my, sums.mxx, sums.mxy, sums.myy, sums.ml, sums.mlx));
-            record[8] = sum_lanes(sums.mly);
-            record[9] = sum_lanes(sums.mk);
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[MOMENTS + k] = sum_lanes(v_colors[k]);
+            store8(record, sum_lanes8(m->m, m->mx, m->my, m->mxx, m->mxy, m->myy, m->ml, m->mlx));
+            record[8] = sum_lanes(m->mly);
+            record[9] = sum_lanes(m->mk);
+            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) record[MOMENTS + k] = sum_lanes(sums.v_colors[k]);
 #elif CHANNELS > 1
             store8(record,
-                   sum_lanes8(sums.m, sums.mx, sums.my, sums.mxx, sums.mxy, sums.myy, v_colors[0], v_colors[1]));
-            _Pragma("unroll") for (int k = 2; k < CHANNELS; ++k) record[MOMENTS + k] = sum_lanes(v_colors[k]);
+                   sum_lanes8(m->m, m->mu, m->mv, m->muu, m->muv, m->mvv, sums.v_colors[0], sums.v_colors[1]));
+            _Pragma("unroll") for (int k = 2; k < CHANNELS; ++k) record[MOMENTS + k] = sum_lanes(sums.v_colors[k]);
 #else
             for (int k = 0; k < MOMENTS; ++k)
-                record[k] = sum_lanes(((const REALV *)&sums)[k]);
-            record[MOMENTS] = sum_lanes(v_colors[0]);
+                record[k] = sum_lanes(((const REALV *)m)[k]);
+            record[MOMENTS] = sum_lanes(sums.v_colors[0]);
 #endif
         }
     }

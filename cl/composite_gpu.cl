@@ -79,7 +79,8 @@ static inline uint blocks_met(const Splat *s, int x0, int y0) {
     const BandOutline outline = {e->x - x0,   e->y - y0, e->half_height, e->inv_half_height,
                                  e->at_right, e->slope,  e->half_sq};
 #else
-    const BandOutline outline = band_outline(s->x - x0, s->y - y0, s->half_height, s->at_right, s->a, s->b, s->level);
+    const BandOutline outline =
+        band_outline(s->x - x0, s->y - y0, s->half_height, s->at_right, s->u_x, s->u_y, s->level);
 #endif
     uint blocks = 0;
     for (int row = 0; row < TILE / 4; ++row) {
@@ -159,9 +160,8 @@ composite_fwd(const int width, const int height, const __global Splat *splats, c
                 const real t = splat_exponent(&s, &offset, &bend);
                 if (!splat_seen(&s, t)) // in most cases, for all work-items in lockstep
                     continue;
-                real alpha = exp2(t);
                 int live;
-                const real weight = splat_over(1, TRANSMITTANCE_MIN, &alpha, &live, &transmittance[o]);
+                const real weight = splat_over(splat_alpha(1, exp2(t)), TRANSMITTANCE_MIN, &live, &transmittance[o]);
                 for (int k = 0; k < CHANNELS; ++k)
                     sums[o][k] += weight * s.color[k];
             }
@@ -249,9 +249,10 @@ composite_bwd(const int width, const int height, const __global Splat *splats, c
                 const int seen = splat_seen(&s, t);
                 any_live |= !seen;
                 if (seen) {
-                    real alpha = exp2(t), after = transmittance[p];
+                    const real alpha = splat_alpha(1, exp2(t));
+                    real after = transmittance[p];
                     int live;
-                    const real weight = splat_over(1, TRANSMITTANCE_MIN, &alpha, &live, &after);
+                    const real weight = splat_over(alpha, TRANSMITTANCE_MIN, &live, &after);
                     any_live |= live;
                     transmittance[p] = after;
                     real u = 0;

@@ -19,19 +19,15 @@
 
 // A pixel as seen from a splat; `ray` is the direction of its ray.
 static inline Offset offset_of(int2 pixel, real3 ray, const Splat *s) {
-    Offset o;
 #if RAYS == 2
+    Offset o;
     o.dx = s->axis0[0] * ray.x + s->axis0[1] * ray.y + s->axis0[2] * ray.z;
     o.dy = s->axis1[0] * ray.x + s->axis1[1] * ray.y + s->axis1[2] * ray.z;
     o.along = s->axis2[0] * ray.x + s->axis2[1] * ray.y + s->axis2[2] * ray.z;
-#else
-    o.dx = pixel.x + (real)0.5 - s->x;
-    o.dy = pixel.y + (real)0.5 - s->y;
-#if RAYS
-    o.along = 1;
-#endif
-#endif
     return o;
+#else
+    return offset_at(s, pixel.x + (real)0.5 - s->x, pixel.y + (real)0.5 - s->y);
+#endif
 }
 
 #endif

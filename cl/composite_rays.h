@@ -40,6 +40,14 @@ typedef struct {
     REALV dx, dy, along;
 } Offset;
 
+#if RAYS == 1
+// The pixel at (dx, dy) from the centre, px.
+static inline Offset offset_at(const Splat *s, REALV dx, REALV dy) {
+    const Offset o = {dx, dy, 1};
+    return o;
+}
+#endif
+
 // Factors of the gradients of an exponent.
 typedef struct {
     REALV ratio, share; // r and h
@@ -57,6 +65,10 @@ static inline REALV splat_exponent(const Splat *s, const Offset *o, Bend *bend) 
     bend->share = ahead ? lambda * inv : (REALV)0;
     bend->ratio = ahead ? (real)(-2 / LOG2_E) * e * inv : (REALV)0;
     return ahead ? s->level + e * inv : (REALV)(LOG2_ALPHA_MIN - 1);
+}
+
+static inline MASKV splat_seen(const Splat *s, REALV t) {
+    return (t <= (REALV)(s->level + (real)EXPONENT_SLACK)) & (t >= (REALV)LOG2_ALPHA_MIN);
 }
 
 // Sums over pixels, from which all gradients of a splat follow (composite_splats.h).

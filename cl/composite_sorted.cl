@@ -76,7 +76,7 @@ typedef struct {
     const __global real *disparities;
     const __global uint *gauss_ids, *slots;
     __global real *records; // 0: forward
-    int x0, y0;
+    const Box *box;
     const Grid *grid;
 } Tile;
 
@@ -113,7 +113,7 @@ static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, c
         ((real *)&u)[lane] = sum;
     }
     const REALV v_sigma = splat_over_vjp(e->alpha, live, weight, u, &pixels->behind[b]);
-    const REALV x = PIXEL_X + (tile->x0 + tile->grid->x[b]), y = PIXEL_Y + (tile->y0 + tile->grid->y[b]);
+    const REALV x = PIXEL_X + (tile->box->x0 + tile->grid->x[b]), y = PIXEL_Y + (tile->box->y0 + tile->grid->y[b]);
     for (int lane = 0; lane < LANES; ++lane) {
         const real w = LANE(weight, lane), v = LANE(v_sigma, lane);
         if (!(w > 0))
@@ -121,13 +121,14 @@ static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, c
         const uint i = ENTRY_LANE(e->entry, lane);
         const __global Splat *s = &tile->splats[tile->gauss_ids[i]];
         const real dx = LANE(x, lane) - s->x, dy = LANE(y, lane) - s->y;
+        const real along = s->u_x * dx + s->u_y * dy, across = s->v_y * dy;
         __global real *record = tile->records + (size_t)RECORD * tile->slots[i];
         record[0] += v;
-        record[1] += v * dx;
-        record[2] += v * dy;
-        record[3] += v * dx * dx;
-        record[4] += v * dx * dy;
-        record[5] += v * dy * dy;
+        record[1] += v * along;
+        record[2] += v * across;
+        record[3] += v * along * along;
+        record[4] += v * along * across;
+        record[5] += v * across * across;
         for (int k = 0; k < CHANNELS; ++k)
             record[6 + k] += w * LANE(pixels->sums[b][k], lane);
     }
@@ -137,10 +138,12 @@ static inline void composite_backward(const Tile *tile, Pixels *pixels, int b, c
 // enough.
 static inline void gather_splat(const Tile *tile, const Splat *s, real3 disparity, uint entry, Pixels *pixels,
                                 int b) {
-    const Offset o = offset_in(tile->grid, b, s, corner_from(s, tile->x0, tile->y0));
+    const REALV dx = PIXEL_X + (tile->grid->x[b] + (tile->box->x0 - s->x));
+    const REALV dy = PIXEL_Y + (tile->grid->y[b] + (tile->box->y0 - s->y));
+    const Offset o = offset_at(s, dx, dy);
     Bend bend;
     const REALV t = splat_exponent(s, &o, &bend);
-    const REALV here = disparity.x + (o.dx * disparity.y + o.dy * disparity.z), last = pixels->last_disparity[b];
+    const REALV here = disparity.x + (dx * disparity.y + dy * disparity.z), last = pixels->last_disparity[b];
     const MASKV beyond = (here < last) | ((here == last) & ((MASKV)entry > pixels->last_entry[b]));
     const MASKV wanted = splat_seen(s, t) & beyond;
     Entry e;
@@ -165,8 +168,9 @@ static inline void composite_window(const Tile *tile, Pixels *pixels, int b) {
         if (!any_lane(seen))
             break;
         window[j].disparity = NOWHERE;
+        e.alpha = splat_alpha(seen, e.alpha);
         MASKV live;
-        const REALV weight = splat_over(seen, TRANSMITTANCE_MIN, &e.alpha, &live, &pixels->transmittance[b]);
+        const REALV weight = splat_over(e.alpha, TRANSMITTANCE_MIN, &live, &pixels->transmittance[b]);
         if (tile->records)
             composite_backward(tile, pixels, b, &e, live, weight);
         else
@@ -187,7 +191,7 @@ static inline void composite_list(const Tile *tile, uint begin, uint end, Pixels
     Batch batch;
     while (open) {
         for (uint first = begin; first < end; first += BATCH) {
-            const uint count = load_batch(tile->splats, tile->gauss_ids, first, end, tile->x0, tile->y0, &batch);
+            const uint count = load_batch(tile->splats, tile->gauss_ids, first, end, tile->box, &batch);
             // One block after the other, so that its window stays in the nearest cache.
             for (Blocks blocks = open; blocks;) {
                 const int b = take_block(&blocks);
@@ -206,40 +210,25 @@ static inline void composite_list(const Tile *tile, uint begin, uint end, Pixels
     }
 }
 
-// Index of the tile's first pixel, and size of the part of the tile inside the image.
-static inline int4 tile_box(uint t, int width, int height) {
-    const int tiles_x = (width + TILE - 1) / TILE;
-    const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
-    return (int4)(x0, y0, LESSER(TILE, width - x0), LESSER(TILE, height - y0));
-}
-
 __kernel void composite_fwd(const int width, const int height, const __global Splat *splats,
                             const __global uint *gauss_ids, const __global uint *tile_ranges,
                             const __global real *background, __global real *image, __global real *alpha_image,
                             const __global real *disparities) {
     const uint t = get_global_id(0);
-    const int4 box = tile_box(t, width, height);
+    const Box box = tile_box(t, width, height);
     const Grid grid = pixel_grid();
-    const Tile tile = {splats, disparities, gauss_ids, 0, 0, box.x, box.y, &grid};
+    const Tile tile = {splats, disparities, gauss_ids, 0, 0, &box, &grid};
 
     Pixels pixels;
     for (int b = 0; b < BLOCKS; ++b) {
-        pixels.transmittance[b] = transmittance_at_first(&grid, b, box.w, box.z);
+        pixels.transmittance[b] = transmittance_at_first(&grid, b, &box);
         for (int k = 0; k < CHANNELS; ++k)
             pixels.sums[b][k] = 0;
     }
     composite_list(&tile, tile_ranges[2 * t], tile_ranges[2 * t + 1], &pixels);
 
-    for (int r = 0; r < box.w; ++r) {
-        const size_t first = (size_t)(box.y + r) * width + box.x;
-        for (int x = 0; x < box.z; ++x) {
-            const int b = block_of(x, r), lane = lane_of(x, r);
-            const real left = ABSOLUTE(LANE(pixels.transmittance[b], lane));
-            for (int k = 0; k < CHANNELS; ++k)
-                image[CHANNELS * (first + x) + k] = LANE(pixels.sums[b][k], lane) + left * background[k];
-            alpha_image[first + x] = 1 - left;
-        }
-    }
+    for (int b = 0; b < BLOCKS; ++b)
+        store_pixels(pixels.transmittance[b], pixels.sums[b], background, &box, width, b, image, alpha_image);
 }
 
 __kernel void composite_bwd(const int width, const int height, const __global Splat *splats,
@@ -248,29 +237,14 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
                             const __global real *v_image, const __global real *v_alpha_image, __global real *records,
                             const __global real *disparities) {
     const uint t = get_global_id(0);
-    const int4 box = tile_box(t, width, height);
+    const Box box = tile_box(t, width, height);
     const Grid grid = pixel_grid();
-    const Tile tile = {splats, disparities, gauss_ids, slots, records, box.x, box.y, &grid};
+    const Tile tile = {splats, disparities, gauss_ids, slots, records, &box, &grid};
 
     Pixels pixels;
     for (int b = 0; b < BLOCKS; ++b) {
-        pixels.transmittance[b] = transmittance_at_first(&grid, b, box.w, box.z);
-        pixels.behind[b] = 0;
-        for (int k = 0; k < CHANNELS; ++k)
-            pixels.sums[b][k] = 0;
-    }
-    for (int r = 0; r < box.w; ++r) {
-        const size_t first = (size_t)(box.y + r) * width + box.x;
-        for (int x = 0; x < box.z; ++x) {
-            const int b = block_of(x, r), lane = lane_of(x, r);
-            real sum = (alpha_image[first + x] - 1) * v_alpha_image[first + x];
-            for (int k = 0; k < CHANNELS; ++k) {
-                const real v = v_image[CHANNELS * (first + x) + k];
-                sum += image[CHANNELS * (first + x) + k] * v;
-                ((real *)&pixels.sums[b][k])[lane] = v;
-            }
-            ((real *)&pixels.behind[b])[lane] = sum;
-        }
+        pixels.transmittance[b] = transmittance_at_first(&grid, b, &box);
+        pixels.behind[b] = load_v_pixels(image, alpha_image, v_image, v_alpha_image, &box, width, b, pixels.sums[b]);
     }
 
     const uint begin = tile_ranges[2 * t], end = tile_ranges[2 * t + 1];

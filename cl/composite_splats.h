@@ -25,6 +25,19 @@ static inline Outline outline_of(real2 centre, real2 extent, real3 conic, real l
 }
 #endif
 
+#if !RAYS
+// u_x, u_y and v_y of a splat (composite.h). The determinant of a needle's conic is a small difference: it is computed
+// without cancellation (Kahan; see Jeannerod et al. 2013, "Further analysis of Kahan's algorithm"), and not below what
+// the rounding of the conic leaves uncertain.
+static inline real3 factor_of(real3 conic) {
+    const real half_log2_e = (real)(0.5 * LOG2_E), square = conic.y * conic.y;
+    const real det = fma(conic.x, conic.z, -square) - fma(conic.y, conic.y, -square);
+    const real u_x = sqrt(half_log2_e * conic.x), least = EPSILON * conic.z, rest = det / conic.x;
+    return conic.x > 0 ? (real3)(u_x, half_log2_e * conic.y / u_x, sqrt(half_log2_e * GREATER(rest, least)))
+                       : (real3)0;
+}
+#endif
+
 __kernel void composite_pack(const uint n, const __global real *means2d, const __global real *conics,
                              const __global real *extents, const __global real *opacities, const __global real *colors
 #if RAYS
@@ -47,6 +60,10 @@ __kernel void composite_pack(const uint n, const __global real *means2d, const _
     s.outline = outline_of(load2(means2d, i), load2(extents, i), load3(conics, i), s.level);
 #else
     const real3 conic = load3(conics, i);
+    const real3 factor = factor_of(conic);
+    s.u_x = factor.x;
+    s.u_y = factor.y;
+    s.v_y = factor.z;
     s.half_height = extents[2 * i + 1];
     s.at_right = -conic.y / conic.z * extents[2 * i];
 #endif
@@ -63,9 +80,11 @@ __kernel void composite_pack(const uint n, const __global real *means2d, const _
     s.x = means2d[2 * i];
     s.y = means2d[2 * i + 1];
 #endif
+#if RAYS
     s.a = (real)(-0.5 * LOG2_E) * conic.x;
     s.b = (real)-LOG2_E * conic.y;
     s.c = (real)(-0.5 * LOG2_E) * conic.z;
+#endif
     for (int k = 0; k < CHANNELS; ++k)
         s.color[k] = colors[CHANNELS * i + k];
     splats[i] = s;
@@ -95,11 +114,17 @@ __kernel void composite_sum(const uint n, const __global uint *first_slots, cons
     const real2 v_mean = -(real2)(conic.x * total[1] + conic.y * total[2] + row[5] * total[6],
                                   conic.y * total[1] + conic.z * total[2] + row[6] * total[6]);
     const real3 v_slope = (real3)(total[7], total[8], total[9]);
-#else
-    const real3 conic = load3(conics, g);
-    const real2 v_mean = -(real2)(conic.x * total[1] + conic.y * total[2], conic.y * total[1] + conic.z * total[2]);
-#endif
     const real3 v_conic = (real3)((real)0.5 * total[3], total[4], (real)0.5 * total[5]);
+#else
+    // dy = v/v_y and dx = u/u_x - turn v, and sigma = ln(2) (u^2 + v^2).
+    const real3 factor = factor_of(load3(conics, g));
+    const real inv_x = 1 / factor.x, inv_y = 1 / factor.z, turn = factor.y * inv_x * inv_y;
+    const real2 v_mean =
+        (real)(-2 / LOG2_E) * (real2)(factor.x * total[1], factor.y * total[1] + factor.z * total[2]);
+    const real3 v_conic =
+        (real3)((real)0.5 * (inv_x * inv_x * total[3] - 2 * inv_x * turn * total[4] + turn * turn * total[5]),
+                inv_y * (inv_x * total[4] - turn * total[5]), (real)0.5 * inv_y * inv_y * total[5]);
+#endif
     const real v_opacity = begin < end ? -total[0] / opacities[g] : 0;
     // Gradients that overflow are set to 0: they would stay in the statistics of densification.
     real any = v_mean.x + v_mean.y + v_conic.x + v_conic.y + v_conic.z + v_opacity;

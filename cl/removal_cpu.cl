@@ -35,41 +35,34 @@ __kernel void removal(const int width, const int height, const __global Splat *s
                       const __global uint *tile_ranges, const __global uint *slots, const __global real *background,
                       const __global real *residuals, const __global uchar *mask, __global real *records DIRECTIONS) {
     const uint t = get_global_id(0);
-    const int tiles_x = (width + TILE - 1) / TILE;
-    const int x0 = t % tiles_x * TILE, y0 = t / tiles_x * TILE;
-    const int rows = LESSER(TILE, height - y0), columns = LESSER(TILE, width - x0);
+    const Box box = tile_box(t, width, height);
 
     // `counts` is 1 in pixels that count and 0 elsewhere.
     Grid grid = pixel_grid();
-    LOAD_DIRECTIONS(grid)
+    LOAD_DIRECTIONS(grid, &box)
     BlockPixels pixels[BLOCKS]; // with the colour behind the present splat, after composite_tile
     REALV residual[BLOCKS][CHANNELS], squared[BLOCKS], counts[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) {
-        pixels[b] = pixels_at_first(&grid, b, rows, columns);
-        squared[b] = counts[b] = 0;
-        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) residual[b][k] = 0;
-    }
-    for (int r = 0; r < rows; ++r) {
-        const size_t first = (size_t)(y0 + r) * width + x0;
-        for (int x = 0; x < columns; ++x) {
-            const int b = block_of(x, r), lane = lane_of(x, r);
-            if (!mask[first + x])
-                continue;
-            ((real *)&counts[b])[lane] = 1;
-            _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
-                const real r = residuals[CHANNELS * (first + x) + k];
-                ((real *)&residual[b][k])[lane] = r;
-                ((real *)&squared[b])[lane] += r * r;
-            }
+        pixels[b] = pixels_at_first(&grid, b, &box);
+        load_block(residuals, CHANNELS, &box, width, b, residual[b]);
+        counts[b] = 0;
+        for (int lane = 0; lane < LANES; ++lane) {
+            if (lane_inside(&box, b, lane) && mask[lane_pixel(&box, width, b, lane)])
+                ((real *)&counts[b])[lane] = 1;
+        }
+        squared[b] = 0;
+        _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
+            residual[b][k] = counts[b] > 0 ? residual[b][k] : (REALV)0;
+            squared[b] += residual[b][k] * residual[b][k];
         }
     }
 
     const uint begin = tile_ranges[2 * t], end = tile_ranges[2 * t + 1];
-    composite_tile(&grid, splats, gauss_ids, begin, end, x0, y0, STOP, pixels);
+    composite_tile(&grid, splats, gauss_ids, begin, end, &box, STOP, pixels);
     for (int b = 0; b < BLOCKS; ++b) {
         _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pixels[b].color[k] +=
             ABSOLUTE(pixels[b].transmittance) * background[k];
-        pixels[b].transmittance = transmittance_at_first(&grid, b, rows, columns);
+        pixels[b].transmittance = transmittance_at_first(&grid, b, &box);
     }
 
     Batch batch;
@@ -78,23 +71,20 @@ __kernel void removal(const int width, const int height, const __global Splat *s
         const Blocks unfinished = unfinished_blocks(&pixels->transmittance, sizeof(BlockPixels) / sizeof(REALV));
         if (!unfinished)
             break;
-        const uint count = load_batch(splats, gauss_ids, first, end, x0, y0, &batch);
+        const uint count = load_batch(splats, gauss_ids, first, end, &box, &batch);
         for (uint j = 0; j < count; ++j) {
             fetch_splat(splats, gauss_ids, first + BATCH + j, end);
             const Splat *s = &batch.splats[j];
-            const Corner corner = corner_from(s, x0, y0);
+            const Sight sight = sight_from(s, &box);
             REALV difference = 0, agreement = 0, weights = 0, squares = 0, shares = 0, pairs = 0;
             REALV pulls[CHANNELS];
             _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) pulls[k] = 0;
             for (Blocks blocks = unfinished & blocks_of(&batch, j); blocks;) {
-                const uint b = take_block(&blocks);
-                const Offset o = offset_in(&grid, b, s, corner);
-                Bend bend;
-                const REALV exponent = splat_exponent(s, &o, &bend);
-                REALV alpha = POWERV(exponent);
+                const Visit visit = next_visit(&grid, s, &sight, &blocks);
+                const uint b = visit.block;
+                const REALV alpha = visit.alpha;
                 MASKV live;
-                const REALV weight =
-                    splat_over(splat_seen(s, exponent), STOP, &alpha, &live, &pixels[b].transmittance);
+                const REALV weight = splat_over(alpha, STOP, &live, &pixels[b].transmittance);
                 const REALV ratio = live ? alpha / (1 - alpha) : (REALV)0;
                 _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) {
                     const REALV part = weight * s->color[k];

@@ -74,9 +74,10 @@ removal(const int width, const int height, const __global Splat *splats, const _
                 const Offset offset = offset_of(pixel, DIRECTIONS_OF((size_t)pixel.y * width + pixel.x), &s);
                 Bend bend;
                 const real t = splat_exponent(&s, &offset, &bend);
-                real alpha = exp2(t), after = transmittance[p];
+                const real alpha = splat_alpha(splat_seen(&s, t), exp2(t));
+                real after = transmittance[p];
                 int live;
-                const real weight = splat_over(splat_seen(&s, t), (real)STOP, &alpha, &live, &after);
+                const real weight = splat_over(alpha, (real)STOP, &live, &after);
                 any_live |= live;
                 transmittance[p] = after;
                 if (weight > 0) {
