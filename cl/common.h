@@ -42,6 +42,9 @@ typedef int16 mask16;
 #define EPSILON FLT_EPSILON
 #endif
 
+// For functions that a compiler would call: arguments would pass through memory, and loops would have no constant ends.
+#define INLINED static inline __attribute__((always_inline))
+
 #define CONCATENATE_(a, b) a##b
 #define CONCATENATE(a, b)  CONCATENATE_(a, b)
 

@@ -122,17 +122,16 @@ static inline size_t lane_pixel(const Box *box, int width, uint b, int lane) {
 }
 
 // Copies the `count` numbers of a pixel.
-static inline void load_lane(const __global real *pixel, int count, int lane, REALV *block) {
+INLINED void load_lane(const __global real *pixel, int count, int lane, REALV *block) {
     _Pragma("unroll") for (int k = 0; k < count; ++k)((real *)&block[k])[lane] = pixel[k];
 }
 
-static inline void store_lane(const REALV *block, int count, int lane, __global real *pixel) {
+INLINED void store_lane(const REALV *block, int count, int lane, __global real *pixel) {
     _Pragma("unroll") for (int k = 0; k < count; ++k) pixel[k] = LANE(block[k], lane);
 }
 
 // Reads `count` numbers of each pixel of a block; those of pixels outside the image are 0.
-static inline void load_block(const __global real *values, int count, const Box *box, int width, uint b,
-                              REALV *block) {
+INLINED void load_block(const __global real *values, int count, const Box *box, int width, uint b, REALV *block) {
     if (lane_inside(box, b, LANES - 1)) {
         _Pragma("unroll") for (int lane = 0; lane < LANES; ++lane)
             load_lane(values + count * lane_pixel(box, width, b, lane), count, lane, block);
@@ -146,8 +145,7 @@ static inline void load_block(const __global real *values, int count, const Box 
     }
 }
 
-static inline void store_block(const REALV *block, int count, const Box *box, int width, uint b,
-                               __global real *values) {
+INLINED void store_block(const REALV *block, int count, const Box *box, int width, uint b, __global real *values) {
     if (lane_inside(box, b, LANES - 1)) {
         _Pragma("unroll") for (int lane = 0; lane < LANES; ++lane)
             store_lane(block, count, lane, values + count * lane_pixel(box, width, b, lane));
@@ -160,8 +158,8 @@ static inline void store_block(const REALV *block, int count, const Box *box, in
 }
 
 // Writes the image and its alpha in a block of composited pixels.
-static inline void store_pixels(REALV transmittance, const REALV *sums, const __global real *background,
-                                const Box *box, int width, uint b, __global real *image, __global real *alpha_image) {
+INLINED void store_pixels(REALV transmittance, const REALV *sums, const __global real *background, const Box *box,
+                          int width, uint b, __global real *image, __global real *alpha_image) {
     const REALV left = ABSOLUTE(transmittance), alpha = 1 - left;
     REALV color[CHANNELS];
     _Pragma("unroll") for (int k = 0; k < CHANNELS; ++k) color[k] = sums[k] + left * background[k];
@@ -171,9 +169,9 @@ static inline void store_pixels(REALV transmittance, const REALV *sums, const __
 
 // Reads the gradients of a block of the image into v_color. Returns S of each pixel before the first splat
 // (composite_cpu.cl).
-static inline REALV load_v_pixels(const __global real *image, const __global real *alpha_image,
-                                  const __global real *v_image, const __global real *v_alpha_image, const Box *box,
-                                  int width, uint b, REALV *v_color) {
+INLINED REALV load_v_pixels(const __global real *image, const __global real *alpha_image,
+                            const __global real *v_image, const __global real *v_alpha_image, const Box *box,
+                            int width, uint b, REALV *v_color) {
     REALV color[CHANNELS], alpha, v_alpha;
     load_block(image, CHANNELS, box, width, b, color);
     load_block(alpha_image, 1, box, width, b, &alpha);

@@ -394,9 +394,6 @@ typedef struct {
     const __global real *v_opacities, *v_colors;
 } SplatArrays;
 
-// A call instead would pass structs through the memory of each work-item; Clang for NVIDIA's GPUs would make one.
-#define INLINED static inline __attribute__((always_inline))
-
 // Gradients of the Gaussians from i on, and the basis of their spherical harmonics; 0 for those that are not visible.
 INLINED GaussianGrad gaussian_vjp(size_t i, size_t n, const Camera *camera, int sh_stride, int sh_degree,
                                   GaussianArrays gaussians, SplatArrays splats, reals *basis) {
