@@ -374,6 +374,18 @@ static inline void fetch_splat(const __global Splat *splats, const __global uint
     }
 }
 
+// Number of splats between the prefetch of a record and its writing.
+#define AHEAD 8
+
+// Prefetches the record, of `size` reals, that is written AHEAD splats after that of entry i.
+static inline void fetch_record(__global real *records, int size, const __global uint *slots, uint i, uint end) {
+    if (i + AHEAD < end) {
+        __global real *record = records + (size_t)size * slots[i + AHEAD];
+        FETCH_TO_WRITE(record);
+        FETCH_TO_WRITE(record + size - 1);
+    }
+}
+
 // Loads up to BATCH splats, beginning with the entry `first` of the list. Returns their number.
 static inline uint load_batch(const __global Splat *splats, const __global uint *gauss_ids, uint first, uint end,
                               const Box *box, Batch *batch) {

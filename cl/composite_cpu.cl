@@ -51,9 +51,6 @@ __kernel void composite_fwd(const int width, const int height, const __global Sp
         store_pixels(pixels[b].transmittance, pixels[b].color, background, &box, width, b, image, alpha_image);
 }
 
-// Number of splats between the prefetch of a record and its writing.
-#define AHEAD 8
-
 // The pixels of a block in the backward pass.
 typedef struct {
     REALV transmittance, behind, v_color[CHANNELS];
@@ -112,11 +109,7 @@ __kernel void composite_bwd(const int width, const int height, const __global Sp
         const uint count = load_batch(splats, gauss_ids, first, end, &box, &batch);
         for (uint j = 0; j < count; ++j) {
             fetch_splat(splats, gauss_ids, first + BATCH + j, end);
-            if (first + j + AHEAD < end) {
-                __global real *later = records + (size_t)RECORD * slots[first + j + AHEAD];
-                FETCH_TO_WRITE(later);
-                FETCH_TO_WRITE(later + RECORD - 1);
-            }
+            fetch_record(records, RECORD, slots, first + j, end);
             const Splat *s = &batch.splats[j];
             Blocks blocks = unfinished & blocks_of(&batch, j);
             SplatSums sums = NO_SUMS;

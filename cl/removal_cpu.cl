@@ -74,6 +74,7 @@ __kernel void removal(const int width, const int height, const __global Splat *s
         const uint count = load_batch(splats, gauss_ids, first, end, &box, &batch);
         for (uint j = 0; j < count; ++j) {
             fetch_splat(splats, gauss_ids, first + BATCH + j, end);
+            fetch_record(records, SUMS, slots, first + j, end);
             const Splat *s = &batch.splats[j];
             const Sight sight = sight_from(s, &box);
             REALV difference = 0, agreement = 0, weights = 0, squares = 0, shares = 0, pairs = 0;
