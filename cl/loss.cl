@@ -127,6 +127,9 @@ static inline void fetch(int length, int row, int column, const __global real *i
     fetch_value(length, begin, column, image, photo, masked, mask, x, y);
 #else
     if (column >= 0 && column + LANES <= length && !masked) {
+        // Of the next row: processors do not foresee reads in another page.
+        FETCH_TO_READ(image + begin + length + column);
+        FETCH_TO_READ(photo + begin + length + column);
         VECTOR(__private, x) = VECTOR(const __global, image + begin + column);
         VECTOR(__private, y) = load_photo(photo + begin + column);
         return;
@@ -292,6 +295,8 @@ __kernel void loss_grad(const int width, const int height, const int band, const
             Derivatives d = {0, 0, 0};
             if (row >= 0 && row < height) {
                 const __global real *in = derivatives + (size_t)row * 3 * pitch + MARGIN + c;
+                for (int next = 3; next < 6; ++next)
+                    FETCH_TO_READ(in + next * pitch);
 #pragma unroll
                 for (int k = 0; k < WINDOW; ++k) {
                     const int tap = 3 * (k - RADIUS);
