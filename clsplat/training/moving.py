@@ -28,7 +28,7 @@ TIMES = (0.2, 0.3, 0.4, 0.6)
 """Fractions of the iterations after which photos are looked through. Each time decides anew, from all their pixels:
 what seemed to move because it was not trained yet comes back."""
 
-EARLIEST = 100
+EARLIEST = 200
 """First iteration after which photos are looked through: before, the scene has learned too little."""
 
 SAMPLE = 60
