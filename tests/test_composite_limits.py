@@ -99,6 +99,22 @@ def test_an_indefinite_conic_is_taken_for_a_needle(any_device, compositor):
     assert all(np.isfinite(a).all() for a in v)
 
 
+def test_a_needle_is_as_long_as_its_conic_says(any_device, compositor):
+    """The determinant of its conic is 1/130000 of the products that it is the difference of."""
+    along, across = np.array([np.cos(0.7), np.sin(0.7)]), np.array([-np.sin(0.7), np.cos(0.7)])
+    cov = 400**2 * np.outer(along, along) + 0.55**2 * np.outer(across, across)
+    splats = handmade([(256.5, 256.5)], cov, [0.9], [[1, 1, 1]])
+    splats = splats._replace(conics=splats.conics.astype(np.float32).astype(np.float64))
+    image = forward(any_device, compositor, splats, reference.bin_splats(splats, 512, 512, 16), (0.0, 0.0, 0.0))
+    y, x = np.indices((512, 512)) - 256.0
+    a, b, c = splats.conics[0]
+    expected = 0.9 * np.exp(-0.5 * (a * x * x + c * y * y) - b * x * y)
+    drawn = expected > 1.01 * ALPHA_MIN
+    assert drawn.sum() > 1000
+    # Rounding leaves 1e-5; a determinant that cancels is off by 4e-4.
+    np.testing.assert_allclose(image.alpha[drawn], expected[drawn], atol=5e-5)
+
+
 def test_same_bits_twice_and_the_same_image_for_every_tiling(device, compositor):
     splats, width, height = make_splats(200, 6)
     bins = {t: reference.bin_splats(splats, width, height, t) for t in (8, 16, 32)}
