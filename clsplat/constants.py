@@ -15,8 +15,9 @@ LOG2_ALPHA_MIN = log2(ALPHA_MIN)
 """Base-2 logarithm of ALPHA_MIN. The compositing kernels compare exponents of two."""
 
 EXPONENT_SLACK = 1e-5
-"""Largest excess of alpha's exponent of two over that of the opacity, along rays. It covers the rounding of float32 at
-sigma = 0. A larger excess means sigma < 0, which only an indefinite conic yields; such pairs are skipped (original)."""
+"""Largest excess of alpha's exponent of two over that of the opacity, along rays. It covers the rounding of float32
+at sigma = 0. A larger excess means sigma < 0, which only an indefinite conic yields; such pairs are skipped
+(original)."""
 
 ALPHA_MAX = 0.99
 """Largest alpha. It is clamped so that 1/(1 - alpha) stays bounded in the backward pass (original)."""

@@ -9,9 +9,9 @@ from clsplat.device import GROUP, Device
 RADIUS = len(SSIM_TAPS) // 2
 TAPS = ",".join(map(repr, SSIM_TAPS))
 
-# Number of values per vector, and number of neighbouring vectors per work-item. Long runs repeat fewer values of their
-# neighbours; the blurred rows of ten vectors fit in the nearest cache of a CPU. On a GPU, neighbouring work-items should
-# access neighbouring values.
+# Number of values per vector, and number of neighbouring vectors per work-item. Long runs repeat fewer values of
+# their neighbours; the blurred rows of ten vectors fit in the nearest cache of a CPU. On a GPU, neighbouring
+# work-items should access neighbouring values.
 CPU_SHAPE = {"LANES": 16, "VECTORS": 10}
 GPU_SHAPE = {"LANES": 1, "VECTORS": 1}
 
