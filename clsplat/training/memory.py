@@ -53,7 +53,7 @@ PER_INTERSECTION_DEPTH = 1
 PER_PIXEL_DEPTH = 1 + 3 + 4 + 1  # the image's fourth channel, its colours apart, v_image with depth, inverse depths
 PER_PIXEL_EXPOSURE = 3  # the image with the colours of its photo
 PER_PIXEL_CHARTS = 3  # directions of rays
-PER_ROW = 3 * 416  # derivatives of SSIM: rows have margins, and end with a work-item
+PER_ROW = 3 * 192  # derivatives of SSIM: rows have margins, and end with a work-item
 
 COPIES = 3
 """Copies of all parameters: themselves and Adam's two moments."""
