@@ -104,9 +104,11 @@ typedef float Lanes8 __attribute__((vector_size(32))); // built-in functions of 
 #define ROOT(x)   sqrt(x)
 #define ROOT16(x) ((real16)(ROOT8((x).lo), ROOT8((x).hi)))
 
-// Prefetches memory to read or to write, where a processor does not foresee the addresses. Only for kernels on the host's processor, where
-// addresses are ordinary pointers.
-#define FETCHED ((int)(64 / sizeof(real))) // reals that come at once: a cache line
+// Reals of a cache line, which come at once.
+#define LINE ((int)(64 / sizeof(real)))
+
+// Prefetches memory to read or to write, where a processor does not foresee the addresses. Only for kernels on the
+// host's processor, where addresses are ordinary pointers.
 #if defined(__clang__) && (defined(__x86_64__) || defined(__aarch64__))
 #define FETCH_TO_READ(p)  __builtin_prefetch((const void *)(size_t)(p))
 #define FETCH_TO_WRITE(p) __builtin_prefetch((const void *)(size_t)(p), 1)

@@ -96,9 +96,9 @@ static inline REALV splat_alpha(MASKV seen, REALV power) {
     return seen ? clamped : (REALV)0;
 }
 
-// Composites a splat over a group of pixels. A pixel whose transmittance would fall to `stop` or below is finished: its transmittance stays the same, and is stored
-// negated from then on. (Other pixels have a transmittance above `stop`.) Returns the weight alpha T, which is 0
-// where the splat is not drawn. *live: the pixels that are not finished.
+// Composites a splat over a group of pixels. A pixel whose transmittance would fall to `stop` or below is finished: its
+// transmittance stays the same, and is stored negated from then on. (Other pixels have a transmittance above `stop`.)
+// Returns the weight alpha T, which is 0 where the splat is not drawn. *live: the pixels that are not finished.
 static inline REALV splat_over(REALV alpha, real stop, MASKV *live, REALV *transmittance) {
     const REALV before = *transmittance, weight = alpha * before, behind = before - weight;
     *live = behind > (REALV)stop;

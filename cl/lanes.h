@@ -81,7 +81,7 @@ static inline real lane_sum(reals v) {
 static inline void fetch_ahead(const __global real *x, int count) {
 #if LANES == 8
 #pragma unroll
-    for (int k = 0; k < LANES * count; k += FETCHED)
+    for (int k = 0; k < LANES * count; k += LINE)
         FETCH_TO_READ(x + 2 * LANES * count + k);
 #endif
 }

@@ -260,7 +260,7 @@ static inline void fetch_coefficients(const __global real *sh, size_t i, size_t 
         return;
     for (int lane = 0; lane < LANES; ++lane) {
         const __global real *row = sh + 3 * (i + 2 * LANES + lane) * stride;
-        for (int k = 0; k < 3 * count; k += FETCHED)
+        for (int k = 0; k < 3 * count; k += LINE)
             FETCH_TO_READ(row + k);
     }
 #endif
