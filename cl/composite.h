@@ -74,13 +74,13 @@ typedef struct {
     { 0, 0, 0, 0, 0, 0 }
 
 static inline void add_moments(const Offset *o, const Bend *bend, REALV v_sigma, Moments *m) {
-    const REALV u_sigma = o->u * v_sigma, v_sigma_v = o->v * v_sigma;
+    const REALV by_u = o->u * v_sigma, by_v = o->v * v_sigma;
     m->m += v_sigma;
-    m->mu += u_sigma;
-    m->mv += v_sigma_v;
-    m->muu += o->u * u_sigma;
-    m->muv += o->u * v_sigma_v;
-    m->mvv += o->v * v_sigma_v;
+    m->mu += by_u;
+    m->mv += by_v;
+    m->muu += o->u * by_u;
+    m->muv += o->u * by_v;
+    m->mvv += o->v * by_v;
 }
 
 // A record holds the sums of one splat and one tile: the moments, then those of weight v_image.
