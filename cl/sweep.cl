@@ -7,21 +7,23 @@
 //   q = that of the largest score, refined by the parabola through it and its neighbours
 // See docs/stages/sweep.md; clsplat/reference/sweep.py is the twin.
 //
-// Mapping: one work-item per number (sweep_pad, sweep_windows), per number of each plane (sweep_warp), per LANES columns
-// of ROWS rows on each plane (sweep_similarity), and per pixel (sweep_best). The sums of a row serve all windows that it
-// is in.
+// Mapping: one work-item per number (sweep_pad, sweep_windows), per LANES columns of a row (sweep_textured, sweep_warp),
+// per LANES columns of ROWS rows on each plane (sweep_scores), and per pixel (sweep_best). The sums of a row serve all
+// windows that it is in. Sources are resampled on a few planes at a time, `count` from plane `first` on, and compared
+// before they leave the cache.
 //
 // Buffers, H x W pixels, S sources, D planes; rows have `stride` numbers, of which the first PAD and the last are 0:
 //   in   photo[H,W], grey in [0, 1]; source[rows,columns] grey; maps[S,12], A (row-major) and b for positions in pixels,
 //        with centres at +0.5; planes[D] inverse depths, ascending
 //   out  padded[H,stride], the photo; windows[2,H,stride], its mean and variance in the window around each pixel;
-//        warped[D,H,stride], grey, or OUTSIDE where the source does not show the position;
-//        pairs[2,D,H,W], the two largest similarities so far, -1 where the window leaves the photo or the source, or
-//        the photo is flat; inverse[H,W]; scores[H,W], -1 where the best plane is the first or the last one
+//        textured[H,stride/LANES]; warped[S,count,H,stride], grey, or OUTSIDE where the source does not show the
+//        position, undefined where nothing is textured;
+//        scores[D,H,W], where similarities are -1 if the window leaves the photo or the source, or the photo is flat;
+//        inverse[H,W]; largest[H,W], -1 where the best plane is the first or the last one
 // -DRADIUS        half of the window, px, less than PAD
 // -DVARIANCE_MIN  least variance of the photo in a window, and e
-// -DLANES=1|8     columns per work-item of sweep_similarity
-// -DROWS          rows per work-item of sweep_similarity
+// -DLANES=1|8     columns per work-item
+// -DROWS          rows per work-item of sweep_scores
 #include "common.h"
 
 #if !defined(RADIUS) || !defined(VARIANCE_MIN) || !defined(LANES) || !defined(ROWS)
@@ -38,11 +40,13 @@
 
 #if LANES == 8
 typedef real8 reals;
+typedef real16 Pairs;
 typedef mask8 masks;
 #define COLUMNS_FROM(x) ((reals)(0, 1, 2, 3, 4, 5, 6, 7) + (x))
 #define ROOTS(x)        ROOT8(x)
 #elif LANES == 1
 typedef real reals;
+typedef real2 Pairs;
 typedef int masks;
 #define COLUMNS_FROM(x) ((reals)(x))
 #define ROOTS(x)        ROOT(x)
@@ -54,6 +58,10 @@ typedef int masks;
 typedef struct __attribute__((packed)) {
     reals v;
 } Vector;
+typedef struct __attribute__((packed)) {
+    real2 v;
+} Pair;
+#define PAIR(p)     (((const __global Pair *)(p))->v)
 #define LOAD(p)     (((const __global Vector *)(p))->v)
 #define STORE(p, x) (((__global Vector *)(p))->v = (x))
 #define LANE(v, i)  (((real *)&(v))[i])
@@ -83,38 +91,55 @@ __kernel void sweep_windows(const int width, const int height, const int stride,
     windows[(size_t)height * stride + i] = SHARE * squares - mean * mean;
 }
 
+// Whether a window that is not flat has a pixel in LANES columns of a row. Other pixels need no comparison.
+__kernel void sweep_textured(const int height, const int stride, const __global real *windows,
+                             __global uchar *textured) {
+    const int x = (int)(LANES * get_global_id(0)), y = get_global_id(1);
+    const __global real *variances = windows + (size_t)height * stride;
+    bool any = false;
+    for (int row = GREATER(y - RADIUS, 0); row <= LESSER(y + RADIUS, height - 1); ++row)
+        for (int column = GREATER(x - RADIUS, 0); column < LESSER(x + LANES + RADIUS, stride); ++column)
+            any |= variances[(size_t)row * stride + column] >= (real)VARIANCE_MIN;
+    textured[y * (stride / LANES) + x / LANES] = any;
+}
+
 __kernel void sweep_warp(const int width, const int height, const int stride, const int columns, const int rows,
                          const __global real *source, const uint s, const __global real *maps,
-                         const __global real *planes, __global real *warped) {
+                         const __global real *planes, const uint first, const uint count,
+                         const __global uchar *textured, __global real *warped) {
     const int x = (int)(LANES * get_global_id(0)) - PAD, y = get_global_id(1);
-    const size_t d = get_global_id(2);
+    if (!textured[y * (stride / LANES) + get_global_id(0)])
+        return;
     const __global real *m = maps + 12 * s;
-    const reals column = COLUMNS_FROM((real)x), px = column + (real)0.5;
-    const real py = y + (real)0.5, q = planes[d];
-    const reals z = m[6] * px + (m[7] * py + m[8] + q * m[11]);
-    const reals u = (m[0] * px + (m[1] * py + m[2] + q * m[9])) / z - (real)0.5;
-    const reals v = (m[3] * px + (m[4] * py + m[5] + q * m[10])) / z - (real)0.5;
-    // Comparisons with NaN are false.
-    const masks shown =
-        (z > (real)0) & (u >= (real)0) & (v >= (real)0) & (u <= (real)(columns - 1)) & (v <= (real)(rows - 1));
+    const reals column = COLUMNS_FROM((real)x), px = column + (real)0.5, zero = 0, outside = OUTSIDE;
     const masks inside = (column >= (real)0) & (column < (real)width);
-    const reals zero = 0, outside = OUTSIDE;
-    const reals u_max = LESSER(shown ? u : zero, (reals)(real)(columns - 2));
-    const reals v_max = LESSER(shown ? v : zero, (reals)(real)(rows - 2));
-    reals right, low, c00, c01, c10, c11;
-    for (int lane = 0; lane < LANES; ++lane) {
-        const int left = LANE(u_max, lane), top = LANE(v_max, lane);
-        const __global real *corner = &source[top * columns + left];
-        LANE(right, lane) = LANE(u, lane) - left;
-        LANE(low, lane) = LANE(v, lane) - top;
-        LANE(c00, lane) = corner[0];
-        LANE(c01, lane) = corner[1];
-        LANE(c10, lane) = corner[columns];
-        LANE(c11, lane) = corner[columns + 1];
+    const real py = y + (real)0.5;
+    const reals u_0 = m[0] * px + (m[1] * py + m[2]), v_0 = m[3] * px + (m[4] * py + m[5]);
+    const reals z_0 = m[6] * px + (m[7] * py + m[8]);
+    for (uint d = 0; d < count; ++d) {
+        const real q = planes[first + d];
+        const reals z = z_0 + q * m[11];
+        const reals u = (u_0 + q * m[9]) / z - (real)0.5, v = (v_0 + q * m[10]) / z - (real)0.5;
+        // Comparisons with NaN are false.
+        const masks shown =
+            (z > (real)0) & (u >= (real)0) & (v >= (real)0) & (u <= (real)(columns - 1)) & (v <= (real)(rows - 1));
+        const reals u_max = LESSER(shown ? u : zero, (reals)(real)(columns - 2));
+        const reals v_max = LESSER(shown ? v : zero, (reals)(real)(rows - 2));
+        reals right, low;
+        Pairs uppers, lowers; // of neighbours in a row: gathering single numbers takes longer
+        _Pragma("unroll") for (int lane = 0; lane < LANES; ++lane) {
+            const int left = LANE(u_max, lane), top = LANE(v_max, lane);
+            const __global real *corner = &source[top * columns + left];
+            LANE(right, lane) = LANE(u, lane) - left;
+            LANE(low, lane) = LANE(v, lane) - top;
+            ((real2 *)&uppers)[lane] = PAIR(corner);
+            ((real2 *)&lowers)[lane] = PAIR(corner + columns);
+        }
+        const reals upper = uppers.even + right * (uppers.odd - uppers.even);
+        const reals lower = lowers.even + right * (lowers.odd - lowers.even);
+        const reals value = shown ? upper + low * (lower - upper) : outside;
+        STORE(&warped[((s * count + d) * height + y) * stride + x + PAD], inside ? value : zero);
     }
-    const reals upper = c00 + right * (c01 - c00), lower = c10 + right * (c11 - c10);
-    const reals value = shown ? upper + low * (lower - upper) : outside;
-    STORE(&warped[(d * height + y) * stride + x + PAD], inside ? value : zero);
 }
 
 // Sums over the columns of a window, of one row of it.
@@ -133,23 +158,30 @@ static inline Sums row_sums(const __global real *a_row, const __global real *b_r
     return sums;
 }
 
-__kernel void sweep_similarity(const int width, const int height, const int stride, const uint s, const uint planes,
-                               const __global real *padded, const __global real *windows, const __global real *warped,
-                               __global real *pairs) {
+__kernel void sweep_scores(const int width, const int height, const int stride, const uint sources, const uint first,
+                           const uint count, const __global real *padded, const __global real *windows,
+                           const __global uchar *textured, const __global real *warped, __global real *scores) {
     const int x = LANES * get_global_id(0), begin = ROWS * get_global_id(1), end = LESSER(begin + ROWS, height);
-    const size_t d = get_global_id(2), size = (size_t)height * stride, step = (size_t)planes * height * width;
+    const size_t d = get_global_id(2), size = (size_t)height * stride;
     const reals column = COLUMNS_FROM((real)x), least = (real)VARIANCE_MIN;
     const masks columns = (column >= (real)RADIUS) & (column < (real)(width - RADIUS));
-    const __global real *a = padded + x + PAD, *b = warped + d * size + x + PAD;
-    Sums rows[WINDOW]; // of the last rows, row y at y % WINDOW
-    for (int y = GREATER(begin - RADIUS, 0); y < LESSER(begin + RADIUS, height); ++y)
-        rows[y % WINDOW] = row_sums(a + (size_t)y * stride, b + (size_t)y * stride);
-    for (int y = begin; y < end; ++y) {
-        const int next = y + RADIUS;
-        if (next < height)
+    const __global real *a = padded + x + PAD;
+    reals most[ROWS], second[ROWS]; // the two largest similarities so far
+    for (int i = 0; i < ROWS; ++i)
+        most[i] = second[i] = -1;
+    bool any = false;
+    for (int y = begin; y < end; ++y)
+        any |= textured[(y * stride + x + PAD) / LANES];
+    for (uint s = 0; any && s < sources; ++s) {
+        const __global real *b = warped + (s * count + d) * size + x + PAD;
+        Sums rows[WINDOW]; // of the last rows, row y at y % WINDOW
+        for (int y = GREATER(begin - RADIUS, 0); y < LESSER(begin + RADIUS, height); ++y)
+            rows[y % WINDOW] = row_sums(a + (size_t)y * stride, b + (size_t)y * stride);
+        for (int y = begin; y < LESSER(end, height - RADIUS); ++y) {
+            const int next = y + RADIUS;
             rows[next % WINDOW] = row_sums(a + (size_t)next * stride, b + (size_t)next * stride);
-        reals similarity = -1;
-        if (y >= RADIUS && next < height) {
+            if (y < RADIUS)
+                continue;
             reals sum_b = 0, sum_ab = 0, sum_bb = 0;
             _Pragma("unroll") for (int j = 0; j < WINDOW; ++j) {
                 sum_b += rows[j].b;
@@ -157,39 +189,37 @@ __kernel void sweep_similarity(const int width, const int height, const int stri
                 sum_bb += rows[j].bb;
             }
             const __global real *window = windows + (size_t)y * stride + x + PAD;
-            const reals mean_a = LOAD(window), var_a = LOAD(window + size);
+            const reals mean_a = LOAD(window), var_a = LOAD(window + size), none = -1;
             const reals mean_b = SHARE * sum_b, var_b = SHARE * sum_bb - mean_b * mean_b;
             const reals root = ROOTS(GREATER(var_a, least) * GREATER(var_b, least));
             const masks known = columns & (var_a >= least) & (sum_b < (reals)(real)(OUTSIDE / 2));
-            similarity = known ? (SHARE * sum_ab - mean_a * mean_b) / root : similarity;
+            const reals similarity = known ? (SHARE * sum_ab - mean_a * mean_b) / root : none;
+            const reals previous = most[y - begin];
+            most[y - begin] = GREATER(previous, similarity);
+            second[y - begin] = similarity > previous ? previous : GREATER(second[y - begin], similarity);
         }
-        __global real *row = &pairs[(d * height + y) * width + x];
+    }
+    for (int y = begin; y < end; ++y) {
+        reals score = (real)0.5 * (most[y - begin] + second[y - begin]);
+        __global real *row = &scores[((first + d) * height + y) * width + x];
         if (x + LANES <= width) {
-            const reals first = s ? LOAD(row) : (reals)-1, second = s ? LOAD(row + step) : (reals)-1;
-            STORE(row, GREATER(first, similarity));
-            STORE(row + step, similarity > first ? first : GREATER(second, similarity));
+            STORE(row, score);
         } else {
-            for (int lane = 0; x + lane < width; ++lane) {
-                const real value = LANE(similarity, lane);
-                const real first = s ? row[lane] : -1, second = s ? row[step + lane] : -1;
-                row[lane] = GREATER(first, value);
-                row[step + lane] = value > first ? first : GREATER(second, value);
-            }
+            for (int lane = 0; x + lane < width; ++lane)
+                row[lane] = LANE(score, lane);
         }
     }
 }
 
-__kernel void sweep_best(const uint pixels, const uint count, const __global real *pairs, const __global real *planes,
-                         __global real *inverse, __global real *scores) {
+__kernel void sweep_best(const uint pixels, const uint count, const __global real *scores,
+                         const __global real *planes, __global real *inverse, __global real *largest) {
     const size_t i = get_global_id(0);
     if (i >= pixels)
         return;
-    const __global real *first = pairs + i, *second = first + (size_t)count * pixels;
     uint best = 0;
-    real most = (real)0.5 * (first[0] + second[0]), before = most, after = most, last = most;
+    real most = scores[i], before = most, after = most, last = most;
     for (uint d = 1; d < count; ++d) {
-        const size_t at = d * (size_t)pixels;
-        const real score = (real)0.5 * (first[at] + second[at]);
+        const real score = scores[d * (size_t)pixels + i];
         after = d == best + 1 ? score : after;
         if (score > most) {
             before = last;
@@ -203,5 +233,5 @@ __kernel void sweep_best(const uint pixels, const uint count, const __global rea
     const real shift = inner && bend < 0 ? (real)0.5 * (before - after) / bend : 0;
     const uint lower = inner && shift < 0 ? best - 1 : best;
     inverse[i] = inner ? planes[best] + shift * (planes[lower + 1] - planes[lower]) : planes[best];
-    scores[i] = inner ? most : -1;
+    largest[i] = inner ? most : -1;
 }

@@ -100,6 +100,9 @@ SWEEP_RADIUS = 2
 """Half of the window in which the stage sweep compares photos, px: 5x5 pixels, as small as noise allows, since a
 window across an edge of depth has the depth of neither side."""
 
+SWEEP_PLANES = 4
+"""Planes on which the stage sweep resamples photos before it compares them: few enough that they stay in a cache."""
+
 SWEEP_VARIANCE_MIN = (3 / 255) ** 2
 """Least variance of grey values in such a window: 3 levels of 8 bits, the noise of a photo. Flat windows are alike at
 all depths."""

@@ -274,8 +274,8 @@ def test_sort(b: Bench) -> Found:
 def test_sweep(b: Bench) -> Found:
     grey, planes = b.random(HEIGHT, WIDTH), np.array([1.0, 2, 3])
     maps = np.array([[1, 0, 0, 0, 1, 0, 0, 0, 1, x, 0.4, 0] for x in (0.3, -0.3)])
-    found = b.stages.sweep_similarities(b.up(grey), [b.up(grey)] * 2, b.up(maps), b.up(planes))
-    expected = reference.sweep_similarities(grey, [grey] * 2, maps, planes)
+    found = b.stages.sweep_scores(b.up(grey), [b.up(grey)] * 2, b.up(maps), b.up(planes))
+    expected = reference.sweep_scores(grey, [grey] * 2, maps, planes)
     yield found, expected
     yield from zip(b.stages.sweep_best(found, b.up(planes)), reference.sweep_best(expected, planes), strict=True)
 

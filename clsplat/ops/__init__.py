@@ -46,7 +46,7 @@ from clsplat.ops.removal import removal, removal_residuals, removal_sums
 from clsplat.ops.scan import exclusive_scan
 from clsplat.ops.sort import argsort, argsort_segments
 from clsplat.ops.spheres import spheres
-from clsplat.ops.sweep import sweep_best, sweep_similarities
+from clsplat.ops.sweep import sweep_best, sweep_scores
 from clsplat.ops.take import take_rows
 from clsplat.ops.voxels import voxels_bwd, voxels_fwd, voxels_tv
 from clsplat.ops.weights import weights_bwd, weights_fwd
@@ -96,7 +96,7 @@ class Launches:
         self.removal_residuals = _held(removal_residuals, device)
         self.disparity_loss = _held(disparity_loss, device)
         self.disparity_grad = _held(disparity_grad, device)
-        self.sweep_similarities = _held(sweep_similarities, device)
+        self.sweep_scores = _held(sweep_scores, device)
         self.sweep_best = _held(sweep_best, device)
         self.exposure_fwd = _held(exposure_fwd, device)
         self.exposure_bwd = _held(exposure_bwd, device)

@@ -2,15 +2,16 @@
 
 from typing import Any
 
+import numpy as np
 from pyopencl.array import Array
 
-from clsplat.constants import SWEEP_RADIUS, SWEEP_VARIANCE_MIN
+from clsplat.constants import SWEEP_PLANES, SWEEP_RADIUS, SWEEP_VARIANCE_MIN
 from clsplat.device import Device
 
 # Zeros before and after each row (cl/sweep.cl), so that windows of vectors may begin outside the photo.
 PAD = 8
 
-# Rows of a work-item of sweep_similarity: windows share the sums of rows, so that more rows save additions.
+# Rows of a work-item of sweep_scores: windows share the sums of rows, so that more rows save additions.
 ROWS = 16
 
 
@@ -19,7 +20,7 @@ def _defines(device: Device) -> dict[str, Any]:
     return {"RADIUS": SWEEP_RADIUS, "VARIANCE_MIN": SWEEP_VARIANCE_MIN, "LANES": lanes, "ROWS": ROWS}
 
 
-def sweep_similarities(device: Device, photo: Array, sources: list[Array], maps: Array, planes: Array) -> Array:
+def sweep_scores(device: Device, photo: Array, sources: list[Array], maps: Array, planes: Array) -> Array:
     """Compare a photo with others that are seen through planes of constant depth.
 
     Parameters
@@ -36,35 +37,42 @@ def sweep_similarities(device: Device, photo: Array, sources: list[Array], maps:
 
     Returns
     -------
-    (2, D, H, W) real
-        The two largest of the sources' normalised cross-correlations of windows, -1 to 1; -1 where there is none.
+    (D, H, W) real
+        Mean of the two largest of the sources' normalised cross-correlations of windows, -1 to 1. A source that does
+        not show the window counts as -1, and so do all of them where the photo is flat.
     """
     (height, width), count, defines = photo.shape, len(planes), _defines(device)
-    stride = -(-width // 8) * 8 + 2 * PAD
+    lanes, stride = defines["LANES"], -(-width // 8) * 8 + 2 * PAD
     padded = device.empty("photo with margins", (height, stride))
-    device.launch("sweep", "sweep_pad", (stride, height), [width, stride, photo, padded], defines=defines)
     windows = device.empty("windows of the photo", (2, height, stride))
-    arguments: list[Any] = [width, height, stride, padded, windows]
-    device.launch("sweep", "sweep_windows", (stride, height), arguments, defines=defines)
-    warped = device.empty("photo on planes", (count, height, stride))
-    pairs = device.empty("similarities", (2, count, height, width))
-    for s, source in enumerate(sources):
-        rows, columns = source.shape
-        arguments = [width, height, stride, columns, rows, source, s, maps, planes, warped]
-        device.launch("sweep", "sweep_warp", (stride // defines["LANES"], height, count), arguments, defines=defines)
-        arguments = [width, height, stride, s, count, padded, windows, warped, pairs]
-        chunks = -(-width // defines["LANES"]), -(-height // ROWS), count
-        device.launch("sweep", "sweep_similarity", chunks, arguments, defines=defines)
-    return pairs
+    textured = device.empty("textured pixels", (height, stride // lanes), np.uint8)
+    warped = device.empty("photos on planes", (len(sources), SWEEP_PLANES, height, stride))
+    scores = device.empty("scores", (count, height, width))
+
+    def launch(kernel: str, size: tuple[int, ...], *arguments: Any) -> None:
+        device.launch("sweep", kernel, size, list(arguments), defines=defines)
+
+    launch("sweep_pad", (stride, height), width, stride, photo, padded)
+    launch("sweep_windows", (stride, height), width, height, stride, padded, windows)
+    launch("sweep_textured", (stride // lanes, height), height, stride, windows, textured)
+    chunks = -(-width // lanes), -(-height // ROWS)
+    for first in range(0, count, SWEEP_PLANES):
+        some = min(SWEEP_PLANES, count - first)
+        for s, source in enumerate(sources):
+            seen = *source.shape[::-1], source, s, maps, planes, first, some
+            launch("sweep_warp", (stride // lanes, height), width, height, stride, *seen, textured, warped)
+        compared = len(sources), first, some, padded, windows, textured, warped
+        launch("sweep_scores", (*chunks, some), width, height, stride, *compared, scores)
+    return scores
 
 
-def sweep_best(device: Device, pairs: Array, planes: Array) -> tuple[Array, Array]:
+def sweep_best(device: Device, scores: Array, planes: Array) -> tuple[Array, Array]:
     """Choose the depth of each pixel.
 
     Parameters
     ----------
-    pairs : (2, D, H, W) real
-        Of `sweep_similarities`.
+    scores : (D, H, W) real
+        Of `sweep_scores`.
     planes : (D,) real
         Inverse depths, 1/world units, ascending.
 
@@ -72,11 +80,11 @@ def sweep_best(device: Device, pairs: Array, planes: Array) -> tuple[Array, Arra
     -------
     inverse : (H, W) real
         Inverse depth with the largest score, refined between the planes, 1/world units.
-    scores : (H, W) real
-        Mean of the two largest similarities there; -1 where the best plane is the first or the last one.
+    largest : (H, W) real
+        The score there; -1 where the best plane is the first or the last one.
     """
-    _, count, height, width = pairs.shape
-    inverse, scores = (device.empty(name, (height, width)) for name in ("inverse depths", "scores"))
-    arguments: list[Any] = [height * width, count, pairs, planes, inverse, scores]
+    count, height, width = scores.shape
+    inverse, largest = (device.empty(name, (height, width)) for name in ("inverse depths", "largest scores"))
+    arguments: list[Any] = [height * width, count, scores, planes, inverse, largest]
     device.launch("sweep", "sweep_best", (height * width,), arguments, defines=_defines(device))
-    return inverse, scores
+    return inverse, largest

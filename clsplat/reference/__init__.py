@@ -41,7 +41,7 @@ from clsplat.reference.removal import removal, removal_residuals, removal_sums
 from clsplat.reference.scan import exclusive_scan
 from clsplat.reference.sort import argsort, argsort_segments
 from clsplat.reference.spheres import spheres
-from clsplat.reference.sweep import sweep_best, sweep_similarities
+from clsplat.reference.sweep import sweep_best, sweep_scores
 from clsplat.reference.take import take_rows
 from clsplat.reference.voxels import voxels_bwd, voxels_fwd, voxels_tv
 from clsplat.reference.weights import weights_bwd, weights_fwd

@@ -11,13 +11,13 @@ from clsplat.constants import SWEEP_RADIUS, SWEEP_VARIANCE_MIN
 Array = NDArray[Any]
 
 
-def sweep_similarities(photo: Array, sources: list[Array], maps: Array, planes: Array) -> Array:
-    """Compare photos on planes. Arguments and result as for `clsplat.ops.sweep_similarities`."""
+def sweep_scores(photo: Array, sources: list[Array], maps: Array, planes: Array) -> Array:
+    """Compare photos on planes. Arguments and result as for `clsplat.ops.sweep_scores`."""
     height, width = photo.shape
     size, r = 2 * SWEEP_RADIUS + 1, SWEEP_RADIUS
     found = np.full((len(sources), len(planes), height, width), -1.0)
     if min(height, width) < size:
-        return found[:2]
+        return found[0]
     for s, d in np.ndindex(len(sources), len(planes)):
         b, inside = _seen_through(sources[s], maps[s], planes[d], height, width)
         windows_a, windows_b = (sliding_window_view(image, (size, size)) for image in (photo, b))
@@ -28,7 +28,7 @@ def sweep_similarities(photo: Array, sources: list[Array], maps: Array, planes: 
         similarity = (off_a * off_b).mean(axis=(2, 3)) / np.sqrt(np.maximum(var_a, least) * np.maximum(var_b, least))
         known = sliding_window_view(inside, (size, size)).all(axis=(2, 3)) & (var_a >= least)
         found[s, d, r : height - r, r : width - r] = np.where(known, similarity, -1)
-    return np.sort(found, axis=0)[:-3:-1]
+    return np.sort(found, axis=0)[-2:].mean(axis=0)
 
 
 def _seen_through(source: Array, mapping: Array, plane: float, height: int, width: int) -> tuple[Array, Array]:
@@ -49,9 +49,8 @@ def _seen_through(source: Array, mapping: Array, plane: float, height: int, widt
     return np.where(inside, (1 - low) * upper + low * lower, 0), inside
 
 
-def sweep_best(pairs: Array, planes: Array) -> tuple[Array, Array]:
+def sweep_best(scores: Array, planes: Array) -> tuple[Array, Array]:
     """Choose depths. Arguments and result as for `clsplat.ops.sweep_best`."""
-    scores = pairs.mean(axis=0)
     best = scores.argmax(axis=0)
     inner = (best > 0) & (best < len(planes) - 1)
     middle = np.clip(best, 1, max(1, len(planes) - 2))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
+from clsplat.constants import SWEEP_PLANES
 from clsplat.dataset.coverage import projected
 from clsplat.randomness import stream
 from clsplat.renderer import Renderer, download
@@ -48,9 +49,9 @@ SOURCES = 5
 MOST_PHOTOS = 100
 """Largest number of photos that are compared, evenly spaced, which bounds the time."""
 
-BYTES = 4 * (3 * PLANES + MOST_PHOTOS)
-"""Bytes of the device's memory per pixel, in single precision: a photo on each plane, two similarities there, and all
-photos."""
+BYTES = 4 * (PLANES + 2 * SOURCES * SWEEP_PLANES + MOST_PHOTOS)
+"""Bytes of the device's memory per pixel, in single precision: scores of all planes, sources with margins on a few of
+them, and all photos."""
 
 ANGLE = 8.0
 """Best angle between the directions to a point from two photos, degrees: smaller ones tell little of the depth, at
@@ -61,6 +62,9 @@ NARROWER, WIDER = 4.0, 12.0
 
 COMMON = 20
 """Fewest sparse points that both photos of a pair show."""
+
+MOST_ANGLES = 500
+"""Most points of a pair whose angles are measured: enough for their median."""
 
 SCORE = 0.6
 """Least score of a depth that becomes a point."""
@@ -161,12 +165,13 @@ def neighbours(cameras: list[Camera], points: Array) -> list[list[int]]:
     towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-12)
     weights = np.zeros((len(cameras), len(cameras)))
     for i, j in combinations(range(len(cameras)), 2):
-        both = seen[i] & seen[j]
-        if both.sum() >= COMMON:
-            cosines = (towards[i, both] * towards[j, both]).sum(axis=1)
+        both = np.flatnonzero(seen[i] & seen[j])
+        if len(both) >= COMMON:
+            some = both[:: -(-len(both) // MOST_ANGLES)]
+            cosines = (towards[i, some] * towards[j, some]).sum(axis=1)
             angle = np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1))))
             spread = NARROWER if angle < ANGLE else WIDER
-            weights[i, j] = weights[j, i] = both.sum() * np.exp(-0.5 * ((angle - ANGLE) / spread) ** 2)
+            weights[i, j] = weights[j, i] = len(both) * np.exp(-0.5 * ((angle - ANGLE) / spread) ** 2)
     orders = np.argsort(-weights, axis=1, kind="stable")[:, :SOURCES]
     return [[int(j) for j in order if row[j] > 0] for row, order in zip(weights, orders, strict=True)]
 
@@ -183,7 +188,7 @@ def depths_of(
     nearest, farthest = np.percentile(depths[inside], DEPTHS)
     planes = renderer.upload("planes", np.linspace(1 / (FARTHER * farthest), 1 / (NEARER * nearest), PLANES))
     maps = renderer.upload("maps", np.array([between(camera, photos[s].camera) for s in sources]))
-    pairs = renderer.stages.sweep_similarities(greys[i], [greys[s] for s in sources], maps, planes)
+    pairs = renderer.stages.sweep_scores(greys[i], [greys[s] for s in sources], maps, planes)
     inverse, scores = map(download, renderer.stages.sweep_best(pairs, planes))
     mask = photos[i].mask
     return Depths(1 / inverse.astype(np.float64), scores if mask is None else np.where(mask, scores, -1))
