@@ -105,7 +105,7 @@ def first_points(scene: Scene, config: TrainConfig, device: "Device") -> Scene:
 
     They are left out where the memory of the device does not allow them.
     """
-    wanted = round(SHARE * reach(scene))
+    wanted = round(SHARE * reach(scene, config))
     if config.max_gaussians is not None:
         wanted = min(wanted, round(SHARE * config.max_gaussians))
     wanted = min(wanted, Footprint.of(scene, config, device).most_gaussians(device.memory_limit))

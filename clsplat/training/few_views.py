@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from clsplat.config import TrainConfig
 from clsplat.scene import Scene
-from clsplat.training.autosize.rule import PER_PIXEL, full_size, reach
+from clsplat.training.autosize.rule import PER_PIXEL, cheapness, full_size, reach
 from clsplat.training.autosize.validation import FEWEST_PHOTOS
 from clsplat.training.densify.strategy import MOST_GAUSSIANS
 from clsplat.training.run_length import SMALL_PHOTO, largest_photo
@@ -54,14 +54,14 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
         config = replace(config, size="fixed")
     cap = config.max_gaussians
     if first and not named:
-        wanted = _most_of_few(few.growth * first, scene) if fewest else full_size(scene, first)
+        wanted = _most_of_few(few.growth * first, scene, config) if fewest else full_size(scene, first, config)
         most = max(1, min(round(wanted), MOST_GAUSSIANS))
         cap = most if cap is None else min(cap, most)
     return replace(config, init=init, max_gaussians=cap, dropout=max(config.dropout, dropout))
 
 
-def _most_of_few(grown: float, scene: Scene) -> float:
+def _most_of_few(grown: float, scene: Scene, config: TrainConfig) -> float:
     """Largest number of Gaussians for the fewest photos, from a multiple of the points."""
     pixels = largest_photo(scene)
-    most = min(grown, max(grown / 2, PER_PIXEL * pixels))
-    return max(most, reach(scene)) if pixels > SMALL_PHOTO else most
+    most = min(grown, max(grown / 2, PER_PIXEL * pixels)) * cheapness(config)
+    return max(most, reach(scene, config)) if pixels > SMALL_PHOTO else most

@@ -23,6 +23,7 @@ from clsplat.testing import synthetic_scene
 from clsplat.training.autosize.explanation import size_chart
 from clsplat.training.autosize.reduction import costliest_rows, unvalidated
 from clsplat.training.autosize.rule import (
+    CHEAPEST,
     TRIAL_RATES,
     Search,
     SmallSide,
@@ -165,6 +166,10 @@ def test_growth_has_a_pace(device: Device) -> None:
     camera = Camera.look_at((0, 0, -5), (0, 0, 0), (0, 1, 0), 900, 900, 400)
     large = replace(scene, train=[View("large", camera, np.zeros((400, 900, 3), np.uint8))])
     assert start(large, 1000, CONFIG).pace ** growing == pytest.approx(90 * 2**0.5), "the root of edges twice as long"
+    for price, factor in ((0.025, 2), (0.0, CHEAPEST), (0.1, 1)):
+        priced = replace(CONFIG, size_price=price)
+        assert start(large, 1000, priced).pace ** growing == pytest.approx(90 * 2**0.5 * factor)
+        assert start(many, 5000, priced).pace ** growing == pytest.approx(3 * factor)
     assert most_grown(search, CONFIG) == np.ceil(1000 * search.pace)
     assert most_grown(search, replace(CONFIG, max_gaussians=1100)) == 1100
     assert most_grown(replace(search, grows=False), CONFIG) == 1000

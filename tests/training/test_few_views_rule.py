@@ -39,6 +39,15 @@ def test_numbers_by_hand(photos: int, size: tuple[int, int], points: int, most: 
     assert config == replace(TrainConfig(), size="fixed", max_gaussians=most, dropout=dropout)
 
 
+@pytest.mark.parametrize(
+    ("photos", "size", "points"), [(16, (20, 20), 1000), (16, (600, 600), 1000), (20, (20, 20), 9)]
+)
+def test_a_low_price_raises_the_number(photos: int, size: tuple[int, int], points: int) -> None:
+    scene = scene_of(photos, size, points)
+    found, half = (adapted(TrainConfig(size_price=price), scene).max_gaussians for price in (0.05, 0.025))
+    assert half == pytest.approx(2 * found, abs=1)
+
+
 @pytest.mark.parametrize(("below", "photos", "dropout"), [(17, 24, 0.1), (0, 8, 0.0)])
 def test_with_enough_photos_the_size_is_searched(below: int, photos: int, dropout: float) -> None:
     config = TrainConfig(few=FewViewsConfig(below=below))

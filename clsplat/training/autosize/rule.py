@@ -59,6 +59,9 @@ PER_PIXEL = 1.0
 """Gaussians per pixel of a small photo that growth reaches by its end, unless `PACE` allows more. Larger photos allow
 more in proportion to the root of their edges (measured: docs/benchmarks.md)."""
 
+CHEAPEST = 16.0
+"""Largest factor by which a low price raises the number of Gaussians that growth may reach."""
+
 VALIDATIONS = 3
 """Validations in the second half of a window, which are averaged: quality fluctuates while the learning rates are
 high."""
@@ -248,17 +251,23 @@ def start(scene: Scene, n: int, config: TrainConfig) -> "Search":
     """The search before the first iteration, with n Gaussians."""
     growing = max(1, len(growth_bounds(config)) - 1)  # the first window has the first Gaussians
     sparse = min(n, len(scene.points) or n)  # dense points fill what growth may reach, and do not extend it
-    return Search(n, max(full_size(scene, sparse) / n, 1.0) ** (1 / growing))
+    return Search(n, max(full_size(scene, sparse, config) / n, 1.0) ** (1 / growing))
 
 
-def full_size(scene: Scene, sparse: int) -> float:
-    """Number of Gaussians that growth may reach by its end, by the sparse points and the photos."""
-    return max(PACE * sparse, reach(scene))
+def full_size(scene: Scene, sparse: int, config: TrainConfig) -> float:
+    """Number of Gaussians that growth may reach by its end, by the sparse points, the photos and the price."""
+    return max(PACE * sparse * cheapness(config), reach(scene, config))
 
 
-def reach(scene: Scene) -> float:
-    """Number of Gaussians that growth may reach by its end, by the photos."""
-    return PER_PIXEL * min(largest_photo(scene), SMALL_PHOTO) * detail(scene)
+def reach(scene: Scene, config: TrainConfig) -> float:
+    """Number of Gaussians that growth may reach by its end, by the photos and the price."""
+    return PER_PIXEL * min(largest_photo(scene), SMALL_PHOTO) * detail(scene) * cheapness(config)
+
+
+def cheapness(config: TrainConfig) -> float:
+    """Factor by which a price below the default raises the number of Gaussians that growth may reach."""
+    default = TrainConfig.size_price
+    return default / min(default, max(config.size_price, default / CHEAPEST))
 
 
 def validation_times(config: TrainConfig) -> set[int]:
