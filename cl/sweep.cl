@@ -44,27 +44,21 @@ typedef real16 Pairs;
 typedef mask8 masks;
 #define COLUMNS_FROM(x) ((reals)(0, 1, 2, 3, 4, 5, 6, 7) + (x))
 #define ROOTS(x)        ROOT8(x)
+#define LOAD(p)         load8(p)
+#define STORE(p, x)     store8(p, x)
 #elif LANES == 1
 typedef real reals;
 typedef real2 Pairs;
 typedef int masks;
 #define COLUMNS_FROM(x) ((reals)(x))
 #define ROOTS(x)        ROOT(x)
+#define LOAD(p)         (*(p))
+#define STORE(p, x)     (*(p) = (x))
 #else
 #error "-DLANES must be 1 or 8"
 #endif
 
-// The vector at any address. PoCL 3.0 calls vload8 as a function, which doubles the time.
-typedef struct __attribute__((packed)) {
-    reals v;
-} Vector;
-typedef struct __attribute__((packed)) {
-    real2 v;
-} Pair;
-#define PAIR(p)     (((const __global Pair *)(p))->v)
-#define LOAD(p)     (((const __global Vector *)(p))->v)
-#define STORE(p, x) (((__global Vector *)(p))->v = (x))
-#define LANE(v, i)  (((real *)&(v))[i])
+#define LANE(v, i) (((real *)&(v))[i])
 
 __kernel void sweep_pad(const int width, const int stride, const __global real *photo, __global real *padded) {
     const int x = (int)get_global_id(0) - PAD, y = get_global_id(1);
@@ -132,8 +126,8 @@ __kernel void sweep_warp(const int width, const int height, const int stride, co
             const __global real *corner = &source[top * columns + left];
             LANE(right, lane) = LANE(u, lane) - left;
             LANE(low, lane) = LANE(v, lane) - top;
-            ((real2 *)&uppers)[lane] = PAIR(corner);
-            ((real2 *)&lowers)[lane] = PAIR(corner + columns);
+            ((real2 *)&uppers)[lane] = load2(corner, 0);
+            ((real2 *)&lowers)[lane] = load2(corner + columns, 0);
         }
         const reals upper = uppers.even + right * (uppers.odd - uppers.even);
         const reals lower = lowers.even + right * (lowers.odd - lowers.even);
