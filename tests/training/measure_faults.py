@@ -221,11 +221,11 @@ class Command:
 
 
 def prepared(root: Path) -> Path:
-    """Write a dataset and a scene that is trained on it to a folder."""
+    """Write a dataset, and a scene of a few Gaussians that is trained on it, to a folder."""
     write_dataset(root / "data", PHOTOS)
     (root / "tmp").mkdir()
     with outside(root):
-        status_of([*TRAIN[:3], "first", TRAIN[4], "10", *TRAIN[10:12]])
+        status_of([*TRAIN[:3], "first", TRAIN[4], "10", *TRAIN[10:12], "--init.no-triangulate"])
     (root / "first" / "scene.ply").rename(root / "scene.ply")
     shutil.rmtree(root / "first")
     (root / "photos").mkdir()
