@@ -150,6 +150,16 @@ def test_angles_below_the_best_one_count_less_than_those_above() -> None:
     assert neighbours(cameras, points)[0] == [2, 1]
 
 
+def test_common_points_count_beyond_those_whose_angles_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clsplat.training.dense_start.MOST_ANGLES", 20)
+    points = np.random.default_rng(0).uniform(-1, 1, (400, 3)) * (1, 1, 0.01)
+    cameras = [
+        Camera.look_at((5 * np.sin(a), 0, -5 * np.cos(a)), (0, 0, 0), (0, -1, 0), focal, 64, 64)
+        for a, focal in ((0, 60), (0.14, 400), (-0.14, 60))
+    ]
+    assert neighbours(cameras, points)[0] == [2, 1], "the second camera shows fewer points"
+
+
 def test_points_are_supported_by_sure_depths_of_two_photos() -> None:
     photos = wall().train
 
@@ -196,6 +206,8 @@ def test_configuration_and_memory_leave_dense_points_out(device: Device) -> None
     assert len(first_points(scene, config, device).points) > 500
     assert first_points(scene, replace(config, init=InitConfig(dense=False)), device) is scene
     assert len(first_points(scene, replace(config, max_gaussians=200), device).points) <= 100
+    cheap = first_points(scene, replace(config, size_price=0.025), device)
+    assert len(first_points(scene, config, device).points) <= 48 * 64 / 2 < len(cheap.points) <= 48 * 64
     small = Device(device.cl_device, memory_limit=2_000_000)
     assert first_points(scene, config, small) is scene
 
