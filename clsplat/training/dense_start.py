@@ -188,8 +188,8 @@ def depths_of(
     nearest, farthest = np.percentile(depths[inside], DEPTHS)
     planes = renderer.upload("planes", np.linspace(1 / (FARTHER * farthest), 1 / (NEARER * nearest), PLANES))
     maps = renderer.upload("maps", np.array([between(camera, photos[s].camera) for s in sources]))
-    pairs = renderer.stages.sweep_scores(greys[i], [greys[s] for s in sources], maps, planes)
-    inverse, scores = map(download, renderer.stages.sweep_best(pairs, planes))
+    compared = renderer.stages.sweep_scores(greys[i], [greys[s] for s in sources], maps, planes)
+    inverse, scores = map(download, renderer.stages.sweep_best(compared, planes))
     mask = photos[i].mask
     return Depths(1 / inverse.astype(np.float64), scores if mask is None else np.where(mask, scores, -1))
 
