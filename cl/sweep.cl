@@ -29,6 +29,8 @@
 #if !defined(RADIUS) || !defined(VARIANCE_MIN) || !defined(LANES) || !defined(ROWS)
 #error "-DRADIUS, -DVARIANCE_MIN, -DLANES and -DROWS must be given, see the head of sweep.cl"
 #endif
+#include "lanes.h"
+
 #define PAD 8
 #if RADIUS < 1 || RADIUS >= PAD
 #error "-DRADIUS must be 1 or more, and less than 8"
@@ -39,26 +41,17 @@
 #define OUTSIDE 10000
 
 #if LANES == 8
-typedef real8 reals;
 typedef real16 Pairs;
-typedef mask8 masks;
-#define COLUMNS_FROM(x) ((reals)(0, 1, 2, 3, 4, 5, 6, 7) + (x))
-#define ROOTS(x)        ROOT8(x)
-#define LOAD(p)         load8(p)
-#define STORE(p, x)     store8(p, x)
-#elif LANES == 1
-typedef real reals;
-typedef real2 Pairs;
-typedef int masks;
-#define COLUMNS_FROM(x) ((reals)(x))
-#define ROOTS(x)        ROOT(x)
-#define LOAD(p)         (*(p))
-#define STORE(p, x)     (*(p) = (x))
+#define LOAD(p)     load8(p)
+#define STORE(p, x) store8(p, x)
 #else
-#error "-DLANES must be 1 or 8"
+typedef real2 Pairs;
+#define LOAD(p)     (*(p))
+#define STORE(p, x) (*(p) = (x))
 #endif
 
-#define LANE(v, i) (((real *)&(v))[i])
+// A lane that may be written.
+#define IN_LANE(v, lane) (((real *)&(v))[lane])
 
 __kernel void sweep_pad(const int width, const int stride, const __global real *photo, __global real *padded) {
     const int x = (int)get_global_id(0) - PAD, y = get_global_id(1);
@@ -94,7 +87,7 @@ __kernel void sweep_textured(const int height, const int stride, const __global 
     for (int row = GREATER(y - RADIUS, 0); row <= LESSER(y + RADIUS, height - 1); ++row)
         for (int column = GREATER(x - RADIUS, 0); column < LESSER(x + LANES + RADIUS, stride); ++column)
             any |= variances[(size_t)row * stride + column] >= (real)VARIANCE_MIN;
-    textured[y * (stride / LANES) + x / LANES] = any;
+    textured[y * (stride / LANES) + get_global_id(0)] = any;
 }
 
 __kernel void sweep_warp(const int width, const int height, const int stride, const int columns, const int rows,
@@ -105,7 +98,7 @@ __kernel void sweep_warp(const int width, const int height, const int stride, co
     if (!textured[y * (stride / LANES) + get_global_id(0)])
         return;
     const __global real *m = maps + 12 * s;
-    const reals column = COLUMNS_FROM((real)x), px = column + (real)0.5, zero = 0, outside = OUTSIDE;
+    const reals column = LANE_NUMBERS + (real)x, px = column + (real)0.5, zero = 0, outside = OUTSIDE;
     const masks inside = (column >= (real)0) & (column < (real)width);
     const real py = y + (real)0.5;
     const reals u_0 = m[0] * px + (m[1] * py + m[2]), v_0 = m[3] * px + (m[4] * py + m[5]);
@@ -124,8 +117,8 @@ __kernel void sweep_warp(const int width, const int height, const int stride, co
         _Pragma("unroll") for (int lane = 0; lane < LANES; ++lane) {
             const int left = LANE(u_max, lane), top = LANE(v_max, lane);
             const __global real *corner = &source[top * columns + left];
-            LANE(right, lane) = LANE(u, lane) - left;
-            LANE(low, lane) = LANE(v, lane) - top;
+            IN_LANE(right, lane) = LANE(u, lane) - left;
+            IN_LANE(low, lane) = LANE(v, lane) - top;
             ((real2 *)&uppers)[lane] = load2(corner, 0);
             ((real2 *)&lowers)[lane] = load2(corner + columns, 0);
         }
@@ -157,7 +150,7 @@ __kernel void sweep_scores(const int width, const int height, const int stride, 
                            const __global uchar *textured, const __global real *warped, __global real *scores) {
     const int x = LANES * get_global_id(0), begin = ROWS * get_global_id(1), end = LESSER(begin + ROWS, height);
     const size_t d = get_global_id(2), size = (size_t)height * stride;
-    const reals column = COLUMNS_FROM((real)x), least = (real)VARIANCE_MIN;
+    const reals column = LANE_NUMBERS + (real)x, least = (real)VARIANCE_MIN;
     const masks columns = (column >= (real)RADIUS) & (column < (real)(width - RADIUS));
     const __global real *a = padded + x + PAD;
     reals most[ROWS], second[ROWS]; // the two largest similarities so far
@@ -194,7 +187,7 @@ __kernel void sweep_scores(const int width, const int height, const int stride, 
         }
     }
     for (int y = begin; y < end; ++y) {
-        reals score = (real)0.5 * (most[y - begin] + second[y - begin]);
+        const reals score = (real)0.5 * (most[y - begin] + second[y - begin]);
         __global real *row = &scores[((first + d) * height + y) * width + x];
         if (x + LANES <= width) {
             STORE(row, score);

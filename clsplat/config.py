@@ -303,7 +303,7 @@ class TrainConfig:
     back until then, and train afterwards (size.json). fixed: the strategy alone decides, up to the cap."""
     size_price: NonNegative = 0.05
     """Gain of quality, dB, that a doubling of the Gaussians or of the bytes must bring; with --size auto. Quality is
-    the mean of PSNR and of SSIM in decibels. With half the default growth may reach twice as many Gaussians."""
+    the mean of PSNR and of SSIM in decibels. With half the default, growth may reach twice as many."""
     max_gaussians: Annotated[int | None, within(least=1, most=UINT32_MAX)] = None
     """Largest number of Gaussians in any iteration. A larger start is reduced to it. The strategies mcmc and error
     grow to it and need it with --size fixed."""
