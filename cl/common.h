@@ -43,7 +43,9 @@ typedef int16 mask16;
 #endif
 
 // For functions that a compiler would call: arguments would pass through memory, and loops would have no constant ends.
+#ifndef INLINED // the simulator Oclgrind takes annotations that inlining leaves behind for calls
 #define INLINED static inline __attribute__((always_inline))
+#endif
 
 #define CONCATENATE_(a, b) a##b
 #define CONCATENATE(a, b)  CONCATENATE_(a, b)
