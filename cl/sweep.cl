@@ -23,7 +23,7 @@
 // -DRADIUS        half of the window, px, less than PAD
 // -DVARIANCE_MIN  least variance of the photo in a window, and e
 // -DLANES=1|8     columns per work-item
-// -DROWS          rows per work-item of sweep_scores
+// -DROWS          rows per work-item of sweep_scores; with LANES=1 those of a window, so that all sums are in registers
 #include "common.h"
 
 #if !defined(RADIUS) || !defined(VARIANCE_MIN) || !defined(LANES) || !defined(ROWS)
@@ -39,6 +39,18 @@
 #define SHARE  (1 / (real)(WINDOW * WINDOW))
 // Far above any grey: the sum over a window shows whether one of its pixels is outside.
 #define OUTSIDE 10000
+
+// Where the sums of row `begin` + i are: row y is at y % WINDOW.
+#if LANES == 1
+#if ROWS % WINDOW != 0
+#error "-DROWS must be a multiple of the window for -DLANES=1"
+#endif
+#define PLACE(i) (((i) + WINDOW) % WINDOW)
+#define UNROLLED _Pragma("unroll")
+#else
+#define PLACE(i) ((begin + (i)) % WINDOW)
+#define UNROLLED
+#endif
 
 #if LANES == 8
 typedef real16 Pairs;
@@ -154,19 +166,23 @@ __kernel void sweep_scores(const int width, const int height, const int stride, 
     const masks columns = (column >= (real)RADIUS) & (column < (real)(width - RADIUS));
     const __global real *a = padded + x + PAD;
     reals most[ROWS], second[ROWS]; // the two largest similarities so far
-    for (int i = 0; i < ROWS; ++i)
-        most[i] = second[i] = -1;
+    UNROLLED for (int i = 0; i < ROWS; ++i) most[i] = second[i] = -1;
     bool any = false;
     for (int y = begin; y < end; ++y)
         any |= textured[(y * stride + x + PAD) / LANES];
     for (uint s = 0; any && s < sources; ++s) {
         const __global real *b = warped + (s * count + d) * size + x + PAD;
-        Sums rows[WINDOW]; // of the last rows, row y at y % WINDOW
-        for (int y = GREATER(begin - RADIUS, 0); y < LESSER(begin + RADIUS, height); ++y)
-            rows[y % WINDOW] = row_sums(a + (size_t)y * stride, b + (size_t)y * stride);
-        for (int y = begin; y < LESSER(end, height - RADIUS); ++y) {
-            const int next = y + RADIUS;
-            rows[next % WINDOW] = row_sums(a + (size_t)next * stride, b + (size_t)next * stride);
+        Sums rows[WINDOW]; // of the last rows
+        UNROLLED for (int i = -RADIUS; i < RADIUS; ++i) {
+            const int y = begin + i;
+            if (y >= 0 && y < height)
+                rows[PLACE(i)] = row_sums(a + (size_t)y * stride, b + (size_t)y * stride);
+        }
+        UNROLLED for (int i = 0; i < ROWS; ++i) {
+            const int y = begin + i, next = y + RADIUS;
+            if (next >= height)
+                break;
+            rows[PLACE(i + RADIUS)] = row_sums(a + (size_t)next * stride, b + (size_t)next * stride);
             if (y < RADIUS)
                 continue;
             reals sum_b = 0, sum_ab = 0, sum_bb = 0;
@@ -181,14 +197,16 @@ __kernel void sweep_scores(const int width, const int height, const int stride, 
             const reals root = ROOTS(GREATER(var_a, least) * GREATER(var_b, least));
             const masks known = columns & (var_a >= least) & (sum_b < (reals)(real)(OUTSIDE / 2));
             const reals similarity = known ? (SHARE * sum_ab - mean_a * mean_b) / root : none;
-            const reals previous = most[y - begin];
-            most[y - begin] = GREATER(previous, similarity);
-            second[y - begin] = similarity > previous ? previous : GREATER(second[y - begin], similarity);
+            const reals previous = most[i];
+            most[i] = GREATER(previous, similarity);
+            second[i] = similarity > previous ? previous : GREATER(second[i], similarity);
         }
     }
-    for (int y = begin; y < end; ++y) {
-        const reals score = (real)0.5 * (most[y - begin] + second[y - begin]);
-        __global real *row = &scores[((first + d) * height + y) * width + x];
+    UNROLLED for (int i = 0; i < ROWS; ++i) {
+        if (begin + i >= height)
+            break;
+        const reals score = (real)0.5 * (most[i] + second[i]);
+        __global real *row = &scores[((first + d) * height + begin + i) * width + x];
         if (x + LANES <= width) {
             STORE(row, score);
         } else {

@@ -11,13 +11,15 @@ from clsplat.device import Device
 # Zeros before and after each row (cl/sweep.cl), so that windows of vectors may begin outside the photo.
 PAD = 8
 
-# Rows of a work-item of sweep_scores: windows share the sums of rows, so that more rows save additions.
-ROWS = 16
+# Rows of a work-item of sweep_scores: windows share the sums of rows, so that more rows save additions. On a GPU, the
+# sums of more rows than these would be in private memory.
+CPU_ROWS = 16
+GPU_ROWS = 2 * SWEEP_RADIUS + 1
 
 
 def _defines(device: Device) -> dict[str, Any]:
-    lanes = 8 if device.is_cpu else 1
-    return {"RADIUS": SWEEP_RADIUS, "VARIANCE_MIN": SWEEP_VARIANCE_MIN, "LANES": lanes, "ROWS": ROWS}
+    lanes, rows = (8, CPU_ROWS) if device.is_cpu else (1, GPU_ROWS)
+    return {"RADIUS": SWEEP_RADIUS, "VARIANCE_MIN": SWEEP_VARIANCE_MIN, "LANES": lanes, "ROWS": rows}
 
 
 def sweep_scores(device: Device, photo: Array, sources: list[Array], maps: Array, planes: Array) -> Array:
@@ -55,7 +57,7 @@ def sweep_scores(device: Device, photo: Array, sources: list[Array], maps: Array
     launch("sweep_pad", (stride, height), width, stride, photo, padded)
     launch("sweep_windows", (stride, height), width, height, stride, padded, windows)
     launch("sweep_textured", (stride // lanes, height), height, stride, windows, textured)
-    chunks = -(-width // lanes), -(-height // ROWS)
+    chunks = -(-width // lanes), -(-height // defines["ROWS"])
     for first in range(0, count, SWEEP_PLANES):
         some = min(SWEEP_PLANES, count - first)
         for s, source in enumerate(sources):
