@@ -1,5 +1,6 @@
 """Device: selection, buffers, programs, and errors that a user can act on."""
 
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
@@ -77,6 +78,13 @@ class TestBuffers:
         array = any_device.upload("x", np.arange(6, dtype=np.int64).reshape(2, 3)[:, ::-1])
         assert array.dtype == any_device.real
         np.testing.assert_array_equal(array.get(), [[2, 1, 0], [5, 4, 3]])
+
+    def test_upload_does_not_keep_the_array_of_the_host(self, device):
+        host = np.arange(6, dtype=device.real)
+        alive = weakref.ref(host)
+        array = device.upload("x", host)
+        del host
+        assert alive() is None and array.get()[5] == 5
 
     def test_upload_of_a_view(self, any_device):
         host = np.arange(6, dtype=any_device.real).reshape(2, 3)
