@@ -39,6 +39,17 @@ class Reading:
         return float(self._value[0])
 
 
+class DeviceArray(cl.array.Array):
+    """An array that keeps none of the host's arrays that were copied to it or from it.
+
+    pyopencl keeps the events of up to 12 copies with an array, and each of them the host's array. Nothing waits for
+    these events: all work is in one queue, which runs in order.
+    """
+
+    def add_event(self, evt: cl.Event) -> None:
+        pass
+
+
 class Buffers:
     """Memory of a device.
 
@@ -94,7 +105,7 @@ class Buffers:
         return array if array.shape == (count,) else self._array((count,), array.dtype, array.base_data)
 
     def _array(self, shape: tuple[int, ...], dtype: np.dtype[Any], memory: Any) -> cl.array.Array:
-        result = cl.array.Array.__new__(cl.array.Array)
+        result = DeviceArray.__new__(DeviceArray)
         fields = self._blank(shape, dtype).copy()
         fields["events"], fields["base_data"] = [], memory
         result.__dict__ = fields

@@ -260,7 +260,6 @@ class Device:
         host = np.ascontiguousarray(array, dtype=self.real if dtype is None else dtype)
         result = self.empty(what, host.shape, host.dtype)
         result.set(host)
-        result.events.clear()  # its event would keep the host's array as long as the device's
         return result
 
     def constant(self, what: str, values: Any, dtype: DTypeLike | None = None) -> cl.array.Array:

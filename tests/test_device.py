@@ -79,12 +79,15 @@ class TestBuffers:
         assert array.dtype == any_device.real
         np.testing.assert_array_equal(array.get(), [[2, 1, 0], [5, 4, 3]])
 
-    def test_upload_does_not_keep_the_array_of_the_host(self, device):
-        host = np.arange(6, dtype=device.real)
-        alive = weakref.ref(host)
-        array = device.upload("x", host)
-        del host
-        assert alive() is None and array.get()[5] == 5
+    def test_arrays_do_not_keep_those_of_the_host(self, device):
+        hosts = [np.arange(6, dtype=device.real)]
+        array = device.upload("x", hosts[0])
+        array.set(hosts[0] + 1)
+        hosts += [array.get(), array.reshape(2, 3).get()]
+        alive = [weakref.ref(host) for host in hosts]
+        hosts.clear()
+        assert not any(host() is not None for host in alive)
+        assert array.get()[5] == 6
 
     def test_upload_of_a_view(self, any_device):
         host = np.arange(6, dtype=any_device.real).reshape(2, 3)
