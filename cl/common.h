@@ -43,7 +43,7 @@ typedef int16 mask16;
 #endif
 
 // For functions that a compiler would call: arguments would pass through memory, and loops would have no constant ends.
-#ifndef INLINED // the simulator Oclgrind takes annotations that inlining leaves behind for calls
+#ifndef INLINED // `make check-races` defines it without inlining (tests/check_races.py)
 #define INLINED static inline __attribute__((always_inline))
 #endif
 

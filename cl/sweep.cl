@@ -23,7 +23,7 @@
 // -DRADIUS        half of the window, px, less than PAD
 // -DVARIANCE_MIN  least variance of the photo in a window, and e
 // -DLANES=1|8     columns per work-item
-// -DROWS          rows per work-item of sweep_scores; with LANES=1 those of a window, so that all sums are in registers
+// -DROWS          rows per work-item of sweep_scores; with LANES=1 a multiple of the rows of a window
 #include "common.h"
 
 #if !defined(RADIUS) || !defined(VARIANCE_MIN) || !defined(LANES) || !defined(ROWS)
@@ -40,7 +40,8 @@
 // Far above any grey: the sum over a window shows whether one of its pixels is outside.
 #define OUTSIDE 10000
 
-// Where the sums of row `begin` + i are: row y is at y % WINDOW.
+// Index of the sums of row `begin` + i: row y is at y % WINDOW. With LANES=1 loops are unrolled, and `begin` is a multiple
+// of WINDOW: the indices are constants then, and the sums stay in registers.
 #if LANES == 1
 #if ROWS % WINDOW != 0
 #error "-DROWS must be a multiple of the window for -DLANES=1"

@@ -311,7 +311,7 @@ def run_under_oclgrind(case, log):
         pytest.skip("oclgrind is missing: install it (Debian: apt install oclgrind) to check the kernels for races")
     package = str(Path(clsplat.__file__).resolve().parents[1])
     env = os.environ | {"PYTHONPATH": os.pathsep.join([package, os.environ.get("PYTHONPATH", "")])}
-    # Optimised, inlined functions leave annotations behind that Oclgrind 21.10 takes for calls.
+    # Optimised or inlined functions leave annotations behind that Oclgrind 21.10 takes for calls.
     # It does not know Clang's count of zeros either (cl/composite_blocks.h).
     env["PYOPENCL_BUILD_OPTIONS"] = "-cl-opt-disable -DWITHOUT_CTZ -DINLINED=static"
     # It adds up the local memory of all kernels of a program, and reals have twice the bytes that they have on a GPU.

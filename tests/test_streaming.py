@@ -1,9 +1,6 @@
 """Photos that stream from the disk: the same bytes as from memory, bounded memory, a sentence where one is lost."""
 
 import gc
-import json
-import tracemalloc
-import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +16,9 @@ from clsplat.config import CoarseConfig, DataConfig, InitConfig
 from clsplat.dataset import load_scene
 from clsplat.device import Device
 from clsplat.errors import InputError
-from clsplat.evaluate import evaluate, mean_metrics
-from clsplat.metrics import psnr
+from clsplat.evaluate import evaluate
 from clsplat.scene import DepthMap, Scene, View, in_turn
 from clsplat.streaming import Files, PhotoStream, Source, StreamedView
-from clsplat.testing import synthetic_scene
-from clsplat.training.contributions import contributions
 from clsplat.training.loop import train
 from clsplat.training.session import view_at
 
@@ -147,68 +141,6 @@ def test_no_photo_is_decoded_before_it_is_needed(
 
 
 # ---- memory
-
-
-IN_MEMORY = 4
-
-
-def peak(count: int, device: Device, tmp_path: Path) -> int:
-    """Bytes that Python and NumPy take at most in a load, a training, a survey and an evaluation of photos."""
-    width, height = 5 * SIZE[0], 5 * SIZE[1]
-    folder = tmp_path / str(count)
-    write_dataset(folder, count)
-    intrinsics = json.loads((folder / "transforms.json").read_text())
-    larger = {name: 5 * intrinsics[name] for name in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
-    (folder / "transforms.json").write_text(json.dumps(intrinsics | larger))
-    for k in range(count):
-        pixels = np.random.default_rng(k).integers(0, 256, (height, width, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{k}.png", compress_level=1)
-    gaussians = synthetic_scene(40, seed=4)[0]
-    gc.collect()
-    tracemalloc.start()
-    scene = load_scene(folder, DataConfig(), memory=IN_MEMORY * 3 * width * height)
-    train(scene, replace(SHORT, iterations=90), folder / "out", device)
-    assert len(contributions(renderer_of(device), gaussians, scene.train).errors) == 40
-    mean_metrics(gaussians, scene.train, renderer_of(device), (psnr,))
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    return most
-
-
-def renderer_of(device: Device) -> Any:
-    from clsplat.renderer import Renderer
-
-    return Renderer(device)
-
-
-@pytest.fixture
-def most_photos(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The largest number of decoded photos that were alive at once, in a list."""
-    alive: list[weakref.ref[Any]] = []
-    most = [0]
-    decode = PhotoStream._read
-
-    def read(self: PhotoStream, name: str) -> View:
-        view = decode(self, name)
-        alive.append(weakref.ref(view.image))
-        most[0] = max(most[0], sum(each() is not None for each in alive))
-        return view
-
-    monkeypatch.setattr(PhotoStream, "_read", read)
-    return most
-
-
-def test_memory_does_not_grow_with_the_photos(
-    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most_photos: list[int]
-) -> None:
-    """The 80 photos more would take 7.7 MB; their names, cameras, digests and records take 10 kB each."""
-    # A photo's differences in float64 take 2 MB, and threads decide how many of them there are at once.
-    monkeypatch.setattr("clsplat.evaluate.PENDING", 0)
-    peak(3, device, tmp_path)  # modules are loaded, programs are built
-    limit = peak(10, device, tmp_path) + 40 * 25 * PHOTO  # half of them
-    # Threads that other tests have left may allocate meanwhile, but hardly in both.
-    assert any(peak(90, device, tmp_path / again) < limit for again in ("first", "second"))
-    assert most_photos[0] <= 2 * IN_MEMORY, "beside those of the stream, some are in use"
 
 
 def test_a_stream_keeps_what_fits_and_drops_what_was_used_longest_ago() -> None:
