@@ -145,8 +145,8 @@ def _brightness(photos: NDArray[np.intp], points: NDArray[np.intp], colors: Arra
     weights, scale, found = np.ones(len(photos)), 1.0, np.zeros((count, 3))
     for _ in range(ROUNDS):
         totals = np.bincount(points, weights)
-        shares = csr_matrix((weights / totals[points], (photos, points)))
-        seen = csr_matrix((weights, (photos, points)))
+        shares = csr_matrix((weights / totals[points], (photos, points)), (count, len(totals)))
+        seen = csr_matrix((weights, (photos, points)), (count, len(totals)))
         sums = np.stack([np.bincount(points, weights * channel) for channel in colors.T], axis=1)
         own = np.stack([np.bincount(photos, weights * channel, count) for channel in colors.T], axis=1)
         normal = np.diag(np.bincount(photos, weights, count) + (scale / PRIOR) ** 2) - (shares @ seen.T).toarray()

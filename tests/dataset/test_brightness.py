@@ -116,9 +116,11 @@ def test_what_masks_hide_does_not_count() -> None:
 def test_photos_that_are_hidden_or_clipped_have_no_factor() -> None:
     scene = scene_of(np.exp(alternating()))
     everywhere = slice(0, 480)
-    scene = changed(scene, 3, everywhere, 1.0, masked=True)
+    for hidden in (0, 3, PHOTOS - 1):
+        scene = changed(scene, hidden, everywhere, 1.0, masked=True)
     scene = changed(changed(scene, 6, everywhere, np.full(3, 255, np.uint8)), 9, everywhere, 0.05)
-    assert {view.name for view in scene.train} - gains(scene).keys() == {"03.png", "06.png", "09.png"}
+    unknown = {view.name for view in scene.train} - gains(scene).keys()
+    assert unknown == {"00.png", "03.png", "06.png", "09.png", "15.png"}
 
 
 def test_hidden_points_do_not_count() -> None:
