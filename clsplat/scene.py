@@ -136,8 +136,14 @@ class View:
         """The photo with a depth map, or with none."""
         return replace(self, depth=depth)
 
-    def changed(self, change: "Callable[[View], View]", camera: Camera | None = None) -> "View":
-        """The view that `change` makes of this one, now or when it is needed; `camera` is that of the result."""
+    def changed(
+        self, change: "Callable[[View], View]", camera: Camera | None = None, *, masks: bool = False
+    ) -> "View":
+        """The view that `change` makes of this one, now or when it is needed.
+
+        `camera` is that of the result; `masks`: whether it has a mask if this one has none. Some of its pixels count
+        if some of this one do, and it has a depth map if this one has.
+        """
         return change(self)
 
     @property

@@ -186,7 +186,8 @@ class StreamedView(View):
 
     _stream: PhotoStream
     _load: Callable[[], View] | None  # for a view that has been changed
-    _depth: DepthMap | None  # in memory
+    _depth: DepthMap | None  # in memory, before changes
+    _masked: bool  # by a change
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         return View(*args, **kwargs)
@@ -199,10 +200,11 @@ class StreamedView(View):
         stream: PhotoStream,
         load: Callable[[], View] | None = None,
         depth: DepthMap | None = None,
+        masked: bool = False,
     ) -> "StreamedView":
         """A view of a stream's photo. `load` returns it with its depth map, if it is not as the stream has it."""
         view: StreamedView = object.__new__(cls)
-        view.__dict__.update(name=name, camera=camera, _stream=stream, _load=load, _depth=depth)
+        view.__dict__.update(name=name, camera=camera, _stream=stream, _load=load, _depth=depth, _masked=masked)
         return view
 
     def loaded(self) -> View:
@@ -211,7 +213,8 @@ class StreamedView(View):
         return replace(self._stream(self.name), camera=self.camera, depth=self._depth)
 
     def _layer(self, name: str) -> Any:
-        return getattr(self.loaded(), name) if name in self._stream.layers(self.name) else None
+        known = name in self._stream.layers(self.name) or (name == "mask" and self._masked)
+        return getattr(self.loaded(), name) if known else None
 
     @property
     def image(self) -> NDArray[np.uint8]:
@@ -227,20 +230,21 @@ class StreamedView(View):
 
     @property
     def depth(self) -> DepthMap | None:
-        return self.loaded().depth if self._load else self._depth
+        return self.loaded().depth if self._load and self._depth else self._depth
 
     def prefetch(self) -> None:
         self._stream.prefetch(self.name)
 
     def with_camera(self, camera: Camera) -> View:
-        return self.of(self.name, camera, self._stream, self._load, self._depth)
+        return self.of(self.name, camera, self._stream, self._load, self._depth, self._masked)
 
     def with_depth(self, depth: DepthMap | None) -> View:
         load = (lambda: replace(self.loaded(), depth=depth)) if self._load else None
-        return self.of(self.name, self.camera, self._stream, load, depth)
+        return self.of(self.name, self.camera, self._stream, load, depth, self._masked)
 
-    def changed(self, change: Callable[[View], View], camera: Camera | None = None) -> View:
-        return self.of(self.name, camera or self.camera, self._stream, lambda: change(self.loaded()))
+    def changed(self, change: Callable[[View], View], camera: Camera | None = None, *, masks: bool = False) -> View:
+        camera, masked = camera or self.camera, self._masked or masks
+        return self.of(self.name, camera, self._stream, lambda: change(self.loaded()), self._depth, masked)
 
     @property
     def ahead(self) -> int:
@@ -248,7 +252,7 @@ class StreamedView(View):
 
     @property
     def is_used(self) -> bool:
-        return super().is_used if self._load else self._stream.used(self.name)
+        return self._stream.used(self.name)
 
     @property
     def digests(self) -> tuple[str, str] | None:

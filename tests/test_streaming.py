@@ -20,6 +20,7 @@ from clsplat.evaluate import evaluate
 from clsplat.scene import DepthMap, Scene, View, in_turn
 from clsplat.streaming import Files, PhotoStream, Source, StreamedView
 from clsplat.training.loop import train
+from clsplat.training.moving import still
 from clsplat.training.session import view_at
 
 PHOTO = 3 * SIZE[0] * SIZE[1]
@@ -120,6 +121,25 @@ def test_views_keep_streaming_through_changes_of_camera_and_pixels(dataset: Path
     np.testing.assert_array_equal(deep.image, inverted.image)
     assert deep.with_depth(None).depth is None is inverted.depth
     assert type(replace(view, name="other")) is View, "an ordinary view, in memory"
+
+
+def test_what_is_known_of_changed_views_is_known_without_reading_them(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view = streamed(dataset).train[0]
+    moves = {view.name: np.arange(20)[None].repeat(16, axis=0) < 5}
+    darker = view.changed(lambda v: replace(v, image=v.image // 2))
+    without = still([darker], moves)[0].with_camera(view.camera)
+    reads = []
+    read = PhotoStream.__call__
+    monkeypatch.setattr(PhotoStream, "__call__", lambda self, name: reads.append(name) or read(self, name))
+    assert darker.depth is darker.mask is None and darker.is_used and without.is_used and not reads
+    deep = darker.with_depth(DepthMap(np.ones(SIZE[::-1], np.float32))).changed(lambda v: v)
+    assert deep.depth and not np.isnan(deep.depth.values).any() and reads
+    (again,) = still([deep], moves)
+    assert without.mask is not None and not without.mask[0, 0] and without.mask[0, -1]
+    assert again.depth and (np.isnan(again.depth.values) == ~without.mask).all()
+    np.testing.assert_array_equal(without.loaded().mask, without.mask)
 
 
 def test_no_photo_is_decoded_before_it_is_needed(

@@ -33,14 +33,13 @@ def example(
 ) -> Example:
     """Prepare a view for an iteration."""
     camera = photo_poses.refined(view.camera, state.poses.of(view.name)) if state.poses else view.camera
-    photo, mask, disparities = photos(view)
+    photo, mask, disparities, unit = photos(view)
     background = BACKGROUNDS[config.data.background]
     if config.data.random_background:
         drawn = tuple(stream(config.seed, "backgrounds", iteration).random(3).tolist())
         if view.clear is not None:
             photo = renderer.upload("photo", view.on(drawn, background), np.uint8)
         background = drawn
-    unit = view.depth.unit if view.depth else 0.0
     return Example(view.name, camera, photo, mask, background, disparities, unit)
 
 

@@ -187,12 +187,12 @@ class Footprint:
 
 
 class Photos:
-    """Photos, masks and inverse depths on the device, uploaded when they are first needed and kept within a budget of
-    bytes."""
+    """Photos, masks and inverse depths with their unit: on the device, uploaded when they are first needed and kept
+    within a budget of bytes."""
 
     def __init__(self, device: "Device"):
         self._device = device
-        self._kept: dict[str, tuple[Any, Any, Any]] = {}
+        self._kept: dict[str, tuple[Any, Any, Any, float]] = {}
         self._bytes = 0
         self._budget = 0
 
@@ -201,14 +201,14 @@ class Photos:
         self._budget = budget
         while self._kept and self._bytes > budget:
             _, dropped = self._kept.popitem()
-            self._bytes -= sum(array.nbytes for array in dropped if array is not None)
+            self._bytes -= _nbytes(dropped)
 
     def prefetch(self, view: View) -> None:
         """Begin to read a photo that is needed soon, unless it is on the device."""
         if view.name not in self._kept:
             view.prefetch()
 
-    def __call__(self, view: View) -> tuple[Any, Any, Any]:
+    def __call__(self, view: View) -> tuple[Any, Any, Any, float]:
         if view.name in self._kept:
             return self._kept[view.name]
         # The memory of a CPU is that of the machine, in which photos that stream have a budget of their own.
@@ -216,12 +216,16 @@ class Photos:
         view = view.loaded()
         photo = self._device.upload("photo", view.image, np.uint8)
         mask = None if view.mask is None else self._device.upload("mask", view.mask, np.uint8)
-        depths = None
-        if view.depth and view.depth.unit:
+        depths, unit = None, view.depth.unit if view.depth else 0.0
+        if view.depth and unit:
             depths = self._device.upload("inverse depths", view.depth.disparities)
-        found = photo, mask, depths
-        size = sum(array.nbytes for array in found if array is not None)
+        found = photo, mask, depths, unit
+        size = _nbytes(found)
         if keeps and self._bytes + size <= self._budget:
             self._kept[view.name] = found
             self._bytes += size
         return found
+
+
+def _nbytes(kept: tuple[Any, ...]) -> int:
+    return sum(array.nbytes for array in kept[:-1] if array is not None)

@@ -64,7 +64,8 @@ PART = 0.005
 """Fraction of a photo's pixels from which seeds are taken for something that moves."""
 
 WHOLE = 0.5
-"""Fraction of a photo's pixels beyond which its exposure or pose is wrong, and nothing is left out."""
+"""Fraction of a photo's pixels beyond which its exposure or pose is wrong. Nothing is left out of it then, and it
+does not count as evidence that something moves."""
 
 LEAST = 0.004
 """Least fraction of all pixels that must be seeds: otherwise nothing is left out of any photo (where nothing moves:
@@ -132,10 +133,12 @@ def _moving(
     parts, found = [], {}
     for view, evidence in zip(views, evidence_of(renderer, gaussians, views, sh_degree), strict=True):
         seeds = seeds_of(evidence)
-        parts.append(seeds.mean())
-        if PART <= seeds.mean() <= WHOLE:
+        part = float(seeds.mean())
+        if part <= WHOLE:
+            parts.append(part)
+        if PART <= part <= WHOLE:
             found[view.name] = grown(seeds, evidence)
-    return found if np.mean(parts) >= LEAST else {}
+    return found if parts and np.mean(parts) >= LEAST else {}
 
 
 def evidence_of(renderer: Renderer, gaussians: Gaussians, views: list[View], sh_degree: int) -> Iterator[Evidence]:
@@ -228,11 +231,15 @@ def _mean(values: Array, edge: int) -> Array:
 def still(views: list[View], found: Masks) -> list[View]:
     """Views without the pixels that show what moves, as masks of reduced photos by name."""
     return [
-        view.changed(partial(_without, moving=found[view.name])) if view.name in found else view for view in views
+        view.changed(partial(_without, moving=found[view.name]), masks=True) if view.name in found else view
+        for view in views
     ]
 
 
 def _without(view: View, moving: NDArray[np.bool_]) -> View:
     rows, columns = (np.arange(n) * m // n for n, m in zip(view.counts.shape, moving.shape, strict=True))
     counts = view.counts & ~moving[np.ix_(rows, columns)]
-    return replace(view, mask=counts) if counts.any() else view
+    if not counts.any():
+        return view
+    depth = view.depth and replace(view.depth, values=np.where(counts, view.depth.values, np.float32(np.nan)))
+    return replace(view, mask=counts, depth=depth)

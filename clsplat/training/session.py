@@ -137,7 +137,10 @@ class Training:
         """Find what moves in the training photos, which trains no more."""
         state, renderer = self.state, self.renderer
         degree = state.sh_degree(state.iteration, self.config)
-        state.moving = moving(renderer, state.shown(renderer), state.corrected(self.scene.train), degree)
+        views = self.scene.train
+        if state.exposures and state.search:  # the exposures of the others are not known yet, or not well
+            views = split(views)[0]
+        state.moving = moving(renderer, state.shown(renderer), state.corrected(views), degree)
         self._views_of = 0, False
 
     def refresh_filter(self) -> None:
@@ -184,7 +187,7 @@ class Training:
             order = stream(self.config.seed, "surveyed views", state.iteration).permutation(len(self._views))
             chosen = state.corrected([self._views[i] for i in order[:count]])
             found = contributions(self.renderer, state.shown(self.renderer), chosen, sh_degree)
-            return found._replace(photos=len(self._views))
+            return found._replace(photos=len(self.scene.train))
 
         state.rows = state.rows._replace(strategy=state.strategy.on(None))
         gaussians = without_harmonics(state.gaussians)

@@ -33,7 +33,7 @@ from clsplat.training.autosize.rule import (
     most_grown,
     start,
 )
-from clsplat.training.autosize.search import _compared
+from clsplat.training.autosize.search import _compared, _validate
 from clsplat.training.autosize.validation import PERFECT, can_validate, decibels, split, validate
 from clsplat.training.loop import train
 from clsplat.training.optimizer import adam_settings
@@ -152,6 +152,25 @@ def test_sizes_trained_on_photos_of_other_sizes_are_not_compared(device: Device,
     search = _compared(training, Search(1800, small_side=side, validated=[[20.0, 20.0]]), 1200)
     assert len(search.trials) == compared
     assert search.small_side and search.small_side.candidate.n == (500 if compared else 1800)
+
+
+def test_what_moves_counts_in_neither_size(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The smaller one was validated before it was left out, and both are validated again, on the same pixels."""
+    scene = known_scene(8, device, copies=2, views=10)
+    training = Training(scene, GROWING, device, initial_state(scene, GROWING))
+    name = split(scene.train)[1][0].name
+    training.state.moving = {name: np.arange(12)[None].repeat(10, axis=0) < 6}
+    few = training.state.rows.take(np.arange(8))
+    side = SmallSide(few, candidate(600, 8, 1, [[99.0, 99.0]], GROWING))
+    last = [float(k) for k in _validate(training)]
+    found = _compared(training, Search(16, small_side=side, validated=[[0.0, 0.0], last]), 900)
+    trial = found.growth
+    assert trial and trial.larger.views == last and 0 < max(trial.smaller.views) < 99
+    training.state.rows = few
+    assert trial.smaller.views == pytest.approx(_validate(training), abs=1e-9)
+    assert trial.smaller.n == 8 and trial.smaller.iteration == 600
+    training.state.moving = {}
+    assert trial.smaller.views[0] != _validate(training)[0] and trial.smaller.views[1] == _validate(training)[1]
 
 
 def test_growth_has_a_pace(device: Device) -> None:

@@ -1,7 +1,9 @@
 """What moves in training photos: the evidence of the other photos, the rule, and trainings that leave it out."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,14 +21,20 @@ from clsplat.metrics import to_uint8
 from clsplat.reference.composite import hits
 from clsplat.render import render
 from clsplat.renderer import Renderer
-from clsplat.scene import Scene, View
+from clsplat.scene import DepthMap, Scene, View
 from clsplat.testing import synthetic_scene
 from clsplat.training import moving as module
+from clsplat.training import session
+from clsplat.training.autosize.validation import split
 from clsplat.training.loop import train
 from clsplat.training.moving import (
     EARLIEST,
+    LEAST,
+    PART,
     SHOWN,
+    WHOLE,
     Evidence,
+    Masks,
     due,
     evidence_of,
     grown,
@@ -34,7 +42,8 @@ from clsplat.training.moving import (
     seeds_of,
     still,
 )
-from clsplat.training.moving_files import MOVING, load_masks, packed, save_masks, unpacked
+from clsplat.training.moving_files import MOVING, as_runs, from_runs, load_masks, packed, save_masks, unpacked
+from clsplat.training.state import initial_state
 
 Array = NDArray[np.float64]
 
@@ -146,6 +155,25 @@ def test_what_belongs_to_a_seed_is_added() -> None:
     assert not grown(seeds_of(hard), hard)[78:].any()
 
 
+def test_photos_that_differ_as_a_whole_are_no_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One photo has another exposure, and a little differs in another one."""
+    camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 100, 160, 100)
+    views = [View(f"{k}", camera, np.zeros((100, 160, 3), np.uint8)) for k in range(10)]
+    whole, part = np.full((100, 160, 3), 0.5), np.zeros((100, 160, 3))
+    part[:12, :12] = 0.5
+    of = {"0": whole, "1": part}
+
+    def found(renderer: object, gaussians: object, views: list[View], degree: int) -> list[Evidence]:
+        return [evidence(of.get(view.name, 0 * part)) for view in views]
+
+    monkeypatch.setattr(module, "evidence_of", found)
+    seen = [float(seeds_of(evidence(d)).mean()) for d in of.values()]
+    assert seen[0] > WHOLE > LEAST > seen[1] / 9 > 0 and seen[1] > PART
+    assert moving(Renderer("reference"), synthetic_scene(3)[0], views, 0) == {}
+    assert moving(Renderer("reference"), synthetic_scene(3)[0], views[:1], 0) == {}, "no other photo"
+    assert set(moving(Renderer("reference"), synthetic_scene(3)[0], views[1:3], 0)) == {"1"}
+
+
 @pytest.mark.parametrize("size, fraction", [((30, 30), 0.3), ((5, 5), 0.0), ((95, 150), 0.0)])
 def test_photos_of_which_too_little_or_too_much_moves_are_left(
     monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], fraction: float
@@ -214,10 +242,13 @@ def test_masks_of_reduced_photos_apply_to_whole_ones() -> None:
             ("hidden", ~np.kron(~moves, np.ones((4, 4), bool))),
         )
     )
+    depth = DepthMap(np.full(image.shape[:2], 2.0, np.float32), scale=3.0)
     views = still(
-        [other, View("plain", camera, image), masked, hidden], {n: moves for n in ("plain", "masked", "hidden")}
+        [other, View("plain", camera, image, depth=depth), masked, hidden],
+        {n: moves for n in ("plain", "masked", "hidden")},
     )
     expected = np.kron(~moves, np.ones((4, 4), bool))
+    assert views[1].depth and views[1].depth.scale == 3 and (np.isnan(views[1].depth.values) == ~expected).all()
     assert views[0] is other and (views[1].counts == expected).all()
     assert (views[2].counts == (masked.counts & expected)).all()
     assert (views[3].counts == hidden.counts).all(), "something of it must train"
@@ -244,6 +275,45 @@ def test_masks_in_files(tmp_path: Path) -> None:
         load_masks(tmp_path)
     save_masks(tmp_path, {})
     assert load_masks(tmp_path) == {} and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("exposure", [False, True])
+def test_photos_whose_exposures_are_not_learned_are_not_looked_through(
+    device: Device, monkeypatch: pytest.MonkeyPatch, exposure: bool
+) -> None:
+    scene = balls(device)
+    config = replace(LONG, size="auto", max_gaussians=None, exposure=exposure)
+    asked = []
+
+    def look(renderer: Renderer, gaussians: Gaussians, views: list[View], degree: int) -> Masks:
+        asked.extend(view.name for view in views)
+        return {}
+
+    monkeypatch.setattr(session, "moving", look)
+    training = session.Training(scene, config, device, initial_state(scene, config))
+    training.state.iteration = 1
+    training._look_for_motion()
+    left = {view.name for view in scene.train} - {*asked}
+    assert left == ({view.name for view in split(scene.train)[1]} if exposure else set())
+
+
+@pytest.mark.parametrize("value", [False, True, None])
+def test_masks_in_json(value: bool | None) -> None:
+    """Masks that begin with either value, and of one value only."""
+    mask = np.random.default_rng(0).random((7, 5)) < 0.5
+    for first in (False, True):
+        mask.flat[0] = first
+        masks = {"a/ä.png": mask if value is None else np.full((4, 6), value)}
+        found = from_runs(json.loads(json.dumps(as_runs(masks))))
+        assert list(found) == list(masks) and all((found[name] == masks[name]).all() for name in masks)
+
+
+@pytest.mark.parametrize(
+    "broken", [{"runs": [3]}, {"shape": [2, 2], "runs": [3]}, {"shape": [2], "runs": [3, -1]}, {"runs": [2.5]}, [1]]
+)
+def test_other_json_is_no_mask(broken: Any) -> None:
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        from_runs({"a": broken})
 
 
 def balls(device: Device) -> Scene:

@@ -89,6 +89,10 @@ def _compared(training: Training, search: Search, iteration: int) -> Search:
     present, paid = _candidate(training, iteration, search.validated), search.small_side
     if paid and paid.candidate.n < present.n and _same_photos(paid.candidate, present, training.config):
         trial = Trial(True, paid.candidate, present)
+        if training.state.moving:  # other pixels counted when the smaller one was validated
+            before = training.fork(_continued(training.state, paid))
+            smaller = _candidate(before, paid.candidate.iteration, [_validate(before)])
+            trial = Trial(True, smaller, _candidate(training, iteration, search.validated[-1:]))
         search = replace(search, trials=[*search.trials, trial])
         if trial.takes_smaller:
             return search
