@@ -1,4 +1,5 @@
-"""Adaptation of a configuration to few photos, which many arrangements of Gaussians fit equally well.
+"""Adaptation of a configuration to few photos, which many arrangements of Gaussians fit equally well, and to poses
+that are refined.
 
 With few photos none is held back to choose the number of Gaussians by: each shows what no other does, and two or
 three do not decide. Splats are left out at random, so that none is indispensable, which generalises better to other
@@ -28,8 +29,9 @@ def _fewest(config: TrainConfig, scene: Scene) -> bool:
     return len(scene.train) < config.few.below
 
 
-def _searched(config: TrainConfig, scene: Scene) -> bool:
-    return len(scene.train) >= (FEWEST_SEARCHED if config.few.below else FEWEST_PHOTOS)
+def has_few(config: TrainConfig, scene: Scene) -> bool:
+    """Whether a scene has too few training photos to search the number of Gaussians."""
+    return len(scene.train) < (FEWEST_SEARCHED if config.few.below else FEWEST_PHOTOS)
 
 
 def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
@@ -40,12 +42,14 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     dropout. With fewer than `config.few.below` photos there is more dropout, and the number is bounded by a multiple
     of the points; for small photos by half of it, or one per pixel, and for large ones by what a search may reach if
     this is more (measured: docs/experiments/strategies.md). A fixed number that the configuration names is kept.
-    Otherwise the configuration is returned as it is.
+
+    If poses are refined, the number is not searched either, and grows as far: the poses of photos that do not train
+    would be wrong, and would decide. Otherwise the configuration is returned as it is.
     """
     few, init, first, fewest = config.few, config.init, len(scene.points), _fewest(config, scene)
-    if not fewest and (config.size != "auto" or _searched(config, scene)):
+    if not fewest and (config.size != "auto" or not (has_few(config, scene) or config.poses)):
         return config
-    dropout = few.dropout * (1 if fewest else SOME_DROPOUT if few.below else 0)
+    dropout = few.dropout * (1 if fewest else SOME_DROPOUT if few.below and has_few(config, scene) else 0)
     named = config.size == "fixed" and config.max_gaussians is not None
     if config.size == "auto":
         if not first:

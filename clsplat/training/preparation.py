@@ -18,7 +18,7 @@ from clsplat.ranges import check, parse_bytes
 from clsplat.renderer import default_device
 from clsplat.scene import Scene
 from clsplat.training.densify import STRATEGIES
-from clsplat.training.few_views import adapted
+from clsplat.training.few_views import adapted, has_few
 from clsplat.training.initialize import start_count
 from clsplat.training.memory import Footprint
 from clsplat.training.run_length import with_length
@@ -101,7 +101,9 @@ def prepare(
             )
     config = with_length(config, scene)
     few = adapted(config, scene)
-    if few != config:
+    if few != config and not has_few(config, scene):
+        tell("poses: no photo is held back to choose the number of Gaussians, as its pose would not be refined")
+    elif few != config:
         left_out = ", and some Gaussians are left out of each image" if few.dropout > config.dropout else ""
         tell(
             f"few photos: none is held back to choose the number of Gaussians{left_out} "

@@ -48,6 +48,14 @@ def test_a_low_price_raises_the_number(photos: int, size: tuple[int, int], point
     assert half == pytest.approx(2 * found, abs=1)
 
 
+@pytest.mark.parametrize(("photos", "dropout"), [(23, 0.1), (24, 0.0), (100, 0.0)])
+def test_with_refined_poses_the_size_is_not_searched(photos: int, dropout: float) -> None:
+    found = adapted(TrainConfig(poses=True), scene_of(photos))
+    assert (found.size, found.max_gaussians, found.dropout) == ("fixed", 3000, dropout)
+    fixed = TrainConfig(poses=True, size="fixed")
+    assert adapted(fixed, scene_of(24)) is fixed
+
+
 @pytest.mark.parametrize(("below", "photos", "dropout"), [(17, 24, 0.1), (0, 8, 0.0)])
 def test_with_enough_photos_the_size_is_searched(below: int, photos: int, dropout: float) -> None:
     config = TrainConfig(few=FewViewsConfig(below=below))
