@@ -42,20 +42,22 @@ class Inputs:
     """Inputs of a run.
 
     train, test: photos by name; points: digest of points and colours, empty without points; device: its platform,
-    name and driver version.
+    name and driver version; gains: those of the scene, with which the run continues.
     """
 
     train: dict[str, Photo] = field(default_factory=dict)
     test: dict[str, Photo] = field(default_factory=dict)
     points: str = ""
     device: str = ""
+    gains: dict[str, list[float]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, scene: Scene, device: "Device") -> "Inputs":
         """The inputs of a training of a scene on a device."""
         train, test = (photos_of(part, scene.offset) for part in (scene.train, scene.test))
         points = digest(scene.points, scene.colors) if len(scene.points) else ""
-        return cls(train, test, points, f"{device.label}, driver {device.cl_device.driver_version.strip()}")
+        gains = {name: factors.tolist() for name, factors in scene.gains.items()}
+        return cls(train, test, points, f"{device.label}, driver {device.cl_device.driver_version.strip()}", gains)
 
     @classmethod
     def restored(cls, saved: dict[str, Any]) -> "Inputs":
@@ -67,7 +69,8 @@ class Inputs:
             }
             for part in ("train", "test")
         )
-        return cls(train, test, **{name: str(value) for name, value in saved.items()})
+        gains = {name: [float(x) for x in factors] for name, factors in saved.pop("gains").items()}
+        return cls(train, test, **{name: str(value) for name, value in saved.items()}, gains=gains)
 
     def continued(self, now: "Inputs", path: Path) -> "Inputs":
         """Inputs of a run that continues from these.
@@ -104,7 +107,7 @@ class Inputs:
             {n: photo if photo.pixels or n not in old else old[n] for n, photo in part.items()}
             for part, old in ((now.train, self.train), (now.test, self.test))
         )
-        return replace(now, train=train, test=test)
+        return replace(now, train=train, test=test, gains=self.gains)
 
     def demand(self, scene: Scene) -> None:
         """Demand that the photos of a scene that have not been read have these digests, where they are known."""

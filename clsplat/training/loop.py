@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from clsplat.config import TrainConfig
 from clsplat.dataset.brightness import evened
 from clsplat.dataset.near_planes import with_near_planes
@@ -101,11 +103,12 @@ def train(
     out, device = Path(out), device or open_device(config)
     with held(out):
         inputs, read = Inputs.of(scene, device), scene
-        scene = evened(scene)
+        state = load_state(out / CHECKPOINT, scene.extent, config, inputs) if resume else None
+        # Another processor may find other gains by rounding: a run keeps its own.
+        gains = {name: np.array(factors) for name, factors in (state.inputs if state else inputs).gains.items()}
+        scene = evened(replace(scene, gains=gains))
         empty = empty_space(scene, config)
-        if resume:
-            state = load_state(out / CHECKPOINT, scene.extent, config, inputs)
-        else:
+        if not state:
             started = time.perf_counter()
             start = first_points(scene, config, device)
             gaussians = initialize(start, start_config(config), config.seed, config.max_gaussians)
