@@ -107,7 +107,7 @@ def train_block(
     device = device or open_device(job.config)
     with held(work):
         if not result.exists():
-            gaussians = _trained(job, start, points, views, device, work, progress)
+            gaussians = _trained(job, start, points, views, device, work, progress, beside)
             with replacing(log_of(job_file)) as file:
                 file.write((work / LOG).read_bytes())
             save_gaussians(result, gaussians, job.config.render.mode)
@@ -176,6 +176,7 @@ def _seen(
     views: list[View],
     config: TrainConfig,
     folder: Path,
+    beside: int,
 ) -> tuple[list[View], NDArray[np.bool_]]:
     """The photos as the block should see them, in files of a folder, if the views stream; and what they show."""
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
@@ -183,6 +184,7 @@ def _seen(
     budget = photo_budget(photo_memory(config))
     if budget is None or not any(view.ahead for view in views):
         return seen_by_block(renderer, start, trains, views, most=most)
+    budget //= beside
     folder.mkdir(parents=True, exist_ok=True)
     files = Files(folder)
     _, shown = seen_by_block(renderer, start, trains, views, files.write, most)
@@ -198,12 +200,13 @@ def _trained(
     device: "Device",
     work: Path,
     progress: Progress,
+    beside: int,
 ) -> Gaussians:
     """Train the block in a folder that is held, and return what it keeps."""
     config = job.config
     trains = job.wide.contains(start.means)
     device.buffers.forget()  # another block's sizes
-    seen, shown = _seen(device, start, trains, views, job.config, work / SEEN)
+    seen, shown = _seen(device, start, trains, views, job.config, work / SEEN, beside)
     device.buffers.forget()  # those of all that was drawn; less of it trains
     scene = _scene(seen)
     inputs = Inputs.of(scene, device)

@@ -41,6 +41,8 @@ from clsplat.scene import Scene, in_turn
 from clsplat.show.training_curve import read_log
 from clsplat.training.checkpoint import without_free
 from clsplat.training.loop import train
+from clsplat.training.moving import Masks
+from clsplat.training.moving_files import as_runs, from_runs, load_masks, save_masks
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -97,7 +99,8 @@ def plan_blocks(
         return [], None
     folder = out / BLOCKS
     folder.mkdir(parents=True, exist_ok=True)
-    file, seconds = _coarse(scene, config, device, folder, watch)
+    file, seconds, moving = _coarse(scene, config, device, folder, watch)
+    save_masks(out, moving)
     photos = _read_photos(scene)
     coarse = read_scene(file, (config.init.sh_degree + 1) ** 2)
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
@@ -108,7 +111,8 @@ def plan_blocks(
     tell(plan.describe(config, scene, seconds * COARSE_FACTOR**2))
     jobs = []
     for block in plan.blocks:
-        job = make_job(data.resolve(), file.name, block, scene, photos, block_config(config, scene, block))
+        settings = block_config(config, scene, block)
+        job = make_job(data.resolve(), file.name, block, scene, photos, moving, settings)
         if start := sparse_start(scene, coarse.means, block, config):
             job = replace(job, points=_written(start, folder, config).name)
         jobs.append(job.write(folder))
@@ -125,7 +129,13 @@ def _written(gaussians: Gaussians, folder: Path, config: TrainConfig) -> Path:
 
 
 def plan_refinement(
-    latest: list[Path], blocks: list[Block], length: float, scene: Scene, config: TrainConfig, data: Path
+    latest: list[Path],
+    blocks: list[Block],
+    length: float,
+    scene: Scene,
+    config: TrainConfig,
+    data: Path,
+    out: Path,
 ) -> list[Path]:
     """Write the jobs of trainings in which each block has the trained ones around it.
 
@@ -143,7 +153,8 @@ def plan_refinement(
     scene : Scene
     config : TrainConfig
     data : Path
-        All as given to `plan_blocks`.
+    out : Path
+        All as given to `plan_blocks`, which has written what moves to `out`.
 
     Returns
     -------
@@ -155,10 +166,10 @@ def plan_refinement(
     for part in read_index(index):
         means = read_part(folder, part).means
         counts += [block.wide.contains(means).sum() for block in blocks]
-    photos, coarse, refined = _read_photos(scene), read_job(latest[0]).far, []
+    photos, coarse, moving, refined = _read_photos(scene), read_job(latest[0]).far, load_masks(out), []
     for block, count in zip(blocks, counts.tolist(), strict=True):
         settings = refining_config(config, scene, block, count, length)
-        job = make_job(data.resolve(), coarse, block, scene, photos, settings)
+        job = make_job(data.resolve(), coarse, block, scene, photos, moving, settings)
         refined.append(replace(job, scene=index.name, near=block.near).write(folder))
     return refined
 
@@ -173,8 +184,12 @@ def _read_photos(scene: Scene) -> dict[str, Photo]:
     return photos_of(scene.train, scene.offset)
 
 
-def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, watch: Watch) -> tuple[Path, float]:
-    """Train the coarse scene, unless it exists. Returns its index and the seconds that an iteration took.
+def _coarse(
+    scene: Scene, config: TrainConfig, device: "Device", folder: Path, watch: Watch
+) -> tuple[Path, float, Masks]:
+    """Train the coarse scene, unless it exists.
+
+    Returns its index, the seconds that an iteration took, and what moves in the photos.
 
     Photos that stream have not been read before. The run is then named by their names and cameras alone, and the
     record holds a digest of their pixels.
@@ -182,7 +197,9 @@ def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, w
     photos = json.dumps(photos_of(scene.train, scene.offset))
     settings = coarse_config(config, scene, device)
     bound = json.dumps(asdict(without_free(settings)), sort_keys=True)
-    digest = digest_of(bound.encode(), photos.encode(), scene.points.tobytes())
+    gains = json.dumps({name: factors.tolist() for name, factors in scene.gains.items()})
+    points = scene.points.tobytes(), scene.colors.tobytes()
+    digest = digest_of(bound.encode(), photos.encode(), gains.encode(), *points)
     done, work = folder / f"coarse-{digest}.json", folder / f"coarse-{digest}"
     if not done.exists():
         with watch("coarse run", settings) as progress:
@@ -192,7 +209,8 @@ def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, w
         with replacing(done) as file:
             save_gaussians(done.with_suffix(".ply"), gaussians, settings.render.mode)
             index = write_index([done.with_suffix(".ply")])
-            record = {"scene": index.name, "seconds": seconds, "photos": _digest(scene)}
+            moving = as_runs(load_masks(work))
+            record = {"scene": index.name, "seconds": seconds, "photos": _digest(scene), "moving": moving}
             file.write(json.dumps(record).encode())
         shutil.rmtree(work, ignore_errors=True)
     record = json.loads(done.read_text())
@@ -201,7 +219,7 @@ def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, w
             f"{done}: expected the photos of the coarse run, found other pixels or masks; start a new run in another "
             "folder"
         )
-    return folder / record["scene"], record["seconds"]
+    return folder / record["scene"], record["seconds"], from_runs(record["moving"])
 
 
 def _digest(scene: Scene) -> str:

@@ -138,7 +138,7 @@ def test_a_block_takes_the_memory_of_its_training(planned: Planned, tmp_path: Pa
     device = Device(memory_limit=limit)
     (tmp_path / "work").mkdir()
     for _ in range(2):
-        _trained(replace(job, config=config), start, [], views, device, tmp_path / "work", lambda record: None)
+        _trained(replace(job, config=config), start, [], views, device, tmp_path / "work", lambda record: None, 1)
     assert 0.5 * limit < device.memory_peak <= limit
 
 
@@ -200,6 +200,14 @@ def test_another_coarse_scene(planned: Planned, device: Device) -> None:
             train_block(planned.jobs[0], planned.scene.train, device)
 
 
+def test_other_colours_or_gains_need_another_coarse_run(planned: Planned, device: Device) -> None:
+    scene, out = planned.scene, planned.jobs[0].parents[1]
+    other = replace(scene, colors=255 - scene.colors), replace(scene, gains={scene.train[0].name: np.full(3, 1.5)})
+    for changed in (scene, *other):
+        plan_blocks(changed, planned.config, device, planned.data, out, unseen, lambda text: None)
+    assert len([*planned.jobs[0].parent.glob("coarse-*.json")]) == 3
+
+
 def test_one_block_that_fits_needs_no_coarse_run(planned: Planned, device: Device, tmp_path: Path) -> None:
     told: list[str] = []
     config = replace(planned.config, blocks="auto")
@@ -241,9 +249,8 @@ def test_without_a_margin_a_block_keeps_all_that_it_trains(planned: Planned, dev
     for job in planned.jobs:
         train_block(job, planned.scene.train, device)
     fast = replace(planned.config, optim=replace(planned.config.optim, means_lr=1.0))
-    last = plan_refinement(
-        planned.jobs, planned.plan.cut(len(REFINING_LENGTHS)), 1.0, planned.scene, fast, planned.data
-    )
+    blocks, out = planned.plan.cut(len(REFINING_LENGTHS)), planned.jobs[0].parents[1]
+    last = plan_refinement(planned.jobs, blocks, 1.0, planned.scene, fast, planned.data, out)
     for path in last:
         job = read_job(path)
         assert job.wide == job.box

@@ -172,6 +172,10 @@ def test_configurations(device: Device) -> None:
     assert block_config(replace(config, iterations=24_000), scene, block._replace(visits=2.0)).iterations == 4000
     assert block_config(replace(config, iterations=70), scene, block).iterations == 70
     assert block_config(replace(config, max_gaussians=None), scene, block).max_gaussians is None
+    large = replace(scene.train[5], camera=replace(scene.train[5].camera, width=1200, height=1200))  # 2 times as long
+    mixed = replace(scene, train=[*scene.train[:5], large, *scene.train[6:]])
+    assert block_config(config, mixed, block).iterations == 3000, "no photo of the block is large"
+    assert block_config(config, mixed, block._replace(photos=np.arange(3, 6))).iterations == 6000
     later = refining_config(config, scene, block, 280, 0.5)
     assert (later.iterations, later.max_gaussians, later.error.stop_fraction) == (1500, 280, 0)
     assert later.optim.sh0_lr == settings.optim.sh0_lr / 2 and later.optim.means_lr == settings.optim.means_lr / 10
