@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -204,8 +204,14 @@ class Export:
         say(f"{folder}: {len(counts)} levels of {of_levels} Gaussians, {size / 1e6:.3g} MB")
 
     def _photos(self) -> "tuple[Scene | None, TrainConfig]":
-        """The dataset of the run that is exported, and its settings; None without held-out photos."""
+        """The dataset of the run that is exported, its photos as the run ended with them, and the run's settings.
+
+        None in place of the dataset without held-out photos. Exposures are not applied.
+        """
         from clsplat.dataset import load_scene, with_points
+        from clsplat.dataset.brightness import evened, gains
+        from clsplat.training.moving import still
+        from clsplat.training.moving_files import load_masks
         from clsplat.training.preparation import photo_memory
 
         if not is_run(self.scene) or self.data is None:
@@ -215,7 +221,10 @@ class Export:
         if not scene.test:
             say("levels: not refined, as no held-out photo can show whether that pays")
             return None, config
-        return with_points(scene, self.data, config.data) if config.init.triangulate else scene, config
+        scene = with_points(scene, self.data, config.data) if config.init.triangulate else scene
+        if config.even_brightness and not config.exposure:
+            scene = evened(replace(scene, gains=gains(scene)))
+        return replace(scene, train=still(scene.train, load_masks(self.scene))), config
 
     def _page(self, out: Path, gaussians: "Gaussians", mode: Mode, offset: Any) -> None:
         from clsplat.dataset import load_scene

@@ -128,9 +128,9 @@ def halved(gaussians: Gaussians) -> Gaussians:
     reduced mass.
     """
     target = -(-len(gaussians) // 2)
-    oriented = gaussians.quats.any(axis=1)
-    if oriented.any():  # others are not drawn, and would be once they are merged
-        gaussians = gaussians.take(np.flatnonzero(oriented))
+    drawn = gaussians.quats.any(axis=1) & (masses(gaussians) > 0)
+    if drawn.any():  # others would be drawn once they are merged, or have no mean
+        gaussians = gaussians.take(np.flatnonzero(drawn))
     while len(gaussians) > target:
         pairs = neighbours(gaussians)
         rank = np.empty(len(pairs), np.intp)
@@ -151,7 +151,7 @@ def _costs(gaussians: Gaussians, pairs: NDArray[np.intp]) -> Array:
     i, j = pairs.T
     mass = masses(gaussians)
     total = mass[i] + mass[j]
-    share = mass[j] / total
+    share = np.divide(mass[j], total, out=np.full_like(total, 0.5), where=total > 0)
     volume = gaussians.log_scales.sum(axis=1, dtype=np.float64)
     spread = [axis[j] - axis[i] for axis in gaussians.means.T.astype(np.float64)]
     matrices = covariances(gaussians)

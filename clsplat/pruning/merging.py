@@ -89,7 +89,7 @@ def merged(gaussians: Gaussians, pairs: Array, visible: Array | None = None) -> 
     if visible is not None:
         mass = mass * visible
     total = mass.sum(axis=1)
-    share = mass / total[:, None]
+    share = np.divide(mass, total[:, None], out=np.full_like(mass, 0.5), where=total[:, None] > 0)
     spread = means[:, 1] - means[:, 0]
     each = covariances(gaussians.take(pairs.ravel())).reshape(-1, 2, 3, 3)
     covariance = np.einsum("pk,pkij->pij", share, each)
@@ -100,7 +100,7 @@ def merged(gaussians: Gaussians, pairs: Array, visible: Array | None = None) -> 
         np.einsum("pk,pki->pi", share, means),
         log_scales,
         quats,
-        logit(np.minimum(opacities, 1 - 1e-7)),
+        logit(np.clip(opacities, np.finfo(np.float32).tiny, 1 - 1e-7)),
         np.einsum("pk,pkac->pac", share, gaussians.sh[pairs].astype(np.float64)),
     ).astype(gaussians.means.dtype)
 

@@ -126,7 +126,7 @@ class Adam:
         """Take one step down the gradients with respect to the Gaussians, on the device or the host."""
         degree = self.sh_degree
         self.iteration += 1
-        progress = min(1.0, self.iteration / self._iterations)
+        progress = min(1.0, (self.iteration - 1) / max(self._iterations - 1, 1))
         settings = adam_settings(self.iteration, progress, self._extent, self._config, degree)
         gradients = self._renderer.place(gradients)
         self._renderer.stages.adam_step(self.gaussians, gradients, *self._moments, settings)

@@ -163,7 +163,7 @@ def sky_gaussians(scene: Scene, config: TrainConfig, plain: bool = False) -> Gau
         places, _, inside = projected(view.camera, means)
         rows = np.flatnonzero(inside)
         column, row = (places[rows] // edge).astype(int).T
-        shown[rows] += 1
+        shown[rows] += _whole_cells(view.counts, edge)[row, column]  # masks hide what is there
         sky = cells[row, column]
         as_sky[rows[sky]] += 1
         colors[rows[sky]] += averages[row[sky], column[sky]]
@@ -245,7 +245,7 @@ def sky_cells(
     counts = view.counts if view.clear is None else view.counts & (view.clear == 0)
     if color is not None:
         counts = counts & background(view, color)
-    whole = np.pad(counts, padding, mode="edge").reshape(rows, edge, columns, edge).all(axis=(1, 3))
+    whole = _whole_cells(counts, edge)
 
     places, _, inside = projected(camera, points)
     empty = np.ones((rows, columns), bool)
@@ -261,6 +261,13 @@ def sky_cells(
     rim[1:-1, 1:-1] = False
     labels, _ = label(free)
     return np.isin(labels, np.unique(labels[rim])) & free, averages, edge
+
+
+def _whole_cells(counts: NDArray[np.bool_], edge: int) -> NDArray[np.bool_]:
+    """Whether all pixels of each square cell count, (R, C), of those of a photo, (H, W)."""
+    rows, columns = (-(-size // edge) for size in counts.shape)
+    padding = (0, rows * edge - counts.shape[0]), (0, columns * edge - counts.shape[1])
+    return np.asarray(np.pad(counts, padding, mode="edge").reshape(rows, edge, columns, edge).all(axis=(1, 3)))
 
 
 def _cell_sums(values: NDArray[Any], edge: int) -> NDArray[np.int64]:

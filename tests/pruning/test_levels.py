@@ -45,6 +45,15 @@ def test_halves_have_the_same_masses_and_look_alike() -> None:
     )
 
 
+@pytest.mark.parametrize("invisible", [100, 700, 1000])
+def test_what_has_no_opacity_is_in_no_level(invisible: int) -> None:
+    gaussians = surface(1000)
+    gaussians.logit_opacities[:invisible] = -200
+    half = halved(gaussians)
+    assert len(half) == (300 if invisible == 700 else 500)
+    assert all(np.isfinite(array).all() for array in half.arrays().values())
+
+
 def test_what_differs_costs_more() -> None:
     gaussians = surface(5)
     gaussians.means[:] = [[0, 0, 4], [0.1, 0, 4], [0.2, 0, 4], [0.5, 0, 4], [0.6, 0, 4]]

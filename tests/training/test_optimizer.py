@@ -62,7 +62,7 @@ def test_adam_for_loops_of_ones_own_is_that_of_training(device: Device) -> None:
         degree = sh_degree_at(iteration, 2, 2)
         assert adam.sh_degree == degree
         adam.step(v if iteration % 2 else adam._renderer.place(v))
-        settings = adam_settings(iteration, min(1.0, iteration / 4), 2.5, config, degree)
+        settings = adam_settings(iteration, min(1.0, (iteration - 1) / 3), 2.5, config, degree)
         reference.adam_step(expected, v.astype(np.float64), moments.first, moments.second, settings)
     for name, array in fetch(adam.gaussians).arrays().items():
         np.testing.assert_allclose(array, expected.arrays()[name], rtol=1e-4, atol=1e-5)

@@ -202,6 +202,18 @@ def test_the_sky_continues_a_little_where_no_photo_looks() -> None:
     assert beside.sum() > 20 and (directions[beside] @ UP).min() > 0
 
 
+def test_masks_have_no_say_in_the_sky() -> None:
+    """Half of the photos are masked above the horizon; the others show the same directions as sky."""
+    views = [view for view in ring() for _ in range(2)]
+    expected = sky_gaussians(square(views), CONFIG)
+    hidden = np.arange(HEIGHT)[:, None].repeat(WIDTH, axis=1) >= HEIGHT // 2
+    found = sky_gaussians(square([replace(v, mask=hidden if k % 2 else None) for k, v in enumerate(views)]), CONFIG)
+    assert expected and found
+    np.testing.assert_array_equal(found.means, expected.means)
+    np.testing.assert_allclose(found.sh, expected.sh, atol=1e-6)
+    assert sky_gaussians(square([replace(view, mask=hidden) for view in views]), CONFIG) is None
+
+
 @pytest.mark.parametrize(("columns", "enough"), [(0, False), (4, False), (12, True)])
 def test_with_dropout_photos_must_agree_on_the_sky(columns: int, enough: bool) -> None:
     """A second photo, from the same place, shows sky in some columns: about 0.01 steradians each."""
