@@ -52,7 +52,7 @@ ROUNDS = 4
 """Cuts after the first one, by which blocks that do not fit become alike (effect: docs/experiments/blocks.md)."""
 
 WHOLE = 0.8
-"""Part of a photo that a block and its margin have to fill for one visit in the block's length; other parts count in
+"""Fraction of a photo that a block and its margin have to fill for one visit in the block's length; other parts count in
 proportion (measured: docs/experiments/blocks.md)."""
 
 RESERVE = 1 / 10

@@ -29,7 +29,7 @@ ROUNDING = 1e-6
 """Fraction by which the distance is enlarged up to which viewpoints are found."""
 
 NEIGHBOURS = 4
-"""Nearest cameras of each camera that are viewpoints together with it: those before and after it on a path, and those
+"""Number of nearest cameras of each camera that are viewpoints together with it: those before and after it on a path, and those
 of the paths beside it."""
 
 

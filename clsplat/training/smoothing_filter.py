@@ -1,4 +1,4 @@
-"""Mip-Splatting's 3D smoothing filter in training (Yu et al. 2024, section 4.1; stage filter)."""
+"""Mip-Splatting's 3D smoothing filter in training (Yu et al. 2024, section 5.1; stage filter)."""
 
 from typing import Any
 

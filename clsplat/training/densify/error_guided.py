@@ -37,7 +37,7 @@ HARM = 1.0
 docs/experiments/strategies.md)."""
 
 TOLL = 1.0
-"""Squared error that a Gaussian pays for each pair of it and a pixel, in even shares of the error per pair:
+"""Deduction from the price for each pair of the Gaussian and a pixel, in even shares of the squared error per pair:
 compositing takes the same time for every pair (measured: docs/experiments/strategies.md)."""
 
 PRICED_PHOTOS = 100
