@@ -52,8 +52,8 @@ ROUNDS = 4
 """Cuts after the first one, by which blocks that do not fit become alike (effect: docs/experiments/blocks.md)."""
 
 WHOLE = 0.8
-"""Fraction of a photo that a block and its margin have to fill for one visit in the block's length; other parts count in
-proportion (measured: docs/experiments/blocks.md)."""
+"""Fraction of a photo that a block and its margin have to fill for one visit in the block's length; other parts count
+in proportion (measured: docs/experiments/blocks.md)."""
 
 RESERVE = 1 / 10
 """Fraction of the memory's limit that a plan leaves free: trained Gaussians are not spread as the coarse ones

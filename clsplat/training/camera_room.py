@@ -29,8 +29,8 @@ ROUNDING = 1e-6
 """Fraction by which the distance is enlarged up to which viewpoints are found."""
 
 NEIGHBOURS = 4
-"""Number of nearest cameras of each camera that are viewpoints together with it: those before and after it on a path, and those
-of the paths beside it."""
+"""Number of nearest cameras of each camera that are viewpoints together with it: those before and after it on a path,
+and those of the paths beside it."""
 
 
 def viewpoints(cameras: list[Camera]) -> NDArray[np.float64]:
