@@ -46,22 +46,32 @@ def adapted(config: TrainConfig, scene: Scene) -> TrainConfig:
     If poses are refined, the number is not searched either, and grows as far: the poses of photos that do not train
     would be wrong, and would decide. Otherwise the configuration is returned as it is.
     """
-    few, init, first, fewest = config.few, config.init, len(scene.points), _fewest(config, scene)
-    if not fewest and (config.size != "auto" or not (has_few(config, scene) or config.poses)):
+    fewest = _fewest(config, scene)
+    unsearched = config.size == "auto" and (fewest or has_few(config, scene) or config.poses)
+    if not fewest and not unsearched:
         return config
-    dropout = few.dropout * (1 if fewest else SOME_DROPOUT if few.below and has_few(config, scene) else 0)
+    dropout = max(config.dropout, _dropout(config, scene))
     named = config.size == "fixed" and config.max_gaussians is not None
-    if config.size == "auto":
-        if not first:
+    init, points = config.init, len(scene.points)
+    if unsearched:
+        if not points:
             init = replace(init, random_points=start_config(config).random_points)
-            first = init.random_points or 0
+            points = init.random_points or 0
         config = replace(config, size="fixed")
     cap = config.max_gaussians
-    if first and not named:
-        wanted = _most_of_few(few.growth * first, scene, config) if fewest else full_size(scene, first, config)
+    if points and not named:
+        growth = config.few.growth
+        wanted = _most_of_few(growth * points, scene, config) if fewest else full_size(scene, points, config)
         most = max(1, min(round(wanted), MOST_GAUSSIANS))
         cap = most if cap is None else min(cap, most)
-    return replace(config, init=init, max_gaussians=cap, dropout=max(config.dropout, dropout))
+    return replace(config, init=init, max_gaussians=cap, dropout=dropout)
+
+
+def _dropout(config: TrainConfig, scene: Scene) -> float:
+    """Dropout at the end of a training, by the number of photos."""
+    if _fewest(config, scene):
+        return config.few.dropout
+    return SOME_DROPOUT * config.few.dropout if config.few.below and has_few(config, scene) else 0.0
 
 
 def _most_of_few(grown: float, scene: Scene, config: TrainConfig) -> float:

@@ -66,7 +66,7 @@ class Training:
         self.optimizer = Optimizer(self.renderer, config.optimizer)
         self.photos = Photos(device)
         self._views: list[View] = []
-        self._views_of = 0, False  # the divisor of their edges, and whether some are held back
+        self._views_of: tuple[int, bool] | None = None  # the divisor of their edges, and whether some are held back
         if state.filter and state.filter.pixels is not None:  # of a checkpoint
             state.filter.pixels = self.renderer.upload("pixel sizes", state.filter.pixels)
 
@@ -128,7 +128,7 @@ class Training:
         search = self.state.search
         wanted = factor_at(iteration, self.config), bool(search and search.holds_back(iteration))
         if self._views_of != wanted:
-            factor, holds_back = self._views_of = wanted
+            self._views_of = factor, holds_back = wanted
             views = split(self.scene.train)[0] if holds_back else self.scene.train
             views = still(views, self.state.moving)
             self._views, self.photos = [shrunk(view, factor) for view in views], Photos(self.device)
@@ -141,7 +141,7 @@ class Training:
         if state.exposures and state.search:  # the exposures of the others are not known yet, or not well
             views = split(views)[0]
         state.moving = moving(renderer, state.shown(renderer), state.corrected(views), degree)
-        self._views_of = 0, False
+        self._views_of = None
 
     def refresh_filter(self) -> None:
         """Measure the pixel sizes of the 3D filter, if there is one and its rows have changed."""

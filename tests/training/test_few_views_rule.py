@@ -48,6 +48,11 @@ def test_a_low_price_raises_the_number(photos: int, size: tuple[int, int], point
     assert half == pytest.approx(2 * found, abs=1)
 
 
+def test_below_may_be_more_than_a_search_needs() -> None:
+    found = adapted(TrainConfig(few=FewViewsConfig(below=50)), scene_of(40))
+    assert (found.size, found.max_gaussians, found.dropout) == ("fixed", 4000, 0.2)
+
+
 @pytest.mark.parametrize(("photos", "dropout"), [(23, 0.1), (24, 0.0), (100, 0.0)])
 def test_with_refined_poses_the_size_is_not_searched(photos: int, dropout: float) -> None:
     found = adapted(TrainConfig(poses=True), scene_of(photos))
