@@ -18,8 +18,6 @@ from clsplat.errors import InputError, named
 from clsplat.inputs import Photo
 from clsplat.scene import DIGEST_BYTES, DepthMap, Scene, View, digest
 from clsplat.training.checkpoint import without_free
-from clsplat.training.moving import Masks, still
-from clsplat.training.moving_files import as_runs, from_runs
 from clsplat.training.presets import with_settings
 
 BOXES = ("near", "box", "wide")
@@ -41,8 +39,7 @@ class Job:
     elsewhere; points: the index of Gaussians at sparse points, which the block trains, too, or empty; box, wide: what
     the block keeps and trains; photos: digests of pixels and mask, by name; cameras: as the scene has them, by name;
     depths: for photos with a depth map, by name, the digest of its values and its fit to the points; gains: factors
-    by which the colours of photos are divided, by name; moving: what moves in photos and does not count, by name
-    (`clsplat.training.moving_files.as_runs`); config: settings of the block.
+    by which the colours of photos are divided, by name; config: settings of the block.
     """
 
     data: str
@@ -56,7 +53,6 @@ class Job:
     cameras: dict[str, dict[str, Any]]
     depths: dict[str, dict[str, Any]]
     gains: dict[str, list[float]]
-    moving: dict[str, Any]
     config: TrainConfig
 
     @property
@@ -82,7 +78,6 @@ class Job:
             "config": asdict(self.config),
             **({"depths": self.depths} if self.depths else {}),
             **({"gains": self.gains} if self.gains else {}),
-            **({"moving": self.moving} if self.moving else {}),
         }
 
     def write(self, folder: Path) -> Path:
@@ -119,7 +114,7 @@ class Job:
                 f"({named(other)}); start a new run in another folder"
             )
         posed = [view.with_camera(_camera(self.cameras[view.name])) for view in chosen]
-        return still(even([view.with_depth(self._depth(view)) for view in posed], self.gains), from_runs(self.moving))
+        return even([view.with_depth(self._depth(view)) for view in posed], self.gains)
 
     def _depth(self, view: View) -> DepthMap | None:
         """The depth map of a photo as the whole scene is trained with it."""
@@ -134,13 +129,11 @@ class Job:
         return replace(view.depth, **fit)
 
 
-def make_job(
-    data: Path, file: str, block: Block, scene: Scene, photos: dict[str, Photo], moving: Masks, config: TrainConfig
-) -> Job:
+def make_job(data: Path, file: str, block: Block, scene: Scene, photos: dict[str, Photo], config: TrainConfig) -> Job:
     """Make the job of a block in a scene's file, without sparse points.
 
     file: name of the index of the Gaussians; scene: with the photos of the block; photos: digests of all photos;
-    moving: what moves in all photos; config: settings of the block.
+    config: settings of the block.
     """
     views = [scene.train[i] for i in block.photos]
     names = [view.name for view in views]
@@ -152,9 +145,7 @@ def make_job(
         if (depth := view.depth)
     }
     gains = {name: scene.gains[name].tolist() for name in names if name in scene.gains}
-    moves = as_runs({name: moving[name] for name in names if name in moving})
-    boxes = block.box, block.wide
-    return Job(str(data), file, EVERYWHERE, file, "", *boxes, own, cameras, depths, gains, moves, config)
+    return Job(str(data), file, EVERYWHERE, file, "", block.box, block.wide, own, cameras, depths, gains, config)
 
 
 def read_job(path: Path) -> Job:
@@ -175,18 +166,8 @@ def read_job(path: Path) -> Job:
         cameras = {name: dict(p["camera"]) for name, p in content["photos"].items()}
         depths = {str(name): dict(depth) for name, depth in content.get("depths", {}).items()}
         gains = {str(name): [float(x) for x in factor] for name, factor in content.get("gains", {}).items()}
-        moving = as_runs(from_runs(content.get("moving", {})))
         config = with_settings(TrainConfig(), content["config"], str(path))
-        job = Job(
-            **scenes,
-            **boxes,
-            photos=photos,
-            cameras=cameras,
-            depths=depths,
-            gains=gains,
-            moving=moving,
-            config=config,
-        )
+        job = Job(**scenes, **boxes, photos=photos, cameras=cameras, depths=depths, gains=gains, config=config)
         found = job.digest
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error

@@ -170,8 +170,7 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
 
     It trains for as many iterations as its photos alone would, counted by the part of them that it fills, and at most
     those of the whole configuration. Its first Gaussians have been trained, so that all bands of their spherical
-    harmonics train from the first iterations on, and photos have their full size. The coarse run, which has all
-    photos, has found what moves.
+    harmonics train from the first iterations on, and photos have their full size.
     """
     photos = max(1, round(block.visits))
     largest = max((scene.train[i] for i in block.photos), key=lambda view: view.camera.width * view.camera.height)
@@ -183,7 +182,6 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
         max_gaussians=None if config.max_gaussians is None else block.gaussians,
         optim=replace(config.optim, sh_degree_every=1),
         coarse=CoarseConfig(factor=1),
-        mask_moving=False,
         eval_every=0,
     )
 

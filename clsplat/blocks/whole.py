@@ -41,8 +41,6 @@ from clsplat.scene import Scene, in_turn
 from clsplat.show.training_curve import read_log
 from clsplat.training.checkpoint import without_free
 from clsplat.training.loop import train
-from clsplat.training.moving import Masks
-from clsplat.training.moving_files import as_runs, from_runs, load_masks, save_masks
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -99,8 +97,7 @@ def plan_blocks(
         return [], None
     folder = out / BLOCKS
     folder.mkdir(parents=True, exist_ok=True)
-    file, seconds, moving = _coarse(scene, config, device, folder, watch)
-    save_masks(out, moving)
+    file, seconds = _coarse(scene, config, device, folder, watch)
     photos = _read_photos(scene)
     coarse = read_scene(file, (config.init.sh_degree + 1) ** 2)
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
@@ -111,8 +108,7 @@ def plan_blocks(
     tell(plan.describe(config, scene, seconds * COARSE_FACTOR**2))
     jobs = []
     for block in plan.blocks:
-        settings = block_config(config, scene, block)
-        job = make_job(data.resolve(), file.name, block, scene, photos, moving, settings)
+        job = make_job(data.resolve(), file.name, block, scene, photos, block_config(config, scene, block))
         if start := sparse_start(scene, coarse.means, block, config):
             job = replace(job, points=_written(start, folder, config).name)
         jobs.append(job.write(folder))
@@ -129,13 +125,7 @@ def _written(gaussians: Gaussians, folder: Path, config: TrainConfig) -> Path:
 
 
 def plan_refinement(
-    latest: list[Path],
-    blocks: list[Block],
-    length: float,
-    scene: Scene,
-    config: TrainConfig,
-    data: Path,
-    out: Path,
+    latest: list[Path], blocks: list[Block], length: float, scene: Scene, config: TrainConfig, data: Path
 ) -> list[Path]:
     """Write the jobs of trainings in which each block has the trained ones around it.
 
@@ -153,8 +143,7 @@ def plan_refinement(
     scene : Scene
     config : TrainConfig
     data : Path
-    out : Path
-        All as given to `plan_blocks`, which has written what moves to `out`.
+        All as given to `plan_blocks`.
 
     Returns
     -------
@@ -166,10 +155,10 @@ def plan_refinement(
     for part in read_index(index):
         means = read_part(folder, part).means
         counts += [block.wide.contains(means).sum() for block in blocks]
-    photos, coarse, moving, refined = _read_photos(scene), read_job(latest[0]).far, load_masks(out), []
+    photos, coarse, refined = _read_photos(scene), read_job(latest[0]).far, []
     for block, count in zip(blocks, counts.tolist(), strict=True):
         settings = refining_config(config, scene, block, count, length)
-        job = make_job(data.resolve(), coarse, block, scene, photos, moving, settings)
+        job = make_job(data.resolve(), coarse, block, scene, photos, settings)
         refined.append(replace(job, scene=index.name, near=block.near).write(folder))
     return refined
 
@@ -184,12 +173,8 @@ def _read_photos(scene: Scene) -> dict[str, Photo]:
     return photos_of(scene.train, scene.offset)
 
 
-def _coarse(
-    scene: Scene, config: TrainConfig, device: "Device", folder: Path, watch: Watch
-) -> tuple[Path, float, Masks]:
-    """Train the coarse scene, unless it exists.
-
-    Returns its index, the seconds that an iteration took, and what moves in the photos.
+def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, watch: Watch) -> tuple[Path, float]:
+    """Train the coarse scene, unless it exists. Returns its index and the seconds that an iteration took.
 
     Photos that stream have not been read before. The run is then named by their names and cameras alone, and the
     record holds a digest of their pixels.
@@ -209,8 +194,7 @@ def _coarse(
         with replacing(done) as file:
             save_gaussians(done.with_suffix(".ply"), gaussians, settings.render.mode)
             index = write_index([done.with_suffix(".ply")])
-            moving = as_runs(load_masks(work))
-            record = {"scene": index.name, "seconds": seconds, "photos": _digest(scene), "moving": moving}
+            record = {"scene": index.name, "seconds": seconds, "photos": _digest(scene)}
             file.write(json.dumps(record).encode())
         shutil.rmtree(work, ignore_errors=True)
     record = json.loads(done.read_text())
@@ -219,7 +203,7 @@ def _coarse(
             f"{done}: expected the photos of the coarse run, found other pixels or masks; start a new run in another "
             "folder"
         )
-    return folder / record["scene"], record["seconds"], from_runs(record["moving"])
+    return folder / record["scene"], record["seconds"]
 
 
 def _digest(scene: Scene) -> str:

@@ -53,7 +53,7 @@ def train_in_blocks(
     _run(first, scene, renderer.device, watch, where)
     trained = [first]
     for training, length in enumerate(REFINING_LENGTHS, 1):
-        trained.append(plan_refinement(trained[-1], plan.cut(training), length, scene, config, data, out))
+        trained.append(plan_refinement(trained[-1], plan.cut(training), length, scene, config, data))
         _run(trained[-1], scene, renderer.device, watch, where)
     merge(trained[-1], out / SCENE, scene.offset)
     gaussians = StoredScene(out / SCENE)

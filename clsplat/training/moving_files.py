@@ -1,4 +1,4 @@
-"""What moves in training photos, in files: in checkpoints, in jobs of blocks, and in a file of its own."""
+"""Files of what moves in training photos: a part of a checkpoint, and a file of its own at the end of a run."""
 
 import json
 from collections.abc import Mapping
@@ -38,30 +38,6 @@ def unpacked(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[np.bool_]]
             raise ValueError(f"moving.{k} of type {bits.dtype} and shape {bits.shape}")
         found[name] = np.unpackbits(bits, count=height * width).astype(bool).reshape(height, width)
     return found
-
-
-def as_runs(found: Masks) -> dict[str, Any]:
-    """Masks for a JSON file, by name: the shape, and the lengths of runs of pixels that stay and move, in turn."""
-    runs = {}
-    for name, mask in found.items():
-        pixels = np.concatenate([[False], mask.ravel()])  # the first run stays, if only for no pixel
-        ends = np.flatnonzero(pixels[1:] != pixels[:-1])
-        runs[name] = {"shape": mask.shape, "runs": np.diff(ends, prepend=0, append=mask.size).tolist()}
-    return runs
-
-
-def from_runs(saved: Mapping[str, Any]) -> dict[str, NDArray[np.bool_]]:
-    """The masks of a JSON file.
-
-    Raises
-    ------
-    KeyError, TypeError or ValueError
-        If its content is not that of `as_runs`.
-    """
-    return {
-        name: np.repeat(np.arange(len(mask["runs"])) % 2 == 1, mask["runs"]).reshape(mask["shape"])
-        for name, mask in saved.items()
-    }
 
 
 def save_masks(out: Path, found: Masks) -> None:

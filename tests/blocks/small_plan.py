@@ -38,8 +38,7 @@ class Planned:
     def again(self, blocks: list[Block] | None = None) -> list[Path]:
         """The jobs of second trainings, of the plan's blocks or of others."""
         chosen = self.plan.cut(1) if blocks is None else blocks
-        out = self.jobs[0].parents[1]
-        return plan_refinement(self.jobs, chosen, 0.5, self.scene, self.config, self.data, out)
+        return plan_refinement(self.jobs, chosen, 0.5, self.scene, self.config, self.data)
 
 
 def plan(dataset: Path, device: Device, out: Path, blocks: int) -> Planned:

@@ -249,8 +249,9 @@ def test_without_a_margin_a_block_keeps_all_that_it_trains(planned: Planned, dev
     for job in planned.jobs:
         train_block(job, planned.scene.train, device)
     fast = replace(planned.config, optim=replace(planned.config.optim, means_lr=1.0))
-    blocks, out = planned.plan.cut(len(REFINING_LENGTHS)), planned.jobs[0].parents[1]
-    last = plan_refinement(planned.jobs, blocks, 1.0, planned.scene, fast, planned.data, out)
+    last = plan_refinement(
+        planned.jobs, planned.plan.cut(len(REFINING_LENGTHS)), 1.0, planned.scene, fast, planned.data
+    )
     for path in last:
         job = read_job(path)
         assert job.wide == job.box

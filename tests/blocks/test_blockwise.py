@@ -4,21 +4,11 @@ import json
 import shlex
 from pathlib import Path
 
-import numpy as np
 import pytest
 from cli_runs import fails, run
 
-from clsplat.blocks.jobs import read_job
 from clsplat.blocks.plan import REFINING_LENGTHS
-from clsplat.config import DataConfig
-from clsplat.dataset import load_scene
 from clsplat.formats import load_gaussians
-from clsplat.gaussians import Gaussians
-from clsplat.renderer import Renderer
-from clsplat.scene import View
-from clsplat.training import session
-from clsplat.training.moving import Masks
-from clsplat.training.moving_files import load_masks
 
 TRAIN = (
     *("--iterations", 40, "--size", "fixed", "--max-gaussians", 240, "--init.no-triangulate", "--few.below", 3),
@@ -63,37 +53,6 @@ def test_a_run_is_like_any_other_and_printed_jobs_make_the_same(
     text = fails(capsys, "train", dataset, "-o", out, *TRAIN, "--blocks", 2, "--resume", "--seed", 1)
     assert "expected the configuration it was made with, --seed 0, found --seed 1" in text
     assert "holds a run already" in fails(capsys, "train", dataset, "-o", out, *TRAIN, "--blocks", 2)
-
-
-def test_what_the_coarse_run_finds_moving_trains_in_no_block(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    looks = []
-
-    def left_half(renderer: Renderer, gaussians: Gaussians, views: list[View], degree: int) -> Masks:
-        looks.append(len(views))
-        return {views[1].name: np.arange(8)[None].repeat(6, axis=0) < 4}
-
-    monkeypatch.setattr(session, "due", lambda iteration, iterations, found: iteration == 5)
-    monkeypatch.setattr(session, "moving", left_half)
-    out, count = tmp_path / "out", len(load_scene(dataset, DataConfig()).train)
-    run("train", dataset, "-o", out, *TRAIN, "--blocks", 2)
-    said = capsys.readouterr().err
-    assert looks == [count], "blocks do not look for themselves"
-    assert f"moving: 1 of {count} training photos" in said and (out / "moving.png").exists()
-    jobs = [read_job(path) for path in (out / "blocks").glob("*.json") if not path.stem.startswith("coarse")]
-    (name,) = load_masks(out)
-    assert len(jobs) == 2 + 3 + 2 and all((name in job.moving) == (name in job.photos) for job in jobs)
-    assert any(job.moving for job in jobs)
-
-    run("train", dataset, "-o", tmp_path / "all", *TRAIN, "--blocks", 2, "--no-mask-moving")
-    before = (out / "scene.ply").read_bytes()
-    assert (tmp_path / "all" / "scene.ply").read_bytes() != before
-    for path in (out / "scene.ply", out / "moving.npz", *(out / "blocks").glob("*.ply")):
-        if not path.stem.startswith("coarse"):
-            path.unlink()
-    run("train", dataset, "-o", out, *TRAIN, "--blocks", 2, "--resume")
-    assert (out / "scene.ply").read_bytes() == before and looks == [count]
 
 
 def test_one_block_is_todays_training(dataset: Path, tmp_path: Path) -> None:

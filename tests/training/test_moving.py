@@ -1,9 +1,7 @@
 """What moves in training photos: the evidence of the other photos, the rule, and trainings that leave it out."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +40,7 @@ from clsplat.training.moving import (
     seeds_of,
     still,
 )
-from clsplat.training.moving_files import MOVING, as_runs, from_runs, load_masks, packed, save_masks, unpacked
+from clsplat.training.moving_files import MOVING, load_masks, packed, save_masks, unpacked
 from clsplat.training.state import initial_state
 
 Array = NDArray[np.float64]
@@ -295,25 +293,6 @@ def test_photos_whose_exposures_are_not_learned_are_not_looked_through(
     training._look_for_motion()
     left = {view.name for view in scene.train} - {*asked}
     assert left == ({view.name for view in split(scene.train)[1]} if exposure else set())
-
-
-@pytest.mark.parametrize("value", [False, True, None])
-def test_masks_in_json(value: bool | None) -> None:
-    """Masks that begin with either value, and of one value only."""
-    mask = np.random.default_rng(0).random((7, 5)) < 0.5
-    for first in (False, True):
-        mask.flat[0] = first
-        masks = {"a/ä.png": mask if value is None else np.full((4, 6), value)}
-        found = from_runs(json.loads(json.dumps(as_runs(masks))))
-        assert list(found) == list(masks) and all((found[name] == masks[name]).all() for name in masks)
-
-
-@pytest.mark.parametrize(
-    "broken", [{"runs": [3]}, {"shape": [2, 2], "runs": [3]}, {"shape": [2], "runs": [3, -1]}, {"runs": [2.5]}, [1]]
-)
-def test_other_json_is_no_mask(broken: Any) -> None:
-    with pytest.raises((KeyError, TypeError, ValueError)):
-        from_runs({"a": broken})
 
 
 def balls(device: Device) -> Scene:
