@@ -253,9 +253,12 @@ class _Search:
             found = self.measured(n, choice)
             if found.loss <= limit:
                 return self._within(found)
-            aim -= found.loss - limit
+            # Below the loss of this version before rounding: the search does not find it again.
+            aim = self._loss(found.gaussians) - (found.loss - limit)
             choice = choice if self.smallest_number(choice, aim) else min(choice + 1, last)
         whole = self.measured(len(self._gaussians), last)
+        if whole.loss <= limit:
+            return self._within(whole)
         raise InputError(
             f"--max-psnr-loss: expected more than the {whole.loss:.3f} dB that the format costs without any pruning, "
             f"found {limit:g}; a format such as .sog or .ply loses less"

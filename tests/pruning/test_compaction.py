@@ -10,6 +10,7 @@ from cli_runs import fails, run, write_dataset
 from clsplat.camera import Camera
 from clsplat.config import DataConfig
 from clsplat.dataset import load_scene
+from clsplat.errors import InputError
 from clsplat.formats import FORMATS, load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, to_uint8
@@ -73,6 +74,37 @@ def test_the_reduction_goes_as_far_as_the_limits(limits, enough, more):
     search = _Search(scene, lambda left: 0.01 * (100 - len(left)), limits, lambda version: (version, 1000))
     assert search.far_enough(scene.take(np.arange(enough)))
     assert not search.far_enough(scene.take(np.arange(more)))
+
+
+def test_a_loss_just_above_the_limit_does_not_end_the_search():
+    """1000 Gaussians, of which 500 lose 0.46 dB and 550 lose 0.3 dB, in a format (float32) that adds 0.040026 dB."""
+    scene = synthetic_scene(1000)[0]
+
+    def loss(version):
+        own = 0.0 if len(version) == 1000 else 0.3 if len(version) >= 550 else 0.46 if len(version) >= 500 else 0.9
+        return own + 0.040026 * (version.means.dtype == np.float32)
+
+    search = _Search(scene, loss, Limits(loss=0.5), lambda version: (version.astype(np.float32), len(version)))
+    search.reduction = Reduction(scene, np.zeros((0, 2), np.intp), np.zeros(1000, np.intp), np.arange(1, 1001))
+    search.choices = [scene]
+    found = search.smallest(0.5)
+    assert 550 <= len(found.gaussians) <= 1.02 * 550 and found.loss == pytest.approx(0.340026)
+
+
+def test_the_whole_scene_is_the_last_resort():
+    """If all other versions lose more than the limit, by rounding too."""
+    scene = synthetic_scene(100)[0]
+
+    def loss(version):
+        rounded = version.means.dtype == np.float32
+        return 0.09 if len(version) == 100 and rounded else 0.01 * (100 - len(version)) + 0.2 * rounded
+
+    search = _Search(scene, loss, Limits(loss=0.1), lambda version: (version.astype(np.float32), len(version)))
+    search.reduction = Reduction(scene, np.zeros((0, 2), np.intp), np.zeros(100, np.intp), np.arange(1, 101))
+    search.choices = [scene]
+    assert len(search.smallest(0.1).gaussians) == 100
+    with pytest.raises(InputError, match=r"expected more than the 0\.090 dB that the format costs"):
+        search.smallest(0.05)
 
 
 def test_what_has_merged_has_the_curvature_of_both(monkeypatch):
