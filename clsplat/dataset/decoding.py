@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.config import BACKGROUNDS, DataConfig
 from clsplat.dataset.finding import DOWNSCALES
-from clsplat.dataset.lenses import Intrinsics, is_pinhole, rendered
+from clsplat.dataset.lenses import Intrinsics, import_models, is_pinhole, rendered
 from clsplat.dataset.photos import is_transparent, orientation, photo_size, read_mask, read_photo
 from clsplat.dataset.undistortion import lens_positions, resampled, squares_of
 from clsplat.errors import InputError
@@ -149,6 +149,7 @@ def load_views(dataset: Dataset, config: DataConfig, memory: int | None = None) 
     """
     from tqdm import tqdm
 
+    import_models(photo.intrinsics for photo in dataset.photos)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         plans = list(pool.map(lambda photo: plan_view(photo, dataset, config.invert_masks), dataset.photos))
         sizes = list(pool.map(lambda plan: _decoded(plan, config), plans))

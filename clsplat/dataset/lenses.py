@@ -1,6 +1,9 @@
 """COLMAP's camera models, through pycolmap: fisheyes are kept, other distorted cameras become pinholes."""
 
-from collections.abc import Callable
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +14,9 @@ from numpy.typing import NDArray
 # crashes when it writes a PNG.
 import clsplat.dataset.photos  # noqa: F401
 from clsplat.errors import InputError
+
+TRACED = (signal.SIGTERM, signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV)
+"""Signals after which COLMAP prints a stack trace."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +93,7 @@ def undistorted(intrinsics: Intrinsics) -> Intrinsics:
     if intrinsics.model == "SIMPLE_PINHOLE":
         f, cx, cy = intrinsics.params
         return replace(intrinsics, model="PINHOLE", params=(f, f, cx, cy))
-    import pycolmap
-
+    pycolmap = _colmap()
     camera = _camera(intrinsics)
     if is_pinhole(intrinsics):
         params = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
@@ -132,10 +137,10 @@ def project(intrinsics: Intrinsics, points: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _camera(intrinsics: Intrinsics) -> Any:
-    import pycolmap
-
     try:
-        camera = pycolmap.Camera.create_from_model_name(1, intrinsics.model, 1.0, intrinsics.width, intrinsics.height)
+        camera = _colmap().Camera.create_from_model_name(
+            1, intrinsics.model, 1.0, intrinsics.width, intrinsics.height
+        )
     except ValueError as error:
         raise InputError(
             f"camera model: expected one of {', '.join(camera_models())}, found {intrinsics.model!r}"
@@ -151,6 +156,30 @@ def _camera(intrinsics: Intrinsics) -> Any:
 
 def camera_models() -> list[str]:
     """List the COLMAP camera models that can become a pinhole."""
+    return [name for name in _colmap().CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
+
+
+def import_models(lenses: Iterable[Intrinsics]) -> None:
+    """Import pycolmap in this thread if one of the lenses may need it: only the main thread can handle signals."""
+    if not {lens.model for lens in lenses} <= {"PINHOLE", "SIMPLE_PINHOLE"}:
+        _colmap()
+
+
+def handle_signals() -> None:
+    """Handle signals as Python was told to: pycolmap has replaced the handlers on import without its knowledge.
+
+    Only the main thread can do that; in others, nothing happens.
+    """
+    if threading.current_thread() is threading.main_thread():
+        for number in TRACED:
+            signal.signal(number, signal.getsignal(number))
+
+
+def _colmap() -> Any:
+    """The module pycolmap, imported without an effect on signals."""
+    first = "pycolmap" not in sys.modules
     import pycolmap
 
-    return [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
+    if first:
+        handle_signals()
+    return pycolmap

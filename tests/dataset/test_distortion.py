@@ -1,8 +1,13 @@
 """Lenses: distortion is undone, fisheyes are kept, and cameras that cannot become a pinhole are refused."""
 
+import json
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from test_decoding import load, noise, posed, save
+from test_transforms import frames
 
 from clsplat.dataset.lenses import Intrinsics, project, undistorted
 from clsplat.dataset.undistortion import lens_positions
@@ -178,3 +183,28 @@ def test_beyond_a_fisheyes_image_nothing_counts(tmp_path):
 def test_cameras_that_cannot_become_pinholes_are_refused(tmp_path, intrinsics, message):
     with pytest.raises(InputError, match=message):
         load(posed(save(tmp_path / "a.png", noise()), intrinsics))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from clsplat.dataset.lenses import camera_models as load",
+        "from clsplat.dataset import load_scene; load = lambda: load_scene(Path(sys.argv[1]), DataConfig())",
+    ],
+)
+def test_models_of_cameras_leave_signals_to_python(root, source):
+    """pycolmap, which knows the models, would print a stack trace after SIGTERM; photos are decoded in threads."""
+    rows = {"frames": frames(), "fl_x": 50, "w": 64.0, "h": 48.0, "k1": 0.1}
+    (root / "transforms.json").write_text(json.dumps(rows))
+    program = f"""
+import os, signal, sys
+from pathlib import Path
+from clsplat.config import DataConfig
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(3))
+{source}
+load()
+assert "pycolmap" in sys.modules
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+    ended = subprocess.run([sys.executable, "-c", program, root], capture_output=True, text=True)
+    assert ended.returncode == 3 and "Aborted at" not in ended.stderr

@@ -7,7 +7,6 @@ doi:10.1109/CVPR.2016.445.
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import threading
@@ -18,6 +17,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from clsplat.dataset.lenses import handle_signals
 from clsplat.dataset.sfm.processes import child, how_it_ended
 from clsplat.errors import ClsplatError, InputError
 
@@ -30,9 +30,6 @@ WORKERS_MAX = 8
 
 PAIRS_MIN = 16
 """Smallest number of pairs of photos per process. Matching them takes about as long as starting a process."""
-
-TRACED = (signal.SIGTERM, signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV)
-"""Signals after which COLMAP prints a stack trace."""
 
 COUNT_ROWS = """
 import sqlite3, time
@@ -71,10 +68,7 @@ def quiet(verbose: bool) -> Iterator[None]:
     """Suppress COLMAP's messages, unless `verbose`, and the stack trace that it prints when a signal ends it."""
     from pycolmap import logging
 
-    if threading.current_thread() is threading.main_thread():
-        # On import pycolmap has replaced these handlers without Python's knowledge.
-        for number in TRACED:
-            signal.signal(number, signal.getsignal(number))
+    handle_signals()
     before = logging.minloglevel
     logging.minloglevel = before if verbose else int(logging.ERROR)
     try:
