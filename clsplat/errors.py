@@ -52,6 +52,14 @@ def whole(name: str, value: SupportsIndex) -> int:
         raise InputError(f"{name}: expected an integer, found {value!r:.60}") from error
 
 
+def new_folder(folder: Path) -> None:
+    """Create a folder, with an InputError if this fails."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot create {folder}: {error.strerror or error}") from error
+
+
 def unwritable(folder: Path) -> str | None:
     """The reason why no file of `PROBE` bytes can be written in a folder; None if one can be."""
     try:

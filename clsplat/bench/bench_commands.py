@@ -18,7 +18,7 @@ from clsplat.bench.workloads import (
     synthetic,
 )
 from clsplat.config import UINT32_MAX, UINT64_MAX, Count, DataConfig, RenderConfig
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError, InputError, new_folder
 from clsplat.ranges import byte_size, within
 
 if TYPE_CHECKING:
@@ -273,10 +273,7 @@ def _train(cells: "list[Cell]", device_name: str | None, out: Path) -> None:
 
     device = Device(select_device(device_name))
     say(f"device: {device.label}")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot create {out}: {error.strerror}") from error
+    new_folder(out)
     try:
         run_cells(cells, device, out / FILE, say)
     except KeyboardInterrupt:

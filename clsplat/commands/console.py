@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from clsplat.errors import InputError, unwritable
+from clsplat.errors import InputError, new_folder, unwritable
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -66,14 +66,6 @@ def open_device(name: str | None) -> "Device":
     device = Device(select_device(name))
     say(f"device: {device.label}")
     return device
-
-
-def new_folder(out: Path) -> None:
-    """Create a folder, with an InputError if this fails."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot create {out}: {error.strerror or error}") from error
 
 
 def try_folder(out: Path) -> None:

@@ -5,11 +5,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
-from clsplat.commands.console import DeviceName, Out, new_folder, say, write_json
+from clsplat.commands.console import DeviceName, Out, say, write_json
 from clsplat.commands.run_folders import CONFIG
 from clsplat.commands.train import open_and_name, train_and_report
 from clsplat.config import UINT32_MAX, TrainConfig
-from clsplat.errors import InputError
+from clsplat.errors import InputError, new_folder
 from clsplat.ranges import within
 from clsplat.training.presets import DATA_PATH
 

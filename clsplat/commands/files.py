@@ -15,7 +15,6 @@ from clsplat.commands.console import (
     Out,
     SceneOrRun,
     moved,
-    new_folder,
     picture_cameras,
     say,
     say_cameras,
@@ -23,7 +22,7 @@ from clsplat.commands.console import (
 from clsplat.commands.options import PageOptions, PlaceOptions
 from clsplat.commands.run_folders import is_run, read_run, scene_file, with_run
 from clsplat.config import Mode, SfmConfig, TrainConfig
-from clsplat.errors import InputError
+from clsplat.errors import InputError, new_folder
 from clsplat.formats.spz_container import Axes, Version
 from clsplat.ranges import within
 

@@ -15,7 +15,6 @@ from clsplat.commands.console import (
     OptionalOut,
     SceneOrRun,
     moved,
-    new_folder,
     open_device,
     say,
     say_scores,
@@ -24,7 +23,7 @@ from clsplat.commands.console import (
 from clsplat.commands.options import CameraOptions, DrawOptions, PhotoOptions
 from clsplat.commands.run_folders import dataset_of, place_of, scene_file, with_run
 from clsplat.config import BACKGROUNDS
-from clsplat.errors import InputError
+from clsplat.errors import InputError, new_folder
 from clsplat.ranges import within
 
 if TYPE_CHECKING:

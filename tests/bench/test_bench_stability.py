@@ -93,6 +93,7 @@ def test_each_outcome_has_its_row(table, device, tmp_path, capsys):
 
 
 def test_rows_that_are_not_measured_stay(table, tmp_path, capsys):
+    tmp_path /= "new"
     main(["bench", "stability", "open", "-o", str(tmp_path)])
     before = json.loads((tmp_path / "stability.json").read_text())
     capsys.readouterr()
@@ -119,9 +120,10 @@ def test_scenes_that_are_missing_fail(tmp_path, capsys):
 
 
 def test_bad_arguments_are_reported_before_anything_is_measured(table, tmp_path, capsys):
+    (tmp_path / "file").touch()
     for arguments, message in (
         (["nothing"], "nothing: expected experiments among good, open, broken"),
-        (["-o", str(tmp_path / "none")], "none: expected a folder that exists"),
+        (["-o", str(tmp_path / "file" / "none")], "none: Not a directory"),
     ):
         with pytest.raises(SystemExit) as stopped:
             main(["bench", "stability", *arguments])

@@ -14,7 +14,7 @@ from clsplat.bench.stability import EXPERIMENTS
 from clsplat.bench.stability.experiment import Experiment
 from clsplat.bench.stability.stability_report import chart_file, charts, save_chart
 from clsplat.device import Device
-from clsplat.errors import InputError
+from clsplat.errors import InputError, new_folder
 
 Row = dict[str, Any]
 
@@ -78,7 +78,7 @@ def measure_rows(
         As for `run_experiments`.
     device : Device
     out : Path or None
-        Folder of the file, and of the charts. None writes nothing.
+        Folder of the file, and of the charts; it is created. None writes nothing.
     say : callable
         Receives messages about the progress.
     experiments : mapping of Experiment
@@ -94,10 +94,10 @@ def measure_rows(
     Raises
     ------
     InputError
-        If a name is unknown, the folder does not exist, or its file cannot be read or written.
+        If a name is unknown, the folder cannot be created, or its file cannot be read or written.
     """
-    if out is not None and not out.is_dir():
-        raise InputError(f"{out}: expected a folder that exists, found none")
+    if out is not None:
+        new_folder(out)
     results = _read(out / FILE) if out is not None else {}
     say(f"device: {device.label}")
     rows = run_experiments(names, device, lambda name: say(f"measuring: {name}"), experiments)
