@@ -48,9 +48,10 @@ def generalisation(
     held, fitted = report["mean"]["psnr"], report["mean"]["psnr_fitted"]
     if held is None or trained is None:
         return f"{len(scene.test)} held-out photos, without errors in at least one"
+    difference = round(trained - held, 1) or 0.0  # without the sign of minus zero
     text = (
         f"{len(scene.test)} held-out photos have {held:.1f} dB, training photos {trained:.1f} dB: the smaller "
-        f"the difference of {trained - held:.1f} dB, the better the scene holds from new viewpoints. "
+        f"the difference of {difference:.1f} dB, the better the scene holds from new viewpoints. "
     )
     worst = min(report["views"], key=lambda view: np.inf if view["psnr"] is None else view["psnr"])
     text += f"The weakest is {worst['name']}, {worst['psnr']:.1f} dB: {_reason(scene, worst['name'])}"

@@ -60,7 +60,7 @@ def _compared(config: TrainConfig) -> dict[str, Any]:
     return {name: value for name, value in json.loads(json.dumps(asdict(config))).items() if name not in FREE}
 
 
-def load_field(path: Path, methods: dict[str, type[Field]], device: "Device") -> Field:
+def load_field(path: Path | str, methods: dict[str, type[Field]], device: "Device") -> Field:
     """Read the field that `save_field` wrote.
 
     Raises
@@ -68,7 +68,7 @@ def load_field(path: Path, methods: dict[str, type[Field]], device: "Device") ->
     InputError
         If the file is missing or damaged.
     """
-    return _read(path, methods, device)[0]
+    return _read(Path(path), methods, device)[0]
 
 
 def load_checkpoint(

@@ -48,6 +48,14 @@ def test_the_reason_is_the_part_that_few_photos_show(scene, device):
     assert "weakest is seen, 15.0 dB: 3 or more training photos have each part of it" in text
 
 
+def test_the_difference_has_no_sign_if_it_is_zero(scene, device, monkeypatch):
+    for trained in (19.99, 20.01):
+        monkeypatch.setattr(
+            "clsplat.commands.generalisation.training_psnr", lambda *_, found=trained: {"train_psnr": found}
+        )
+        assert "the difference of 0.0 dB" in generalisation(*scene, report(25.0, 15.0), Renderer(device), False)
+
+
 def test_exposures_are_named_where_a_fit_of_colours_gains(scene, device):
     text = generalisation(*scene, report(25.0, 15.0, fitted=21.1), Renderer(device), False)
     assert "After a fit of colours it would be 21.1 dB" in text and "--exposure" in text

@@ -71,7 +71,7 @@ def test_an_interrupt_within_a_step_leaves_the_last_checkpoint(device, scene, me
 def test_the_file_renders_what_was_trained(device, method, room, tmp_path):
     scene = ball(room=room)
     field = train_field(scene, method, replace(CONFIG, iterations=20), tmp_path, device)
-    loaded = load_field(tmp_path / MODEL, {method.name: method}, device)
+    loaded = load_field(str(tmp_path / MODEL), {method.name: method}, device)
     camera = scene.test[0].camera
     np.testing.assert_array_equal(loaded.image(camera, WHITE), field.image(camera, WHITE))
 
