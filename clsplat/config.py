@@ -333,8 +333,8 @@ class TrainConfig:
     device: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Part of the platform's or device's name. Default: PYOPENCL_CTX, or the first GPU, accelerator or CPU."""
     memory_limit: Annotated[str | None, byte_size()] = None
-    """Limit of device memory, such as 4GB or 512MiB (default: all of it). Near it, Gaussians stop growing and photos
-    are no longer kept there. It also limits the machine's memory for photos (default: half of it); others stream."""
+    """Limit of device memory, such as 4GB or 512MiB (default: all). Near it, Gaussians stop growing and photos are
+    not kept there. It also limits the memory for photos (default: half of the machine's); others stay on disk."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     init: InitConfig = field(default_factory=InitConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)

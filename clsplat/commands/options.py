@@ -53,6 +53,14 @@ class DrawOptions(RenderConfig):
 
 
 @dataclass(frozen=True)
+class ViewerDrawOptions(DrawOptions):
+    """Settings of the viewer, whose cameras have no near planes of their own."""
+
+    near: Annotated[float | None, within(above=0)] = None
+    """Depth up to which nothing is drawn, world units. Default: by the size of the scene."""
+
+
+@dataclass(frozen=True)
 class PlaceOptions:
     """Another place of a scene that is exported: it is scaled, then turned, then moved."""
 

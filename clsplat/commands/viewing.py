@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from clsplat.commands.console import DeviceName, SceneOrRun, moved, open_device, say, warn
-from clsplat.commands.options import DrawOptions, ServerOptions, ViewOptions
+from clsplat.commands.options import ServerOptions, ViewerDrawOptions, ViewOptions
 from clsplat.commands.run_folders import scene_file, with_run
 from clsplat.config import BACKGROUNDS
 
@@ -31,7 +31,7 @@ class View:
     device: DeviceName = None
     """Part of the name of the platform or device."""
     data_config: Annotated[ViewOptions, tyro.conf.arg(name="")] = field(default_factory=ViewOptions)
-    render: Annotated[DrawOptions, tyro.conf.arg(name="")] = field(default_factory=DrawOptions)
+    render: Annotated[ViewerDrawOptions, tyro.conf.arg(name="")] = field(default_factory=ViewerDrawOptions)
 
     def base(self) -> "View | None":
         """The command with the settings of its run, before flags override them; None if it has none."""

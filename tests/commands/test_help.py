@@ -48,7 +48,7 @@ def test_all_help_has_every_setting_and_brief_help_the_common_ones(capsys: pytes
         assert f"--{name.replace('_', '-')} " in brief, name
     assert "--help-all shows every setting" in brief and "--help-all" not in whole
     joined = [" ".join(text.replace("│", "").split()) for text in (whole, brief)]
-    assert "others stream" in joined[0] and "others stream" not in joined[1]
+    assert "others stay on disk" in joined[0] and "others stay on disk" not in joined[1]
 
 
 def test_every_common_setting_exists() -> None:
