@@ -42,8 +42,8 @@ NEAR = 0.01
 (gsplat; original: 0.2)."""
 
 NEAR_EXTENTS = 0.0025
-"""Depth of the near plane in extents of the scene, where its points do not tell it. For NeRF-synthetic scenes it is
-`NEAR` within a tenth."""
+"""Depth of the near plane where no points tell it: in extents of the scene, or in `default_near` in median distances
+of the Gaussians from their median. For NeRF-synthetic scenes it is `NEAR` within a tenth."""
 
 FRUSTUM_MARGIN = 0.3
 """Margin around the image to which the slopes x/z and y/z of the Jacobian are clamped, as a fraction of half the

@@ -112,7 +112,7 @@ Variant = tuple[Scene, Masks | None]
 
 
 class Reader:
-    """Reads datasets and makes variants of them. The last dataset and the last variant are kept."""
+    """Reader of datasets and of variants of them. The last dataset and the last variant are kept."""
 
     def __init__(self) -> None:
         self._dataset: tuple[Path, DataConfig, Scene] | None = None

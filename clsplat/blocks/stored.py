@@ -16,8 +16,8 @@ BATCH = 16
 """Most cameras for which Gaussians are read together: each part is read once for them, not once for each."""
 
 SHARE = 1 / 4
-"""Most of the device's memory that the parameters of these Gaussians may take, if there is more than one camera. With
-what rendering needs, they take two to three times as much (`clsplat.training.memory`)."""
+"""Largest fraction of the device's memory that the parameters of these Gaussians may take, if there is more than one
+camera. With what rendering needs, they take two to three times as much (`clsplat.training.memory`)."""
 
 
 class StoredScene:

@@ -1,4 +1,4 @@
-"""Mip-NeRF 360 (Barron et al. 2022): cones, and a proposal network that says where the large one is asked."""
+"""Mip-NeRF 360 (Barron et al. 2022): cones, and a proposal network that sets where the large one is evaluated."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -82,7 +82,7 @@ class MipNerf360(NetworkField):
     proposals, samples = 64, 32
     """Intervals of a round, and of the large network (Barron et al. 2022, section 4)."""
     rays = 512
-    """Of a step. The paper has 16384."""
+    """Rays of a step. The paper has 16384."""
     rate, rate_final = 2e-3, 2e-5
     """Learning rates at the start and at the end, exponential in between (Barron et al. 2022, supplement)."""
     iterations = 5000

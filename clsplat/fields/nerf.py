@@ -1,4 +1,4 @@
-"""NeRF (Mildenhall et al. 2020): a network asked at 64 samples of a ray, and another at 128 more."""
+"""NeRF (Mildenhall et al. 2020): a network evaluated at 64 samples of a ray, and another at these and 128 more."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -51,7 +51,7 @@ class Nerf(NetworkField):
     """Samples of the coarse network, and draws of the fine one, which is asked at both (Mildenhall et al. 2020,
     section 5.3)."""
     rays = 512
-    """Of a step. The paper has 4096."""
+    """Rays of a step. The paper has 4096."""
     rate, rate_final = 5e-4, 5e-5
     """Learning rates at the start and at the end, exponential in between (Mildenhall et al. 2020, section 5.3)."""
     iterations = 5000

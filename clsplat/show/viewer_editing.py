@@ -30,7 +30,7 @@ HELP = (
 
 
 class Editing:
-    """Makes the inputs, and carries out what they ask for on the thread that owns the device.
+    """Maker of the inputs, which carries out what they ask for on the thread that owns the device.
 
     Parameters
     ----------

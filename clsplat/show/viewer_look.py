@@ -14,7 +14,7 @@ FIELDS_OF_VIEW = (10.0, 120.0)
 
 
 class LookInputs:
-    """Makes the inputs, and reads them.
+    """Maker of the inputs, which it also reads.
 
     Parameters
     ----------

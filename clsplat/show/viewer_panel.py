@@ -16,7 +16,7 @@ def _number(value: Any, low: float, high: float) -> bool:
 
 
 class Panel:
-    """Makes inputs, and records which values they can have.
+    """Maker of inputs, which records which values they can have.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ SAME_ANGLE = 1e-3
 
 
 class Photos:
-    """Makes the outlines and the inputs.
+    """Maker of the outlines and the inputs.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ VIDEO_EDGE = 1280
 
 
 class Recording:
-    """Makes the inputs, and renders on the thread that owns the device.
+    """Maker of the inputs, which renders on the thread that owns the device.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ HEIGHT, LABELS = 120, 60
 
 
 class Statistics:
-    """Draws the curves with viser's plots.
+    """Curves, drawn with viser's plots.
 
     Parameters
     ----------
