@@ -11,7 +11,7 @@ import tyro
 from clsplat.commands.console import DeviceName, Out, SceneOrRun, moved, open_device, say
 from clsplat.commands.info import bytes_of
 from clsplat.commands.options import DrawOptions, PhotoOptions
-from clsplat.commands.run_folders import scene_file, with_run
+from clsplat.commands.run_folders import as_trained, is_run, read_run, scene_file, with_run
 from clsplat.config import BACKGROUNDS
 from clsplat.errors import InputError
 from clsplat.ranges import byte_size, parse_bytes, within
@@ -82,6 +82,8 @@ class Compact:
         if dataset is not None:
             scene = load_scene_with_points(dataset, self.data_config, self.data_config.triangulate)
             gaussians, offset = moved(gaussians, offset - scene.offset), scene.offset
+            if self.photos is not None and is_run(self.scene):
+                scene = as_trained(scene, self.scene, read_run(self.scene).config)
         pricing, evaluation = self._views(gaussians, scene, renderer)
         say(f"views: {len(pricing)} to price the Gaussians, {len(evaluation)} to measure the loss")
         loss = LossMeter(gaussians, evaluation, self.photos is not None, renderer)

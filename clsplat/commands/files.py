@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,7 +20,7 @@ from clsplat.commands.console import (
     say_cameras,
 )
 from clsplat.commands.options import PageOptions, PlaceOptions
-from clsplat.commands.run_folders import is_run, read_run, scene_file, with_run
+from clsplat.commands.run_folders import as_trained, is_run, read_run, scene_file, with_run
 from clsplat.config import Mode, SfmConfig, TrainConfig
 from clsplat.errors import InputError, new_folder
 from clsplat.formats.spz_container import Axes, Version
@@ -203,14 +203,9 @@ class Export:
         say(f"{folder}: {len(counts)} levels of {of_levels} Gaussians, {size / 1e6:.3g} MB")
 
     def _photos(self) -> "tuple[Scene | None, TrainConfig]":
-        """The dataset of the run that is exported, its photos as the run ended with them, and the run's settings.
-
-        None in place of the dataset without held-out photos. Exposures are not applied.
-        """
+        """The dataset of the run that is exported, its photos `as_trained`, and the run's settings; None in place of
+        the dataset without held-out photos."""
         from clsplat.dataset import load_scene, with_points
-        from clsplat.dataset.brightness import evened, gains
-        from clsplat.training.moving import still
-        from clsplat.training.moving_files import load_masks
         from clsplat.training.preparation import photo_memory
 
         if not is_run(self.scene) or self.data is None:
@@ -221,9 +216,7 @@ class Export:
             say("levels: not refined, as no held-out photo can show whether that pays")
             return None, config
         scene = with_points(scene, self.data, config.data) if config.init.triangulate else scene
-        if config.even_brightness and not config.exposure:
-            scene = evened(replace(scene, gains=gains(scene)))
-        return replace(scene, train=still(scene.train, load_masks(self.scene))), config
+        return as_trained(scene, self.scene, config), config
 
     def _page(self, out: Path, gaussians: "Gaussians", mode: Mode, offset: Any) -> None:
         from clsplat.dataset import load_scene

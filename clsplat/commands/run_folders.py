@@ -2,13 +2,16 @@
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 from clsplat.commands.console import say, warn
 from clsplat.commands.options import CameraOptions, PhotoOptions
 from clsplat.config import DataConfig, RenderConfig, TrainConfig
 from clsplat.errors import InputError
 from clsplat.ranges import checked, name_in
+
+if TYPE_CHECKING:
+    from clsplat.scene import Scene
 
 CONFIG, SCENE, FRAMES = "config.json", "scene.ply", "frames"
 """Files of a run: its settings and its scene; and the folder of a video's photos."""
@@ -55,6 +58,18 @@ def read_config(file: Path) -> Run:
     # A dataset within the folder of the run moves with it.
     data = photos_of(file.parent / named, file.parent) if isinstance(named, str) else None
     return Run(data, config_in(settings, file), method)
+
+
+def as_trained(scene: "Scene", folder: Path, config: TrainConfig) -> "Scene":
+    """The scene of a run with its training photos as they were at the end of the training: evened out, and without
+    what moves. Exposures are not applied."""
+    from clsplat.dataset.brightness import evened, gains
+    from clsplat.training.moving import still
+    from clsplat.training.moving_files import load_masks
+
+    if config.even_brightness and not config.exposure:
+        scene = evened(replace(scene, gains=gains(scene)))
+    return replace(scene, train=still(scene.train, load_masks(folder)))
 
 
 def check_method(folder: Path, method: str) -> None:

@@ -242,10 +242,12 @@ class _Search:
 
     def smallest(self, limit: float) -> Compacted:
         """The smallest file whose loss, rounding by the format included, is within the limit."""
-        last = len(self.choices) - 1
-        numbers = {c: self.smallest_number(c, limit) for c in range(last + 1)}
-        sizes = {c: self._stored(self.version(n, c))[1] for c, n in numbers.items() if n is not None}
-        choice, aim = min(sizes, key=lambda c: sizes[c], default=last), limit
+        last, most = len(self.choices) - 1, self._limits.gaussians
+        numbers = {c: n for c in range(last + 1) if (n := self.smallest_number(c, limit)) is not None}
+        # Cheaper harmonics may need more Gaussians than the limit.
+        allowed = {c: n for c, n in numbers.items() if most is None or n <= most}
+        sizes = {c: self._stored(self.version(n, c))[1] for c, n in allowed.items()}
+        choice, aim = min(sizes or numbers, key=lambda c: (sizes or numbers)[c], default=last), limit
         for _ in range(TRIES):
             n = self.smallest_number(choice, aim)
             if n is None:

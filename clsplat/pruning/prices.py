@@ -171,11 +171,12 @@ def _demand(gaussians: Gaussians, views: list[View]) -> None:
 
 
 def sight(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
-    """Unit vectors (N, 3) from a camera to Gaussians, and the sizes (N,) of a pixel there, world units."""
+    """Unit vectors (N, 3) along which a camera sees Gaussians, and the sizes (N,) of a pixel there, world units."""
+    if camera.model == "orthographic":
+        return np.tile(camera.viewmat[2, :3], (len(gaussians), 1)), np.full(len(gaussians), 1 / camera.fx)
     offsets = gaussians.means - camera.position
     distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
-    size = np.ones_like(distances) if camera.model == "orthographic" else distances
-    return offsets / distances[:, None], size / camera.fx
+    return offsets / distances[:, None], distances / camera.fx
 
 
 def _color_changes(renderer: Renderer, run: Pass) -> Array:

@@ -1,12 +1,13 @@
 """Viewpoints around a scene without known cameras, and renders of the scene as views."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
+from clsplat.camera import Camera, default_near
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.render import renderings
@@ -100,9 +101,11 @@ def surround(gaussians: Gaussians, count: int, width: int, height: int) -> list[
     Returns
     -------
     list of lists of Camera
-        Per station. The images' upper edge is towards -y, where most scenes of photogrammetry have their sky.
+        Per station. The images' upper edge is towards -y, where most scenes of photogrammetry have their sky. All
+        have the same near plane, which follows the size of the scene.
     """
     centre, radius = bounds(gaussians)
+    near = default_near(gaussians.means)
     fx = max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2)
     y = 1 - (2 * np.arange(count) + 1) / count
 
@@ -111,7 +114,8 @@ def surround(gaussians: Gaussians, count: int, width: int, height: int) -> list[
         turns = GOLDEN_ANGLE * np.arange(count) + 2 * math.pi * station / len(STATIONS)
         rim = np.sqrt(1 - y**2)
         eyes = centre + distance * radius * np.stack([rim * np.cos(turns), y, rim * np.sin(turns)], axis=1)
-        return [Camera.look_at(eye, eye + gaze * (eye - centre), (0, -1, 0), fx, width, height) for eye in eyes]
+        cameras = [Camera.look_at(eye, eye + gaze * (eye - centre), (0, -1, 0), fx, width, height) for eye in eyes]
+        return [replace(camera, near=near) for camera in cameras]
 
     return [look(station) for station in range(len(STATIONS))]
 

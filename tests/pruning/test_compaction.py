@@ -16,6 +16,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, to_uint8
 from clsplat.pruning import compaction, viewpoints
 from clsplat.pruning.compaction import ASSUMED_PSNR, Limits, LossMeter, _Search, choices_of
+from clsplat.pruning.prices import price
 from clsplat.pruning.reductions import Reduction
 from clsplat.pruning.viewpoints import automatic_cameras, own_views
 from clsplat.render import render
@@ -105,6 +106,42 @@ def test_the_whole_scene_is_the_last_resort():
     assert len(search.smallest(0.1).gaussians) == 100
     with pytest.raises(InputError, match=r"expected more than the 0\.090 dB that the format costs"):
         search.smallest(0.05)
+
+
+def test_a_choice_that_needs_more_gaussians_than_the_limit_is_none():
+    """The cheaper harmonics need 800 Gaussians, the others 500."""
+    cheap, full = synthetic_scene(1000, sh_degree=0)[0], synthetic_scene(1000, sh_degree=3)[0]
+
+    def search_within(most):
+        def loss(version):
+            return 0.0 if len(version) >= (800 if version.sh_degree == 0 else 500) else 1.0
+
+        stored = lambda version: (version, len(version) * (100 + version.sh_degree))  # noqa: E731
+        search = _Search(full, loss, Limits(gaussians=most, loss=0.5), stored)
+        search.reduction = Reduction(full, np.zeros((0, 2), np.intp), np.zeros(1000, np.intp), np.arange(1, 1001))
+        search.choices = [cheap, full]
+        return search
+
+    assert 500 <= len(search_within(600).smallest(0.5).gaussians) <= 1.02 * 500
+    with pytest.raises(InputError, match=r"^--max-gaussians: expected at least 50[0-9], which --max-psnr-loss 0.5"):
+        search_within(400).smallest(0.5)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_prices_without_cameras_do_not_depend_on_the_unit(device, scale):
+    """The near plane of automatic cameras follows the size of the scene, also where they price."""
+
+    def priced(factor):
+        scene = synthetic_scene(60)[0].astype(np.float32)
+        scene.means *= factor
+        scene.log_scales += np.float32(np.log(factor))
+        renderer = Renderer(device)
+        views = own_views(scene, automatic_cameras(scene, renderer), renderer)
+        return price(scene, views, renderer).weights
+
+    expected = priced(1)
+    assert (expected > 0).sum() > 50
+    np.testing.assert_allclose(priced(scale), expected, rtol=0.02, atol=1e-6)
 
 
 def test_what_has_merged_has_the_curvature_of_both(monkeypatch):

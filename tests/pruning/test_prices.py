@@ -11,7 +11,7 @@ from clsplat.config import RenderConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
-from clsplat.pruning.prices import price, removal_order, with_degree, without_bands
+from clsplat.pruning.prices import price, removal_order, sight, with_degree, without_bands
 from clsplat.render import render
 from clsplat.renderer import Renderer
 from clsplat.scene import View
@@ -181,3 +181,11 @@ def test_nothing_to_price_is_an_error():
             price(*arguments, Renderer("reference"))
         with pytest.raises(InputError, match="expected at least one each"):
             removal_order(*arguments, lambda left: True, Renderer("reference"))
+
+
+def test_orthographic_cameras_see_along_their_axis() -> None:
+    camera = Camera(np.eye(4), 50, 50, 20, 15, 40, 30, "orthographic")
+    scene = synthetic_scene(5)[0]
+    directions, sizes = sight(scene, camera)
+    np.testing.assert_array_equal(directions, np.tile([0.0, 0, 1], (5, 1)))
+    np.testing.assert_array_equal(sizes, 1 / 50)
