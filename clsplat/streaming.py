@@ -298,12 +298,13 @@ class Files:
     def write(self, view: View) -> None:
         """Write a photo; an InputError if that fails."""
         for layer in LAYERS:
-            if (array := getattr(view, layer)) is not None:
+            if (found := getattr(view, layer)) is not None:
+                array = np.ascontiguousarray(found)
                 header = np.lib.format.header_data_from_array_1_0(array)
                 with replacing(self._file(view.name, layer)) as file:
                     # Not np.save: on a full disk it may leave a part of a small array without an error.
                     np.lib.format.write_array_header_1_0(file, header)
-                    file.write(np.ascontiguousarray(array).data)
+                    file.write(array.data)
 
     def views(self, like: list[View], budget: int) -> list[View]:
         """The photos that have been written, as a stream; `like`: views of the same names and cameras."""

@@ -10,7 +10,7 @@ from tolerances import DOUBLE, FLOAT
 from clsplat import ops, reference
 from clsplat.device import Device
 from clsplat.gaussians import Gaussians
-from clsplat.renderer import Pass, Renderer, fetch
+from clsplat.renderer import Pass, Renderer, download, fetch
 from clsplat.stages import Image, SplatGrads, Splats
 from clsplat.testing import assert_matches, gradcheck, synthetic_scene
 
@@ -60,6 +60,16 @@ def test_matches_twin(configured_device: Device, height: int, width: int) -> Non
     found, expected = by_kernel(configured_device, *arrays), by_twin(*arrays)
     for name, a, b in zip(("loss", "rgb", "v_image"), found, expected, strict=True):
         assert_matches(name, a, b, tolerances_of(configured_device))
+
+
+def test_an_integer_is_a_weight(any_device: Device) -> None:
+    rng = np.random.default_rng(0)
+    image, target, v_rgb = (
+        any_device.upload("arrays", a) for a in (rng.random((4, 5, 4)), rng.random((4, 5)), rng.random((4, 5, 3)))
+    )
+    found = [download(ops.disparity_grad(any_device, image, target, weight, v_rgb)) for weight in (2, 2.0)]
+    np.testing.assert_array_equal(*found)
+    assert np.abs(found[0][:, :, 3]).max() > 0.1
 
 
 @pytest.mark.parametrize("n", [1, 65, 2000])

@@ -70,6 +70,11 @@ def test_matches_twin(any_device, n):
         np.testing.assert_array_equal(getattr(found, name), getattr(gaussians, name).astype(any_device.real))
 
 
+def test_an_integer_is_a_size(any_device):
+    found = [by_kernel(any_device, scene(9), size, 1, 1).means for size in (3, 3.0)]
+    np.testing.assert_array_equal(*found)
+
+
 def test_spread_is_the_squared_covariance_times_the_gate(any_device):
     """size gate Sigma eta has the covariance (size gate)^2 Sigma^2."""
     n, size, opacity = 20_000, 0.5, 0.01

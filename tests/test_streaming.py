@@ -10,7 +10,7 @@ import pytest
 from cli_runs import SIZE, write_dataset
 from PIL import Image
 from small_files import small_files
-from small_run import CONFIG, same
+from small_run import CONFIG, cameras, same
 
 from clsplat.config import CoarseConfig, DataConfig, InitConfig
 from clsplat.dataset import load_scene
@@ -314,3 +314,11 @@ def test_a_reader_is_not_stopped_by_another_one_that_gives_up_the_copies(tmp_pat
     assert view.digests
     stream.expect("a", view.digests)
     np.testing.assert_array_equal(stream("a").image, view.image)
+
+
+def test_photos_in_the_order_of_fortran_are_written_as_they_are(tmp_path: Path) -> None:
+    view = View("a", cameras(1)[0], np.random.default_rng(0).integers(0, 256, (*SIZE[::-1], 3), np.uint8))
+    view = replace(view, image=np.asfortranarray(view.image), mask=np.asfortranarray(view.image[:, :, 0] > 99))
+    Files(tmp_path).write(view)
+    found = Files(tmp_path).read("a", view.camera)
+    assert found and found.digests == view.digests

@@ -87,6 +87,6 @@ def disparity_grad(device: Device, image: Array, target: Array, weight: float, v
         Gradient of the sum of both losses with respect to `image`.
     """
     v_image = device.empty("v_image with depth", image.shape)
-    arguments = [target.size, weight, image, target, v_rgb, v_image]
+    arguments = [target.size, float(weight), image, target, v_rgb, v_image]
     device.launch("disparity", "disparity_grad", (target.size,), arguments)
     return v_image

@@ -22,5 +22,5 @@ def add_noise(device: Device, gaussians: Gaussians, size: float, seed: int, iter
     key = np.array([seed & 0xFFFFFFFF, seed >> 32], np.uint32)
     arrays = [g.log_scales, g.quats, g.logit_opacities, g.means]
     defines = {"GATE_SLOPE": GATE_SLOPE, "GATE_OPACITY": GATE_OPACITY}
-    scalars = [n, key, np.uint32(iteration), size]
+    scalars = [n, key, np.uint32(iteration), float(size)]
     device.launch("noise", "add_noise", (n,), [*scalars, *arrays], defines=defines)
