@@ -35,8 +35,9 @@ from clsplat.training.rows import Rows
 from clsplat.training.smoothing_filter import SmoothingFilter
 from clsplat.training.state import State
 
-FORMAT = 2
-"""Version of the arrays in a checkpoint. The first had no number; the second adds the inputs and the losses."""
+FORMAT = 3
+"""Version of the arrays in a checkpoint. The first had no number; the second added the inputs and the losses, the
+third adds the gains of the photos."""
 
 SEARCH = ("most", "pace", "grows", "trials", "degrees", "settled", "validated")
 """Fields of a search that are saved as JSON."""

@@ -149,7 +149,7 @@ def test_an_older_checkpoint_is_refused_in_a_sentence(scene: Scene, device: Devi
     added = {name: arrays.pop(name) for name in ("format", "inputs", "losses")}
     np.savez(path, **arrays)
     with pytest.raises(
-        InputError, match=r"checkpoint\.npz: expected a checkpoint of format 2, found format 1 of another"
+        InputError, match=r"checkpoint\.npz: expected a checkpoint of format 3, found format 1 of another"
     ):
         load_state(path, scene.extent, SHORT)
     np.savez(path, **arrays, **(added | {"format": np.array(3)}))
