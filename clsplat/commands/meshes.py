@@ -1,6 +1,7 @@
 """The command `mesh`."""
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -49,6 +50,7 @@ class Mesh:
             raise InputError(f"{self.out}: expected the suffix .ply, found {self.out.suffix or 'none'}")
         if len(self.box) not in (0, 6):
             raise InputError(f"--box: expected six numbers, found {len(self.box)}")
+        check_replaceable(self.out)
         data = dataset_of("mesh", self.data)
         gaussians, mode, offset = load_gaussians(scene_file(self.scene))
         device = open_device(self.device)
@@ -65,3 +67,19 @@ class Mesh:
         )
         save_mesh(self.out, mesh._replace(vertices=mesh.vertices + scene.offset))
         say(f"{self.out}: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
+
+
+def check_replaceable(out: Path) -> None:
+    """Raise an InputError if a PLY exists that is no mesh, such as a trained scene, which has the same suffix."""
+    from clsplat.formats.ply_container import read_header
+    from clsplat.formats.validity import reading
+
+    if not out.is_file():
+        return
+    with reading(out), out.open("rb") as file:
+        elements = read_header(out, file).elements
+    if "face" not in elements:
+        raise InputError(
+            f"{out}: expected a new file or a mesh to replace, found a PLY without triangles, such as a scene; "
+            "choose another name with -o"
+        )

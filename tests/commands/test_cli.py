@@ -128,6 +128,18 @@ def test_mesh_of_a_run(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert len(vertices) > 10 and np.isfinite(vertices["x"]).all()
     assert "expected the suffix .ply" in fails(capsys, "mesh", trained, "-o", tmp_path / "mesh.obj")
     assert "expected six numbers" in fails(capsys, "mesh", trained, "-o", tmp_path / "b.ply", "--box", 1, 2, 3)
+    run("mesh", trained, "-o", tmp_path / "part.ply", "--resolution", 16)  # a mesh is replaced
+    assert PlyData.read(tmp_path / "part.ply")["vertex"].count == len(vertices)
+
+
+def test_a_mesh_does_not_replace_a_scene(
+    trained: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = tmp_path / "scene.ply"
+    shutil.copyfile(trained / "scene.ply", scene)
+    message = fails(capsys, "mesh", scene, dataset, "-o", scene, "--resolution", 16)
+    assert "expected a new file or a mesh to replace, found a PLY without triangles" in message
+    assert scene.read_bytes() == (trained / "scene.ply").read_bytes()
 
 
 def test_export_keeps_the_scene(trained: Path, tmp_path: Path) -> None:
