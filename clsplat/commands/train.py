@@ -93,6 +93,8 @@ class Train:
         out = self.out.with_name(self.out.name[: -len(suffix)]) if suffix else self.out
         if suffix:
             check_writable(self.out)
+        if suffix and self.out.exists() and not self.resume:
+            raise InputError(f"{self.out}: expected a new file, found one that exists; choose another name with -o")
         if self.resume and not began(out):
             raise no_checkpoint(out)
         if self.resume:
@@ -211,11 +213,21 @@ class Train:
 
 
 def check_new(out: Path, resume: bool) -> None:
-    """Raise an InputError if a folder holds a run and none resumes."""
-    if not resume and began(out):
+    """Raise an InputError if a folder holds a run and none resumes.
+
+    A run that ended before its first checkpoint is none yet: the same command starts it again.
+    """
+    from clsplat.fields.field_files import MODEL
+
+    if resume:
+        return
+    if began(out):
         raise InputError(
             f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
         )
+    for name in (SCENE, MODEL):
+        if (out / name).exists():
+            raise InputError(f"{out}: expected a folder without {name}, found one; choose another folder with -o")
 
 
 def train_method(command: Train, out: Path, suffix: str) -> None:

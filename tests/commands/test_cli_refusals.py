@@ -21,6 +21,34 @@ def test_a_run_is_not_overwritten(trained: Path, dataset: Path, capsys: pytest.C
     assert "--resume" in message
 
 
+@pytest.mark.parametrize("left", ["scene.ply", "field.npz"])
+def test_a_result_without_its_checkpoint_is_not_overwritten(
+    left: str, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / left).write_bytes(b"trained for days")
+    message = fails(capsys, "train", dataset, "-o", tmp_path, *TRAIN)
+    assert f"{tmp_path}: expected a folder without {left}, found one" in message
+    assert (tmp_path / left).read_bytes() == b"trained for days"
+
+
+def test_a_file_beside_the_folder_is_not_overwritten(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "old.spz").write_bytes(b"trained for days")
+    message = fails(capsys, "train", dataset, "-o", tmp_path / "old.spz", *TRAIN)
+    assert "old.spz: expected a new file, found one that exists" in message
+    assert [path.name for path in tmp_path.iterdir()] == ["old.spz"]
+
+
+def test_a_run_that_ended_before_its_first_checkpoint_starts_again(
+    trained: Path, dataset: Path, tmp_path: Path
+) -> None:
+    for name in ("config.json", "log.jsonl"):
+        shutil.copyfile(trained / name, tmp_path / name)
+    run("train", dataset, "-o", tmp_path, *TRAIN)
+    assert (tmp_path / "scene.ply").read_bytes() == (trained / "scene.ply").read_bytes()
+
+
 def test_train_says_what_memory_it_takes_and_when_it_has_begun(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
