@@ -1,6 +1,7 @@
 """The training of a field: iterations, log, checkpoints and evaluations."""
 
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clsplat.config import BACKGROUNDS, TrainConfig
-from clsplat.errors import ClsplatError
+from clsplat.errors import ClsplatError, InputError
 from clsplat.fields.field import Field
 from clsplat.fields.field_files import MODEL, load_checkpoint, save_checkpoint, save_field
 from clsplat.fields.pixels import Pixels
@@ -74,7 +75,7 @@ def train_field(
     Warns
     -----
     UserWarning
-        If a training resumes on another device.
+        If a training resumes on another device, or its last checkpoint cannot be written.
     """
     config = replace(config, iterations=config.iterations or method.iterations)
     inputs = Inputs.of(scene, device)
@@ -101,7 +102,10 @@ def train_field(
                 raise
             if field.iteration % config.checkpoint_every == 0 and field.iteration < config.iterations:
                 save()
-    save()
+    try:
+        save()
+    except InputError as error:
+        warnings.warn(f"{error}; the field is written next, without it", stacklevel=2)
     field.finish()
     save_field(out / MODEL, field)
     return field

@@ -96,7 +96,7 @@ def train(
     -----
     UserWarning
         If the Gaussians stop growing because more would not fit the device's memory, or if a run resumes on another
-        device or driver, where its bits differ.
+        device or driver, where its bits differ; or if the last checkpoint cannot be written.
     """
     check(scene, config)
     scene, config = with_near_planes(scene), with_length(config, scene)
@@ -142,15 +142,16 @@ def complete(
 
 
 def _run(training: Training, recorder: Recorder, out: Path) -> None:
+    last = training.config.iterations
     try:
         with driver_errors():
             if training.state.search:
                 search_size(training, recorder.after, recorder.after_fork)
-            training.run_until(training.config.iterations, recorder.after)
-    except InputError as error:  # a photo that streams
+            training.run_until(last, recorder.after)
+    except InputError as error:  # a photo that streams, or a checkpoint that cannot be written
         raise InputError(
-            f"iteration {training.state.iteration + 1}: {error}; the last checkpoint in {out}, if there is one, is "
-            "intact: --resume continues from it"
+            f"iteration {min(training.state.iteration + 1, last)}: {error}; the last checkpoint in {out}, if there "
+            "is one, is intact: --resume continues from it"
         ) from error
     except DeviceError as error:
         less = "" if isinstance(error, BuildError) else ", and a lower --memory-limit stops growth earlier"

@@ -1,12 +1,14 @@
 """Records of a training: its log, its checkpoints, its evaluations, and its training time."""
 
 import time
+import warnings
 from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.resuming import CHECKPOINT
 from clsplat.run_log import LOG_EVERY, Append
@@ -55,7 +57,9 @@ class Recorder:
         state.seconds = max(state.seconds, time.perf_counter() - self._started)
         if state.iteration < config.iterations:  # the last line is about the scene as it is saved
             self._line(state.shown(training.renderer) if state.iteration in self._evaluate_after else None)
-        if state.iteration % config.checkpoint_every == 0 or state.iteration == config.iterations:
+        if state.iteration == config.iterations:
+            self._save_last()
+        elif state.iteration % config.checkpoint_every == 0:
             self._save()
         self._tell(training, loss)
 
@@ -93,6 +97,13 @@ class Recorder:
             self._save()
             raise
         self._started += time.perf_counter() - left
+
+    def _save_last(self) -> None:
+        """Save the state after the last iteration. The scene, which is smaller, may fit where this does not."""
+        try:
+            self._save()
+        except InputError as error:
+            warnings.warn(f"{error}; the scene is written next, without it", stacklevel=2)
 
     def _save(self) -> None:
         training = self._training

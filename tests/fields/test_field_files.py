@@ -43,6 +43,13 @@ def test_runs_repeat_and_resume_to_the_bit(device, method, room, tmp_path):
     assert [line["iteration"] for line in lines[0]] == [10, 20, 30, 40] and lines[1] == lines[0]
 
 
+def test_a_last_checkpoint_that_cannot_be_written_leaves_the_field(device, scene, tmp_path):
+    (tmp_path / CHECKPOINT).mkdir()  # no file can replace a folder
+    with pytest.warns(UserWarning, match="cannot write .*; the field is written next, without it"):
+        train_field(scene, SmallNerf, replace(CONFIG, iterations=2), tmp_path, device)
+    assert (tmp_path / MODEL).is_file()
+
+
 @EACH
 def test_an_interrupt_within_a_step_leaves_the_last_checkpoint(device, scene, method, tmp_path, monkeypatch):
     """Half of a step is no state from which a run could go on to the same bits."""

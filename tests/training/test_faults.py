@@ -154,6 +154,18 @@ def test_a_disk_that_fills_up_in_training(dataset: Path, whole: bytes, tmp_path:
     assert (tmp_path / "scene.ply").read_bytes() == whole
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="needs a system with limits on the size of files")
+def test_a_last_checkpoint_that_does_not_fit_leaves_the_scene(dataset: Path, whole: bytes, tmp_path: Path) -> None:
+    arguments = ["train", dataset, "-o", tmp_path, *TRAIN]
+    script = DISK_FULL.replace("4096", "500_000")  # of the files, only the checkpoint is larger
+    done = subprocess.run(
+        [sys.executable, "-c", script, *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "checkpoint.npz: File too large; the scene is written next, without it" in done.stderr
+    assert (tmp_path / "scene.ply").read_bytes() == whole
+
+
 @pytest.mark.parametrize("reason", ["OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "DEVICE_NOT_AVAILABLE"])
 def test_a_device_that_fails_in_the_middle(
     dataset: Path,
