@@ -10,8 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 from clsplat import display
 from clsplat.constants import FISHEYE_ANGLE_MAX, FRUSTUM_MARGIN, NEAR, NEAR_EXTENTS
 from clsplat.errors import InputError, whole
+from clsplat.fisheye import fisheye_angle, fisheye_radius
 
 CameraModel = Literal["pinhole", "orthographic", "fisheye", "equirectangular"]
+
+LAST_ROW_TOLERANCE = 1e-4
+"""Largest difference of the last row of a pose from 0, 0, 0, 1: inversions round it, and finite differences vary
+it. A transposed pose has its translation there."""
+
+PARALLEL = 1e-12
+"""Sine of the angle between two directions up to which rounding determines it: they are parallel."""
 
 NEAR_MEANS = 10_000
 """Approximate number of Gaussians from which `default_near` is computed; the others are skipped."""
@@ -52,8 +60,8 @@ class Camera:
     ------
     InputError
         If the model is unknown, a camera other than a fisheye has a distortion, a value is not finite as float32, a
-        focal length or a size is not positive, a size is not an integer, or the upper left 3x3 of `viewmat` is not a
-        rotation (not orthonormal to 1e-3, or a reflection).
+        focal length or a size is not positive, a size is not an integer, the upper left 3x3 of `viewmat` is not a
+        rotation (not orthonormal to 1e-3, or a reflection), or its last row is not 0, 0, 0, 1 to 1e-4.
     """
 
     viewmat: NDArray[np.float64]
@@ -102,6 +110,11 @@ class Camera:
                 "viewmat: expected a rotation in its upper left 3x3 (orthonormal, determinant +1), found determinant "
                 f"{np.linalg.det(rotation):.4g}"
             )
+        if np.abs(viewmat[3] - (0, 0, 0, 1)).max() > LAST_ROW_TOLERANCE:
+            raise InputError(
+                f"viewmat: expected 0, 0, 0, 1 in its last row, found {display.numbers(viewmat[3])}; transpose a "
+                "matrix whose translation is in its last row"
+            )
 
     @property
     def K(self) -> NDArray[np.float64]:
@@ -131,7 +144,7 @@ class Camera:
         turns = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0)]
         most = min(FISHEYE_ANGLE_MAX, float(np.sqrt(turns.min(initial=np.inf))))
         corners = np.hypot(*np.meshgrid(self._slopes_x([0, self.width]), self._slopes_y([0, self.height])))
-        return min(most, (1 + FRUSTUM_MARGIN) * float(_fisheye_angle(corners.max(), self.distortion, most)))
+        return min(most, (1 + FRUSTUM_MARGIN) * float(fisheye_angle(corners.max(), self.distortion, most)))
 
     def _slopes_x(self, u: ArrayLike) -> NDArray[np.float64]:
         return np.asarray((np.asarray(u, dtype=np.float64) - self.cx) / self.fx)
@@ -161,8 +174,8 @@ class Camera:
             directions = np.stack([a, b, np.ones_like(a)], axis=-1)
             return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
         radius = np.hypot(a, b)
-        angle = _fisheye_angle(radius, self.distortion, self.angle_max)
-        angle = np.where(radius > _fisheye_radius(self.angle_max, self.distortion), np.nan, angle)
+        angle = fisheye_angle(radius, self.distortion, self.angle_max)
+        angle = np.where(radius > fisheye_radius(self.angle_max, self.distortion), np.nan, angle)
         across = np.sin(angle) / np.where(radius > 0, radius, 1)
         return np.stack([a * across, b * across, np.cos(angle)], axis=-1)
 
@@ -186,11 +199,20 @@ class Camera:
         """Make a pinhole camera at `position` (3,) that looks at `target` (3,), with `up` (3,) upwards in the image.
 
         It has square pixels, a focal length of `fx` pixels, and the principal point at the centre of the image.
+
+        Raises
+        ------
+        InputError
+            If `target` is `position`, `up` is parallel to the direction between them, or the camera is not valid.
         """
         eye = np.asarray(position, dtype=np.float64)
         forward = np.asarray(target, dtype=np.float64) - eye
+        if not forward.any():
+            raise InputError(f"position, target: expected two points, found {display.numbers(eye)} for both")
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, np.asarray(up, dtype=np.float64))
+        if np.linalg.norm(right) <= PARALLEL * np.linalg.norm(np.asarray(up, dtype=np.float64)):
+            raise InputError(f"up: expected a direction not parallel to that from position to target, found {up}")
         right /= np.linalg.norm(right)
         viewmat = np.eye(4)
         viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
@@ -244,25 +266,6 @@ def _pixel_rays(
     rays = np.nan_to_num(camera.rays(u, v))
     rays.flags.writeable = False
     return rays
-
-
-def _fisheye_radius(angle: ArrayLike, distortion: tuple[float, ...]) -> NDArray[np.float64]:
-    """Compute theta_d from theta, in radians."""
-    theta = np.asarray(angle, dtype=np.float64)
-    return np.asarray(theta * np.polyval([*reversed(distortion), 1.0], theta**2))
-
-
-def _fisheye_angle(
-    radius: NDArray[np.float64] | np.float64, distortion: tuple[float, ...], most: float
-) -> NDArray[np.float64]:
-    """Compute theta from theta_d by bisection between 0 and `most`, in which range the radius grows."""
-    low = np.zeros(np.shape(radius))
-    high = np.full(np.shape(radius), most)
-    for _ in range(53):  # one bit of float64 per step
-        middle = 0.5 * (low + high)
-        below = _fisheye_radius(middle, distortion) < radius
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return high
 
 
 AXES_SPREAD_MIN = 0.003

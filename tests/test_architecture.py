@@ -21,7 +21,7 @@ STAGES = sorted(p.stem for p in (PACKAGE / "ops").glob("*.py") if p.stem != "__i
 
 # A unit is a package or a module of the top level. It imports only from the rows above its own.
 LAYERS = """
-    constants errors randomness display resuming host_memory
+    constants errors randomness display resuming host_memory fisheye
     ranges json_lines processors event_log
     config atomic
     camera gaussians field_stages run_log

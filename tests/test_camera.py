@@ -46,6 +46,25 @@ def test_refused(changes, message):
         make(**changes)
 
 
+def test_a_transposed_pose_is_refused():
+    with pytest.raises(InputError, match=r"viewmat: expected 0, 0, 0, 1 in its last row, found .*; transpose"):
+        make(viewmat=random_camera().viewmat.T)
+    make(viewmat=np.linalg.inv(np.linalg.inv(random_camera().viewmat).astype(np.float32)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (((1, 2, 3), (1, 2, 3), (0, 0, 1)), "position, target: expected two points, found 1, 2, 3 for both"),
+        (((0, 0, 3), (0, 0, 0), (0, 0, 1)), "up: expected a direction not parallel"),
+        (((0, 1, 3), (0, 0, 0), (0, 0, 0)), "up: expected a direction not parallel"),
+    ],
+)
+def test_points_from_which_no_camera_follows(arguments, message):
+    with pytest.raises(InputError, match=message):
+        Camera.look_at(*arguments, 80, 64, 48)
+
+
 def test_a_size_of_numpy_is_one_of_python():
     camera = make(width=np.int64(64), height=np.uint16(48))
     assert type(camera.width) is type(camera.height) is int

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.camera import LAST_ROW_TOLERANCE
 from clsplat.config import DataConfig
 from clsplat.dataset.decoding import SIZE_MAX, Dataset, PosedPhoto
 from clsplat.dataset.finding import (
@@ -252,6 +253,11 @@ def _viewmat(frame: Json, path: Path, name: str) -> NDArray[np.float64]:
     except (OverflowError, TypeError, ValueError):
         matrix = np.empty(0)
     viewmat = np.eye(4)
+    if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > LAST_ROW_TOLERANCE:
+        raise InputError(
+            f"{path}: expected 0, 0, 0, 1 in the last row of the transform_matrix of frame {name}, found "
+            f"{matrix[3].tolist()}; transpose a matrix whose translation is in its last row"
+        )
     if matrix.shape in ((4, 4), (3, 4)):
         rotation = matrix[:3, :3] * (1.0, -1.0, -1.0)
         viewmat[:3, :3] = rotation.T

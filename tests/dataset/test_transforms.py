@@ -53,6 +53,15 @@ def test_poses_become_opencv_world_to_camera(root):
     assert scene.points.shape == (0, 3)
 
 
+def test_transposed_matrices_are_refused(root):
+    rows = [{**frame, "transform_matrix": np.transpose(frame["transform_matrix"]).tolist()} for frame in frames()]
+    (root / "transforms.json").write_text(json.dumps({"frames": rows, "fl_x": 50}))
+    with pytest.raises(
+        InputError, match=r"expected 0, 0, 0, 1 in the last row of .* images/0.png, found .*transpose"
+    ):
+        read_dataset(root, DataConfig())
+
+
 def test_matrices_of_three_rows_are_the_same(root):
     rows = [{**frame, "transform_matrix": frame["transform_matrix"][:3]} for frame in frames()]
     (root / "transforms.json").write_text(json.dumps({"frames": rows, "fl_x": 50}))
@@ -162,7 +171,7 @@ MIRRORED = (np.array(opengl(CAMERAS[1])) @ np.diag([-1, 1, 1, 1])).tolist()
         (bad_frame(transform_matrix=[[1, 2], [3]]), r"transform_matrix.*1\.png"),
         (bad_frame(transform_matrix=(np.eye(4) * np.nan).tolist()), r"transform_matrix.*1\.png"),
         (bad_frame(transform_matrix=MIRRORED), r"1\.png.*determinant -1"),
-        (bad_frame(transform_matrix=(2 * np.eye(4)).tolist()), r"1\.png.*determinant"),
+        (bad_frame(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), r"1\.png.*determinant"),
         (bad_frame(fl_x="wide"), r"1\.png.*fl_x.*wide"),
         (bad_frame(fl_x=-3), r"1\.png.*fl_x"),
         (bad_frame(k1=float("nan")), r"1\.png.*k1"),
