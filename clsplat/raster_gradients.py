@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.raster_arguments import exponents, on_host
 from clsplat.renderer import Renderer, download, fetch
 from clsplat.stages import AnyGrads, AnySplats, Bins, Image
 
@@ -150,7 +151,7 @@ class Rasterization(_Outputs):
         v_features = np.stack(values)
         return RasterGradients(
             total["means"],
-            total["quats"],
+            np.ldexp(total["quats"], -exponents(gaussians.quats)),
             _quotient(total["log_scales"], np.asarray(gaussians.scales, np.float64)),
             _quotient(total["logit_opacities"], gaussians.opacities * (1 - gaussians.opacities)),
             total["sh"] if sh_degree is not None else v_features.sum(axis=0) if shared else v_features,
@@ -194,25 +195,6 @@ def _matrix(intrinsics: Array) -> Array:
 
 def _quotient(x: Array, y: Array) -> Array:
     return np.divide(x, y, out=np.zeros_like(x), where=y > 0)
-
-
-def on_host(name: str, array: Any) -> Array:
-    """An argument as an array of NumPy, which shares the memory of what exports DLPack.
-
-    Raises
-    ------
-    InputError
-        If its memory is not the host's, or its library does not export it.
-    """
-    if isinstance(array, np.ndarray) or not hasattr(array, "__dlpack__"):
-        return np.asarray(array)
-    try:
-        return np.from_dlpack(array)
-    except (BufferError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{name}: expected an array in the memory of the host, which DLPack shares, found {type(array).__name__} "
-            f"({error}); copy it to the host, and detach it from its gradients"
-        ) from error
 
 
 def _checked(name: str, array: Any, expected: tuple[int, ...]) -> Array:

@@ -1,16 +1,28 @@
 """`rasterization`: gsplat's function of that name on OpenCL, with its gradients."""
 
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.camera import Camera, CameraModel
+from clsplat.camera import Camera
 from clsplat.constants import BLUR
-from clsplat.errors import DeviceError, InputError, whole
-from clsplat.gaussians import Gaussians, logit
-from clsplat.raster_gradients import Rasterization, RasterPass, on_host
+from clsplat.errors import DeviceError, InputError
+from clsplat.gaussians import Gaussians
+from clsplat.raster_arguments import (
+    RenderMode,
+    arrays,
+    behind_of,
+    cameras_of,
+    check_choices,
+    gaussians_of,
+    moderated,
+    rows_of,
+    values_of,
+)
+from clsplat.raster_gradients import Rasterization, RasterPass
 from clsplat.renderer import Renderer, download
 from clsplat.stages import AnySplats
 from clsplat.surface import surface_of
@@ -18,24 +30,8 @@ from clsplat.surface import surface_of
 if TYPE_CHECKING:
     from clsplat.device import Device
 
-CAMERA_MODELS: dict[str, CameraModel] = {"pinhole": "pinhole", "ortho": "orthographic", "fisheye": "fisheye"}
-"""gsplat's names of camera models, and ours."""
-
 _BLURRED: "WeakKeyDictionary[Device, Device]" = WeakKeyDictionary()
 """The last result of `_blurred` for each device, as long as that lives: it holds the compiled kernels."""
-
-RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
-
-CHOICES: dict[str, tuple[Any, ...]] = {
-    "tile_size": (8, 16, 32),
-    "render_mode": get_args(RenderMode),
-    "rasterize_mode": ("classic", "antialiased"),
-    "camera_model": tuple(CAMERA_MODELS),
-}
-"""Values of the options that are names or sizes."""
-
-CHANNELS_MAX = 32
-"""Largest number of channels of the values."""
 
 
 def rasterization(
@@ -80,7 +76,7 @@ def rasterization(
     viewmats : (C, 4, 4)
         World to camera.
     Ks : (C, 3, 3)
-        Intrinsic matrices, px.
+        Intrinsic matrices without skew, px.
     width, height : int
         Image size, px.
     sh_degree : int, optional
@@ -128,33 +124,34 @@ def rasterization(
         If there is no OpenCL device, a buffer exceeds its limits, or the pixels of a tile exceed the local memory,
         which holds them for the gradients.
     """
-    _check_choices(
+    check_choices(
         tile_size=tile_size, render_mode=render_mode, rasterize_mode=rasterize_mode, camera_model=camera_model
     )
-    means, quats, scales, opacities = _arrays(means=means, quats=quats, scales=scales, opacities=opacities)
-    colors, viewmats, Ks = _arrays(colors=colors, viewmats=viewmats, Ks=Ks)
-    n, count = len(means), len(viewmats)
+    means, quats, scales, opacities = arrays(means=means, quats=quats, scales=scales, opacities=opacities)
+    colors, viewmats, Ks = arrays(colors=colors, viewmats=viewmats, Ks=Ks)
+    n, count = rows_of("means", means, (3,)), rows_of("viewmats", viewmats, (4, 4))
     if n == 0 or count == 0:
         raise InputError(f"means, viewmats: expected at least one Gaussian and one camera, found {n} and {count}")
     shared = colors.ndim == 2
     if sh_degree is None:
-        colors = _values(np.broadcast_to(colors, (count, *colors.shape)) if shared else colors, (count, n))
-    gaussians = _gaussians(means, scales, quats, opacities, colors, sh_degree)
-    cameras = _cameras(viewmats, Ks, (width, height), camera_model, radial_coeffs, near_plane)
+        colors = values_of(np.broadcast_to(colors, (count, *colors.shape)) if shared else colors, (count, n))
+    gaussians = gaussians_of(means, scales, quats, opacities, colors, sh_degree)
+    cameras = cameras_of(viewmats, Ks, (width, height), camera_model, radial_coeffs, near_plane)
     channels = colors.shape[2] if sh_degree is None else 3
-    behind = _behind(backgrounds, (count, channels))
+    behind = behind_of(backgrounds, (count, channels))
 
     renderer = _renderer(device, eps2d)
     if gradients:
         _check_local(renderer.device, tile_size, channels * ("RGB" in render_mode) + ("D" in render_mode))
-    placed, antialiased = renderer.place(gaussians), rasterize_mode == "antialiased"
+    moderate = replace(gaussians, quats=moderated(gaussians.quats))
+    placed, antialiased = renderer.place(moderate), rasterize_mode == "antialiased"
     parts: list[tuple[RasterPass, dict[str, Any]]] = []
     for i, camera in enumerate(cameras):
         splats = renderer.stages.project_fwd(placed, camera, sh_degree or 0, antialiased=antialiased, channels=4)
         splats = _clipped(renderer, splats, radius_clip)
         values = colors[i] if sh_degree is None else download(splats.colors)[:, :3]
         run, meta = _composited(renderer, splats, camera, values, behind[i], (render_mode, tile_size, gradients))
-        parts.append((run, meta | _surface(renderer, gaussians, run) if normals else meta))
+        parts.append((run, meta | _surface(renderer, moderate, run) if normals else meta))
     passes = [run for run, _ in parts]
     stacked: dict[str, Any] = {name: np.stack([meta[name] for _, meta in parts]) for name in parts[0][1]}
     stacked |= {"width": width, "height": height, "tile_size": tile_size, "n_cameras": count}
@@ -162,33 +159,6 @@ def rasterization(
     if gradients:
         result.remember(renderer, placed, gaussians, passes, sh_degree, antialiased, shared)
     return result
-
-
-def _arrays(**given: ArrayLike) -> list[NDArray[np.float64]]:
-    """Arguments by name as arrays of NumPy."""
-    return [np.asarray(on_host(name, array), np.float64) for name, array in given.items()]
-
-
-def _values(colors: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
-    """The values of the cameras, of the shape (C, N, D)."""
-    channels = colors.shape[-1] if colors.ndim else 0
-    _check_shape("colors", colors, (*shape, channels))
-    if not 1 <= channels <= CHANNELS_MAX:
-        raise InputError(
-            f"colors: expected 1 to {CHANNELS_MAX} channels, found {channels}; rasterize more in several calls"
-        )
-    return colors
-
-
-def _behind(backgrounds: ArrayLike | None, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """The backgrounds of the cameras, of the shape (C, D)."""
-    if backgrounds is None:
-        return np.zeros(shape)
-    (behind,) = _arrays(backgrounds=backgrounds)
-    _check_shape("backgrounds", behind, shape)
-    if not np.isfinite(behind).all():
-        raise InputError("backgrounds: expected finite numbers, found NaN or infinity")
-    return behind
 
 
 def _surface(renderer: Renderer, gaussians: Gaussians, run: RasterPass) -> dict[str, Any]:
@@ -227,32 +197,6 @@ def _blurred(device: "Device | None", eps2d: float) -> "Device":
     return _BLURRED[device]
 
 
-def _gaussians(
-    means: NDArray[Any],
-    scales: NDArray[Any],
-    quats: NDArray[Any],
-    opacities: NDArray[Any],
-    colors: NDArray[Any],
-    sh_degree: int | None,
-) -> Gaussians:
-    """Gaussians from activated parameters, without spherical harmonics if `sh_degree` is None."""
-    _check_shape("scales", scales, (len(means), 3))
-    _check_shape("opacities", opacities, (len(means),))
-    if (scales < 0).any():
-        raise InputError(f"scales: expected numbers of 0 or more, found {scales.min()}; take exp() of logarithms")
-    if ((opacities < 0) | (opacities > 1)).any():
-        raise InputError(
-            f"opacities: expected numbers from 0 to 1, found {opacities.min()} to {opacities.max()}; take the "
-            "sigmoid of logits"
-        )
-    sh = np.zeros((len(means), 1, 3)) if sh_degree is None else colors
-    with np.errstate(divide="ignore"):  # opacities 0 and 1, scales 0
-        result = Gaussians(means, np.log(scales), quats, logit(opacities), sh).validate()
-    if sh_degree is not None and not 0 <= whole("sh_degree", sh_degree) <= result.sh_degree:
-        raise InputError(f"sh_degree: expected 0 to {result.sh_degree} (what colors hold), found {sh_degree}")
-    return result
-
-
 def _check_local(device: "Device | None", tile_size: int, channels: int) -> None:
     """Raise a DeviceError if the local memory of a GPU does not hold what `backward` keeps of a tile's pixels."""
     if device is None or device.is_cpu:
@@ -263,37 +207,6 @@ def _check_local(device: "Device | None", tile_size: int, channels: int) -> None
             f"tile_size: gradients of {channels} channels in tiles of {tile_size} px need {needed} bytes of local "
             f"memory, but {device.label} has {device.cl_device.local_mem_size}; use smaller tiles or fewer channels"
         )
-
-
-def _cameras(
-    viewmats: NDArray[Any],
-    Ks: NDArray[Any],
-    size: tuple[int, int],
-    model: str,
-    radial_coeffs: ArrayLike | None,
-    near_plane: float | None,
-) -> list[Camera]:
-    """Cameras from gsplat's arguments."""
-    count = len(viewmats)
-    _check_shape("viewmats", viewmats, (count, 4, 4))
-    _check_shape("Ks", Ks, (count, 3, 3))
-    distortions = np.zeros((count, 4))
-    if radial_coeffs is not None:
-        (distortions,) = _arrays(radial_coeffs=radial_coeffs)
-    _check_shape("radial_coeffs", distortions, (count, 4))
-    if near_plane is not None and not 0 < near_plane < float("inf"):
-        raise InputError(f"near_plane: expected a depth above 0, found {near_plane}")
-    return [
-        Camera(
-            viewmat,
-            *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
-            *size,
-            CAMERA_MODELS[model],
-            tuple(distortion.tolist()),
-            near=near_plane,
-        )
-        for viewmat, K, distortion in zip(viewmats, Ks, distortions, strict=True)
-    ]
 
 
 def _composited(
@@ -333,14 +246,3 @@ def _with_depth(values: NDArray[Any], depths: NDArray[Any], render_mode: str) ->
     if render_mode in ("D", "ED"):
         return depths[:, None]
     return np.concatenate([values, depths[:, None]], axis=1)
-
-
-def _check_shape(name: str, array: NDArray[Any], expected: tuple[int, ...]) -> None:
-    if array.shape != expected:
-        raise InputError(f"{name}: expected shape {expected}, found {array.shape}")
-
-
-def _check_choices(**given: Any) -> None:
-    for name, value in given.items():
-        if value not in CHOICES[name]:
-            raise InputError(f"{name}: expected {', '.join(map(str, CHOICES[name]))}, found {value!r}")

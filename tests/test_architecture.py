@@ -25,7 +25,7 @@ LAYERS = """
     ranges json_lines processors event_log
     config atomic
     camera gaussians field_stages run_log
-    scene stages metrics panorama programs
+    scene stages metrics panorama programs raster_arguments
     streaming
     buffers
     structs reference device

@@ -80,6 +80,19 @@ def test_gradients_are_those_of_differences(
     assert np.abs(v.means2d).max() > 0 and v.means2d.shape == (2, 12, 2)
 
 
+@pytest.mark.parametrize("power", [-100, 100])
+def test_quaternions_of_any_norm(given: dict[str, Any], device: Device, power: int) -> None:
+    """A power of two changes no bit of the image, and divides the gradients."""
+    inputs = with_colors(given, 3)
+    plain, scaled = (
+        rasterization(**(inputs | {"quats": factor * given["quats"]}), gradients=True, device=device)
+        for factor in (1.0, 2.0**power)
+    )
+    np.testing.assert_array_equal(scaled.render, plain.render)
+    v_render = np.ones(plain.render.shape)
+    np.testing.assert_array_equal(scaled.backward(v_render).quats, plain.backward(v_render).quats / 2.0**power)
+
+
 def test_values_of_each_camera_have_gradients_of_their_own(given: dict[str, Any], device64: Device) -> None:
     inputs = with_colors(given, 4)
     v_render = np.random.default_rng(3).normal(size=(2, given["height"], given["width"], 4))
