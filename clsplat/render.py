@@ -62,7 +62,7 @@ class Rendering:
         self.rgb, self.alpha = image[:, :, :3], alpha
         self.depth: Array | None = None
         if image.shape[2] == 4:
-            self.depth = np.divide(image[:, :, 3], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+            self.depth = _quotient(image[:, :, 3], alpha)
 
     def _repr_png_(self) -> bytes:
         return display.png(self.rgb)
@@ -82,7 +82,8 @@ class Rendering:
             return Surface(ids, zeros[:, :, 0], zeros[:, :, 1:])
         run = self._run
         ids = download(self._renderer.stages.median_splats(run.drawn, run.bins))
-        return surface_of(fetch(self._gaussians), run.camera, np.where(ids < len(self._gaussians), ids, -1))
+        # What was rendered: the caller may have changed the Gaussians since.
+        return surface_of(fetch(run.gaussians), run.camera, np.where(ids < len(self._gaussians), ids, -1))
 
     def backward(
         self,
@@ -151,15 +152,25 @@ class Rendering:
 
     def _image_gradients(self, v_rgb: Array | None, v_alpha: Array | None, v_depth: Array | None) -> Image:
         """Gradients with respect to the composited channels; the depth is the fourth channel over alpha."""
+        assert self._run
         # Filled on the host: its dtype is that of the image.
         v_image = np.zeros((*self.alpha.shape, 3 if self.depth is None else 4), dtype=self.alpha.dtype)
         v_total_alpha = np.zeros_like(self.alpha) if v_alpha is None else np.array(v_alpha, dtype=self.alpha.dtype)
         if v_rgb is not None:
             v_image[:, :, :3] = v_rgb
         if v_depth is not None and self.depth is not None:
-            v_image[:, :, 3] = np.divide(v_depth, self.alpha, out=np.zeros_like(self.alpha), where=self.alpha > 0)
-            v_total_alpha -= v_image[:, :, 3] * self.depth
+            # Those of the pass: the caller may have changed the ones of this object.
+            alpha = download(self._run.image.alpha)
+            depth = _quotient(download(self._run.image.rgb)[:, :, 3], alpha)
+            v_image[:, :, 3] = _quotient(v_depth, alpha)
+            v_total_alpha -= v_image[:, :, 3] * depth
         return Image(v_image, v_total_alpha)
+
+
+def _quotient(sums: Array, alpha: Array) -> Array:
+    """Sums (H, W) over alpha (H, W); 0 where that is 0."""
+    quotient: Array = np.divide(sums, alpha, out=np.zeros_like(alpha), where=alpha > 0)
+    return quotient
 
 
 def render(
@@ -280,7 +291,10 @@ def _renderings(
 ) -> Iterator[Rendering]:
     """Generator of the images. It is separate so that errors of `renderings` come before the first image."""
     for run, image, alpha in _drawings(renderer, gaussians, cameras, degree, depth, gradients):
-        yield Rendering(renderer, run if gradients else None, gaussians, download(image), download(alpha))
+        shown, cover = download(image), download(alpha)
+        if run and renderer.device is None:  # the arrays of the pass itself, which its gradients need
+            shown, cover = shown.copy(), cover.copy()
+        yield Rendering(renderer, run if gradients else None, gaussians, shown, cover)
 
 
 def images(renderer: Renderer, gaussians: Gaussians, cameras: Iterable[Camera], sh_degree: int) -> Iterator[Any]:

@@ -309,6 +309,23 @@ def test_one_gaussian(device64):
     check_gradients(device64, gaussians, camera, RenderConfig())
 
 
+@pytest.mark.parametrize("twin", [False, True])
+def test_gradients_do_not_follow_changes_in_place(device, twin):
+    """Of the image, alpha and depth that were returned, and of the Gaussians that were rendered."""
+    gaussians, camera = synthetic_scene(20, seed=3)
+    where = "reference" if twin else device
+    changed, kept = (render(gaussians, camera, device=where, depth=True) for _ in range(2))
+    v_images = random_grads(kept)
+    expected, surface = kept.backward(*v_images), kept.surface()
+    for array in (changed.rgb, changed.alpha, changed.depth, *gaussians.arrays().values()):
+        array *= 0.5
+    found = changed.backward(*v_images)
+    for one, other in zip(found.gaussians.arrays().values(), expected.gaussians.arrays().values(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for one, other in zip(changed.surface(), surface, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_gradients_left_out_are_zero(device):
     gaussians, camera = synthetic_scene(30)
     rendering = render(gaussians, camera, RenderConfig(), device, depth=True)
