@@ -182,6 +182,11 @@ def fractional_bits(path: str | Path, gaussians: Gaussians) -> int:
     ------
     InputError
         If a coordinate does not fit into 24 bits even without fractional bits.
+
+    Warns
+    -----
+    UserWarning
+        If far Gaussians leave fewer bits than the size of the Gaussians calls for.
     """
     finest = float(np.median(gaussians.log_scales.min(axis=1)))
     wanted = math.ceil(math.log2(SIGMA_STEPS) - finest / math.log(2))
@@ -191,7 +196,16 @@ def fractional_bits(path: str | Path, gaussians: Gaussians) -> int:
         raise InputError(
             f"{path}: expected coordinates within ±{2**23} units, found {largest:g}; move the scene's origin nearer"
         )
-    return max(0, min(wanted, room, 23))
+    bits = max(0, min(wanted, room, 23))
+    smallest = max(math.exp(finest), math.exp(-LOG_SCALE[1] / LOG_SCALE[0]))  # as the file stores it
+    if room < wanted and 2.0**-bits > smallest / SIGMA_STEPS:
+        warnings.warn(
+            f"{path}: positions have steps of {2.0**-bits:.2g} units, {2.0**-bits / smallest:.2g} times the smallest "
+            f"scale of the median Gaussian, since the farthest coordinate is {largest:.3g}; delete far Gaussians in "
+            "`clsplat view`, or write .sog or .ply",
+            stacklevel=2,
+        )
+    return bits
 
 
 def guessed_axes(gaussians: Gaussians) -> Axes | None:
