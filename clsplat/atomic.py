@@ -54,6 +54,20 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
             part.unlink()
 
 
+def remove(path: Path) -> None:
+    """Remove a file, if it exists.
+
+    Raises
+    ------
+    InputError
+        If this fails.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot remove {path}: {error.strerror or error}") from error
+
+
 def _sync_folder(folder: Path) -> None:
     """Sync a folder's names where the system can. Windows opens no folders, and some file systems refuse."""
     with suppress(OSError):

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.atomic import replacing
+from clsplat.atomic import remove, replacing
 from clsplat.config import Mode
 from clsplat.errors import InputError
 from clsplat.formats.detail_tree import Node, bounds
@@ -102,13 +102,14 @@ class StreamedSogWriter:
         self._written: dict[tuple[int, int], list[_Part]] = {}
 
     def add(self, node: Node) -> None:
-        """Write a node. Threads may add nodes at the same time, in any order.
+        """Write a node; an older index goes. Threads may add nodes at the same time, in any order.
 
         Raises
         ------
         InputError
-            If a value is not finite as float32, or a file cannot be written.
+            If a value is not finite as float32, or a file cannot be written or removed.
         """
+        remove(self._folder / LOD_META)  # it must not name files of two scenes if this process ends here
         ordered, parts, at = [], [], 0
         for leaf, count in node.leaves:
             part = node.gaussians.take(np.arange(at, at + count))

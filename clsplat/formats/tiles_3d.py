@@ -16,7 +16,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.atomic import replacing
+from clsplat.atomic import remove, replacing
 from clsplat.config import Mode
 from clsplat.errors import InputError
 from clsplat.formats.detail_tree import Node, bounds
@@ -52,13 +52,14 @@ class TilesWriter:
         self._written: dict[tuple[int, int], tuple[Any, Any, float]] = {}  # corners and geometric error
 
     def add(self, node: Node) -> None:
-        """Write a node. Threads may add nodes at the same time, in any order.
+        """Write a node; an older index goes. Threads may add nodes at the same time, in any order.
 
         Raises
         ------
         InputError
-            If a value is not finite as float32, or a file cannot be written.
+            If a value is not finite as float32, or a file cannot be written or removed.
         """
+        remove(self._folder / TILESET)  # it must not name files of two scenes if this process ends here
         save_spz_glb(self._folder / _name(node.height, node.number), node.gaussians, self._mode, self._offset)
         largest = np.exp(node.gaussians.log_scales.max(axis=1).astype(np.float64))
         error = float(np.quantile(largest, COVERED)) if node.height else 0.0

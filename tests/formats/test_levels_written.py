@@ -55,6 +55,16 @@ def test_the_finest_level_is_read_back(scene, written, name, error):
     assert sum(anatomy_of(written / name).parts.values()) > 0
 
 
+@pytest.mark.parametrize(("kind", "name"), [(StreamedSogWriter, LOD_META), (TilesWriter, TILESET)])
+def test_an_export_that_ends_early_leaves_no_mixture_of_scenes(scene, written, kind, name):
+    writer = kind(written)
+    assert (written / name).exists()
+    writer.add(next(iter(detail_tree(scene.take(np.arange(600))))))
+    assert not (written / name).exists()
+    with pytest.raises(InputError):
+        load_gaussians(written / name)
+
+
 def test_the_tree_of_a_streamed_sog(scene, written):
     meta = json.loads((written / LOD_META).read_text())
     assert meta["version"] == 1 and meta["lodLevels"] == 4 and meta["counts"][0] == len(scene)
