@@ -313,7 +313,7 @@ def _mask(plan: Plan, reduce: int, positions: NDArray[np.float32] | None) -> NDA
     mask = None
     if plan.photo.mask is not None:
         # Inverted before the reduction: a reduced pixel is used only if all its source pixels are.
-        mask = _fitted_mask(plan.photo.mask, *plan.size) ^ plan.invert_mask
+        mask = _fitted_mask(plan.photo.mask, *plan.size, plan.upright) ^ plan.invert_mask
         if plan.photo.face:
             mask = bordered(mask)
         mask = mask if positions is None else resampled(mask, positions, 0)
@@ -332,9 +332,9 @@ def _image_circle(camera: Camera) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(camera.rays(u, v)[..., 0]))
 
 
-def _fitted_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
-    """Read a mask and resize it to the photo's size, by nearest neighbour."""
-    mask = read_mask(path)
+def _fitted_mask(path: Path, width: int, height: int, upright: bool) -> NDArray[np.bool_]:
+    """Read a mask as its photo is read, and resize it to the photo's size, by nearest neighbour."""
+    mask = read_mask(path, upright)
     if not fits((mask.shape[1], mask.shape[0]), Intrinsics("PINHOLE", (), width, height)):
         raise InputError(
             f"{path}: expected a mask with the aspect ratio of the photo, {width}x{height} pixels, found "

@@ -18,7 +18,7 @@ from clsplat.dataset.coverage import projected
 from clsplat.dataset.decoding import Dataset, PosedPhoto, fits, nearest, plan_view
 from clsplat.dataset.finding import without_suffix
 from clsplat.dataset.lenses import Intrinsics, is_pinhole
-from clsplat.dataset.photos import as_stored, opened
+from clsplat.dataset.photos import loaded, opened
 from clsplat.dataset.undistortion import lens_positions, resampled
 from clsplat.errors import InputError
 from clsplat.scene import DepthMap, Scene, View
@@ -77,15 +77,15 @@ def find_depth_map(folder: Path, name: str) -> Path:
     )
 
 
-def read_depth_map(path: Path) -> NDArray[np.float32]:
-    """Read a depth map: (H, W) float32, NaN where the file has 0, NaN or infinity.
+def read_depth_map(path: Path, upright: bool = False) -> NDArray[np.float32]:
+    """Read a depth map: (H, W) float32, NaN where the file has 0, NaN or infinity; `upright` as for its photo.
 
     Raises
     ------
     InputError
         If the file cannot be read, has several channels or 8 bits, or knows no depth; the message names it.
     """
-    values = _read_array(path) if path.suffix == ".npy" else _read_picture(path)
+    values = _read_array(path) if path.suffix == ".npy" else _read_picture(path, upright)
     known = np.isfinite(values) & (values != 0)
     if not known.any():
         raise InputError(f"{path}: expected depths, found only 0 or numbers that are not finite, which mean unknown")
@@ -105,14 +105,14 @@ def _read_array(path: Path) -> NDArray[np.float32]:
         return values.astype(np.float32)
 
 
-def _read_picture(path: Path) -> NDArray[np.float32]:
+def _read_picture(path: Path, upright: bool) -> NDArray[np.float32]:
     with opened(path) as image:
         if image.mode not in GREY:
             raise InputError(
                 f"{path}: expected one channel of 16 bits or floats, found mode {image.mode}; 8 bits are too coarse "
                 "for depths: write a 16-bit PNG, a TIFF with floats, or .npy"
             )
-        return np.asarray(as_stored(image)).astype(np.float32)
+        return np.asarray(loaded(image, upright)).astype(np.float32)
 
 
 def load_depth_map(path: Path, photo: PosedPhoto, dataset: Dataset) -> DepthMap:
@@ -123,8 +123,8 @@ def load_depth_map(path: Path, photo: PosedPhoto, dataset: Dataset) -> DepthMap:
     InputError
         If the file cannot be read, or its shape differs from the photo's; the message names it.
     """
-    values = read_depth_map(path)
     plan, reduce = plan_view(photo, dataset, invert_mask=False), dataset.reduce
+    values = read_depth_map(path, plan.upright)
     width, height = plan.size
     if not fits((values.shape[1], values.shape[0]), Intrinsics("PINHOLE", (), width, height)):
         raise InputError(

@@ -133,6 +133,11 @@ def as_stored(image: Image.Image) -> Image.Image:
     return image.transpose(TURNED_BACK[tag]) if tag in TURNED_BACK else image
 
 
+def loaded(image: Image.Image, upright: bool) -> Image.Image:
+    """Load an opened image, turned by its EXIF orientation or, unless `upright` is set, with its pixels as stored."""
+    return ImageOps.exif_transpose(image) if upright else as_stored(image)
+
+
 def orientation(path: Path) -> int:
     """Read the EXIF orientation, 1 to 8; 1 if it is missing or unknown. A PNG is decoded for this.
 
@@ -253,11 +258,11 @@ def read_photo(path: Path, background: tuple[float, float, float], upright: bool
         If the file is damaged, is not an image, or has floating-point or 32-bit pixels; the message names it.
     """
     with opened(path) as image:
-        return _rgb(ImageOps.exif_transpose(image) if upright else as_stored(image), background, path)
+        return _rgb(loaded(image, upright), background, path)
 
 
-def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Decode a mask: (H, W) bool, True where the image is white.
+def read_mask(path: Path, upright: bool = False) -> NDArray[np.bool_]:
+    """Decode a mask: (H, W) bool, True where the image is white; `upright` as for its photo in `read_photo`.
 
     Raises
     ------
@@ -265,7 +270,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
         If the file cannot be decoded, or has grey pixels but no white ones: a mask of 0 and 1 would hide everything.
     """
     with opened(path) as image:
-        values = _rgb(as_stored(image), (0.0, 0.0, 0.0), path).max(axis=2)
+        values = _rgb(loaded(image, upright), (0.0, 0.0, 0.0), path).max(axis=2)
     mask: NDArray[np.bool_] = values >= 128
     if values.any() and not mask.any():
         raise InputError(f"{path}: expected a mask of black (0) and white (255), found values up to {values.max()}")

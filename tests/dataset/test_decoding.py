@@ -309,11 +309,14 @@ def test_reduced_masks_count_pixels_without_a_masked_part(tmp_path):
 
 
 @ENDINGS
-def test_the_orientation_of_a_mask_is_ignored(tmp_path, ending):
+def test_the_orientation_of_a_mask_counts_as_that_of_its_photo(tmp_path, ending):
     pattern = RNG.integers(0, 2, (48, 64)).astype(bool)
     photo = save(tmp_path / f"a.{ending}", noise(), exif=turned(6))
     mask = save(tmp_path / f"m.{ending}", pattern.astype(np.uint8) * 255, exif=turned(6))
     np.testing.assert_array_equal(load(posed(photo, mask=mask))[0].mask, pattern)
+    tall = Intrinsics("PINHOLE", (60.0, 50.0, 25.0, 30.0), 48, 64)
+    upright = load(posed(photo, tall, mask=mask), upright=True)[0].mask
+    np.testing.assert_array_equal(upright, pattern.swapaxes(0, 1)[:, ::-1])
 
 
 def test_a_mask_of_another_shape_is_refused(tmp_path):

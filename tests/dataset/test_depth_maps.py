@@ -154,6 +154,16 @@ def test_smaller_and_larger_maps(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.values, large[1::3, 1::3])
 
 
+def test_a_map_is_turned_as_its_photo(tmp_path: Path) -> None:
+    photo = photo_of_ramps(tmp_path, Intrinsics("PINHOLE", (60.0, 60, 48, 32), 96, 64))
+    dataset = Dataset([photo], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), upright=True)
+    exif, values = Image.Exif(), np.arange(1, 96 * 64 + 1, dtype=np.uint16).reshape(96, 64)
+    exif[0x0112] = 6
+    Image.fromarray(values).save(tmp_path / "m.png", exif=exif)
+    found = load_depth_map(tmp_path / "m.png", photo, dataset)
+    np.testing.assert_array_equal(found.values, values.T[:, ::-1])
+
+
 def test_maps_of_another_shape_are_refused_by_name(tmp_path: Path) -> None:
     photo = photo_of_ramps(tmp_path, Intrinsics("PINHOLE", (60.0, 60, 48, 32), 96, 64))
     dataset = Dataset([photo], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
