@@ -138,6 +138,8 @@ def read_model(folder: Path) -> Model:
                 f"{cameras_path}: expected finite parameters and 1 to {SIZE_MAX} pixels per edge, found "
                 f"{width}x{height}, {params} for camera {number}"
             )
+        if number in by_id:
+            raise InputError(f"{cameras_path}: expected one camera of number {number}, found two; remove one of them")
         by_id[number] = Intrinsics(model, params, width, height)
     posed, by_number = [], {}
     for number, name, camera, quat, translation in images:

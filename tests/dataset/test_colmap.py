@@ -176,6 +176,7 @@ def changed(rows, index, *values):
         ({"images": []}, r"images.*at least one"),
         ({"cameras": changed(CAMERAS, 0, (50.0, np.nan, 32.0, 24.0))}, r"cameras.*camera 1"),
         ({"cameras": changed(CAMERAS, 0, 0, 48, CAMERAS[0][-1])}, r"cameras.*0x48"),
+        ({"cameras": [*CAMERAS, CAMERAS[0]]}, r"cameras.*expected one camera of number 1, found two"),
         ({"cameras": changed(CAMERAS, 0, 2**40, 48, CAMERAS[0][-1])}, r"cameras.*x48"),
         ({"points": changed(POINTS, 1, (np.nan, 0, 0), (0, 0, 0))}, "points3D.*finite"),
         ({"points": changed(POINTS, 1, (np.inf, 0, 0), (0, 0, 0))}, "points3D.*finite"),
