@@ -81,13 +81,13 @@ def locate(
     InputError
         If the size of a photo cannot be read, where "auto" needs it; the message names it.
     """
-    full = [_find(root, name) for name in names]
+    full = _files(root, names)
     found = sum(file is not None for file in full)
-    copies = [] if found else [d for d in DOWNSCALES if any(_find(root, name, d) is not None for name in names)]
+    copies = [] if found else [d for d in DOWNSCALES if any(file is not None for file in _files(root, names, d))]
     if downscale == "auto":
         downscale = copies[0] if copies else _fitting(full, cut or [False] * len(full))
     if downscale > 1:
-        small = [_find(root, name, downscale) for name in names]
+        small = _files(root, names, downscale)
         found_small = sum(file is not None for file in small)
         if found_small >= max(found, 1):
             return small, 1, downscale
@@ -122,15 +122,30 @@ def warn_of_missing(source: Path, names: Sequence[str], files: Sequence[Path | N
         )
 
 
-def _find(root: Path, name: str, downscale: int = 1) -> Path | None:
+def _files(root: Path, names: Sequence[str], downscale: int = 1) -> list[Path | None]:
+    """The files of names. A file stands in for a name with another suffix only if it belongs to no other name."""
+    places = [_place(root, name, downscale) for name in names]
+    used = {place for place in places if _is_file(place)}
+    files: list[Path | None] = []
+    for place in places:
+        file = place if place in used else _stand_in(place, used)
+        files.append(file)
+        if file is not None:
+            used.add(file)
+    return files
+
+
+def _place(root: Path, name: str, downscale: int) -> Path:
+    """The path of a photo, or of its smaller copy, by its name."""
     folder, _, rest = name.partition("/")
-    path = root / (name if downscale == 1 else f"{folder}_{downscale}/{rest}")
-    if _is_file(path):
-        return path
-    # Smaller copies often have another suffix, and the transforms of Blender scenes omit it.
+    return root / (name if downscale == 1 else f"{folder}_{downscale}/{rest}")
+
+
+def _stand_in(path: Path, used: set[Path]) -> Path | None:
+    """A file with another suffix: smaller copies often have one, and the transforms of Blender scenes omit it."""
     stem = without_suffix(path.name)
     candidates = (path.with_name(stem + case) for suffix in SUFFIXES for case in (suffix, suffix.upper()))
-    return next((file for file in candidates if _is_file(file)), None)
+    return next((file for file in candidates if file not in used and _is_file(file)), None)
 
 
 def _is_file(path: Path) -> bool:

@@ -128,6 +128,12 @@ def test_absent_photos_are_none_and_all_absent_is_an_error(tmp_path):
         locate(tmp_path, ["images/c.jpg"], 1)
 
 
+def test_a_file_belongs_to_one_name(tmp_path):
+    touch(tmp_path, "a.png", "b.webp")
+    assert locate(tmp_path, ["a.jpg", "a.png"], 1)[0] == [None, tmp_path / "a.png"]
+    assert locate(tmp_path, ["b", "b.jpg"], 1)[0] == [tmp_path / "b.webp", None]
+
+
 def test_masks_are_found_by_both_names(tmp_path):
     touch(tmp_path, "masks/a.png", "masks/s/b.jpg.png")
     assert mask_folder(tmp_path, "masks") == tmp_path / "masks"
