@@ -255,7 +255,8 @@ def read_photo(path: Path, background: tuple[float, float, float], upright: bool
     Raises
     ------
     InputError
-        If the file is damaged, is not an image, or has floating-point or 32-bit pixels; the message names it.
+        If the file is damaged, is not an image, has floating-point or 32-bit pixels, or has 16 bits of which the
+        upper 8 are unused; the message names it.
     """
     with opened(path) as image:
         return _rgb(loaded(image, upright), background, path)
@@ -283,6 +284,10 @@ def _rgb(image: Image.Image, background: tuple[float, float, float], path: Path)
         if image.mode == "F" or grey.min() < 0 or grey.max() > 0xFFFF:
             raise InputError(
                 f"{path}: expected 8 or 16 bits per channel, found 32 (mode {image.mode}); convert the photo"
+            )
+        if 0 < grey.max() < 256:  # their upper 8 bits are black
+            raise InputError(
+                f"{path}: expected values up to 65535 in 16 bits, found none above {grey.max()}; convert it to 8 bits"
             )
         shade = np.repeat((grey.astype(np.uint16) >> 8).astype(np.float32)[..., None], 3, axis=2)
         return _over(shade, (grey != image.info.get("transparency", -1))[..., None], background)

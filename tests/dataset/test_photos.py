@@ -55,6 +55,15 @@ def test_grey_and_sixteen_bits_become_rgb(tmp_path):
     np.testing.assert_array_equal(read(tmp_path / "deep.png"), np.repeat(RGB[..., :1], 3, axis=2))
 
 
+def test_eight_bits_in_sixteen_are_refused(tmp_path):
+    Image.fromarray(RGB[..., 0].astype(np.uint16)).save(tmp_path / "deep.png")
+    for reading in (read, read_mask):
+        with pytest.raises(InputError, match=r"deep\.png: expected values up to 65535 in 16 bits, found none above"):
+            reading(tmp_path / "deep.png")
+    Image.fromarray(np.zeros((4, 4), np.uint16)).save(tmp_path / "black.png")
+    assert not read(tmp_path / "black.png").any()
+
+
 def test_sixteen_bit_rgb(tmp_path):
     tifffile = pytest.importorskip("tifffile")  # comes with scikit-image; Pillow cannot write such a file
     tifffile.imwrite(tmp_path / "deep.tif", RGB.astype(np.uint16) * 257, photometric="rgb")
