@@ -19,11 +19,12 @@ from clsplat.commands.console import (
     say,
     say_scores,
     try_folder,
+    warn,
 )
 from clsplat.commands.options import CameraOptions, DrawOptions, PhotoOptions
 from clsplat.commands.run_folders import dataset_of, place_of, scene_file, with_run
 from clsplat.config import BACKGROUNDS
-from clsplat.errors import InputError, new_folder
+from clsplat.errors import InputError, named, new_folder
 from clsplat.ranges import within
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from clsplat.camera import Camera
     from clsplat.render import Rendering
+    from clsplat.scene import Scene
     from clsplat.surface import Surface
 
 
@@ -113,12 +115,10 @@ class Render:
         from tqdm import tqdm
 
         from clsplat.dataset import load_scene_with_points
-        from clsplat.dataset.finding import without_suffix
+        from clsplat.evaluate import warn_of_nothing
         from clsplat.formats import load_gaussians
         from clsplat.render import renderings
         from clsplat.renderer import Renderer
-        from clsplat.show.camera_paths import orbit
-        from clsplat.show.picture_names import distinct_stems
 
         data, out = dataset_of("render", self.data), place_of(self.out, self.scene, "render")
         try_folder(out)
@@ -126,15 +126,8 @@ class Render:
         device = open_device(self.device)
         scene = load_scene_with_points(data, self.data_config, self.data_config.triangulate)
         gaussians = moved(gaussians, offset - scene.offset)
-        views = scene.test or scene.train
-        if self.path == "test":
-            endings = "", *["_depth"] * self.depth, *["_median", "_normals"] * self.surface
-            stems = distinct_stems((without_suffix(view.name) for view in views), endings)
-            cameras = {stem: view.camera for stem, view in zip(stems, views, strict=True)}
-        else:
-            first = scene.train[0].camera
-            path = orbit([view.camera for view in scene.train], self.frames, first.width, first.height)
-            cameras = {f"{i:04d}": camera for i, camera in enumerate(path)}
+        endings = "", *["_depth"] * self.depth, *["_median", "_normals"] * self.surface
+        cameras = self._cameras(scene, endings)
         new_folder(out)
         config = replace(self.render, mode=mode)
         background = BACKGROUNDS[self.data_config.background]
@@ -144,16 +137,37 @@ class Render:
         # PNG compression takes as long as rendering, so that other threads do it at the same time.
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             writing: deque[Future[None]] = deque()
+            shown: list[bool] = []
             for (name, camera), rendering in tqdm(
                 zip(cameras.items(), images, strict=True), unit="view", total=len(cameras)
             ):
                 surface = rendering.surface() if self.surface else None
+                shown.append(bool(rendering.alpha.any()))
                 writing.append(pool.submit(write_maps, out / name, rendering, surface, camera))
                 if len(writing) > 2 * (os.cpu_count() or 1):
                     writing.popleft().result()
             for image in writing:
                 image.result()
         say(f"{out}: {len(cameras)} images")
+        warn_of_nothing(shown)
+        written = {f"{name}{ending}.png" for name in cameras for ending in endings}
+        others = [name for path in out.rglob("*.png") if (name := path.relative_to(out).as_posix()) not in written]
+        if others:
+            warn(f"warning: {out}: also holds images of other commands ({named(sorted(others))})")
+
+    def _cameras(self, scene: "Scene", endings: tuple[str, ...]) -> "dict[str, Camera]":
+        """The cameras by the paths of their images without ``.png``, to which `endings` are added."""
+        from clsplat.dataset.finding import without_suffix
+        from clsplat.show.camera_paths import orbit
+        from clsplat.show.picture_names import distinct_stems
+
+        if self.path == "test":
+            views = scene.test or scene.train
+            stems = distinct_stems((without_suffix(view.name) for view in views), endings)
+            return {stem: view.camera for stem, view in zip(stems, views, strict=True)}
+        first = scene.train[0].camera
+        path = orbit([view.camera for view in scene.train], self.frames, first.width, first.height)
+        return {f"{i:04d}": camera for i, camera in enumerate(path)}
 
 
 def write_maps(path: Path, rendering: "Rendering", surface: "Surface | None", camera: "Camera") -> None:

@@ -21,7 +21,7 @@ from plyfile import PlyData
 from clsplat.cli import end, main
 from clsplat.config import CoarseConfig, DataConfig, FewViewsConfig, TrainConfig
 from clsplat.dataset import load_scene
-from clsplat.formats import FORMATS, load_gaussians
+from clsplat.formats import FORMATS, load_gaussians, save_gaussians
 from clsplat.training.presets import load_preset
 
 
@@ -99,6 +99,30 @@ def test_render_writes_views_and_orbits(trained: Path, dataset: Path, tmp_path: 
     run("render", trained / "scene.ply", dataset, "-o", tmp_path / "orbit", "--path", "orbit", "--frames", 3)
     assert sorted(p.name for p in (tmp_path / "orbit").iterdir()) == ["0000.png", "0001.png", "0002.png"]
     assert read_image(tmp_path / "orbit" / "0000.png").shape[:2] == SIZE[::-1]
+
+
+def test_render_tells_of_images_that_are_not_its_own(
+    trained: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    orbit = ("render", trained / "scene.ply", dataset, "-o", tmp_path, "--path", "orbit", "--frames")
+    run(*orbit, 3)
+    assert "also holds" not in capsys.readouterr().err
+    run(*orbit, 2)
+    assert f"{tmp_path}: also holds images of other commands (0002.png)" in capsys.readouterr().err
+    assert (tmp_path / "0002.png").exists()
+
+
+@pytest.mark.parametrize("command", ["render", "eval"])
+def test_views_that_show_nothing_are_told(
+    command: str, trained: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gaussians, mode, _ = load_gaussians(trained / "scene.ply")
+    gaussians.means[:] += 1000
+    save_gaussians(tmp_path / "elsewhere.ply", gaussians, mode)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        run(command, tmp_path / "elsewhere.ply", dataset, "-o", tmp_path / "out")
+    assert "2 of 2 views show nothing of the scene; do the cameras belong to it?" in capsys.readouterr().err
 
 
 def test_each_view_is_rendered_to_files_of_its_own(trained: Path, dataset: Path, tmp_path: Path) -> None:
