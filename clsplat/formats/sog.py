@@ -23,7 +23,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -112,9 +112,15 @@ def save_sog(path: str | Path, gaussians: Gaussians, mode: Mode = "classic", off
         If there is no Gaussian, a value is not finite as float32, or the file cannot be written.
     """
     g = checked(path, gaussians)
+    with replacing(path) as out:
+        write_sog(out, g, mode, offset)
+
+
+def write_sog(out: BinaryIO, g: Gaussians, mode: Mode, offset: ArrayLike | None) -> None:
+    """Write checked Gaussians to an open file, as `save_sog` does."""
     images, meta = _encode(g.take(morton_order(g.means)), mode, offset)
     # ZipInfo defaults to the earliest date of a ZIP, so that the same Gaussians give the same bytes.
-    with replacing(path) as out, zipfile.ZipFile(out, "w") as archive:
+    with zipfile.ZipFile(out, "w") as archive:
         for name, image in images.items():
             archive.writestr(zipfile.ZipInfo(name), webp(image))
         archive.writestr(zipfile.ZipInfo(META), json.dumps(meta))

@@ -7,9 +7,9 @@ for the content, into which the scene, as SOG, and the first camera are written.
 import base64
 import gzip
 import html
+import io
 import json
 import math
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from clsplat.atomic import replacing
 from clsplat.config import BACKGROUNDS, Background, Mode
 from clsplat.formats.axes import rotated
-from clsplat.formats.sog import save_sog
+from clsplat.formats.quantisation import checked
+from clsplat.formats.sog import write_sog
 from clsplat.gaussians import Gaussians
 from clsplat.show.browser_cameras import target_of
 from clsplat.show.camera_paths import Viewpoint
@@ -60,10 +61,9 @@ def save_page(path: str | Path, gaussians: Gaussians, mode: Mode, start: Viewpoi
     """
     path = Path(path)
     turn = upright(start.up)
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        scene = Path(folder) / "scene.sog"
-        save_sog(scene, rotated(gaussians, turn), mode)
-        data = base64.b64encode(scene.read_bytes()).decode()
+    scene = io.BytesIO()
+    write_sog(scene, checked(path, rotated(gaussians, turn)), mode, None)
+    data = base64.b64encode(scene.getvalue()).decode()
     shown = {
         "contentUrl": f"data:application/octet-stream;base64,{data}",
         "contentFilename": "scene.sog",

@@ -55,6 +55,14 @@ def test_upright(up):
     assert np.linalg.det(turn) > 0
 
 
+def test_a_page_needs_no_folder_for_temporary_files(tmp_path, monkeypatch):
+    """A full disk there was reported by the name of a file that the user does not know."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
+    gaussians = scene()
+    save_page(tmp_path / "scene.html", gaussians, "classic", overview(gaussians), "black")
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.html"]
+
+
 def test_the_viewer_has_the_hash_that_its_readme_names():
     text = (VENDOR / "README.md").read_text()
     assert hashlib.sha256((VENDOR / "supersplat-viewer.html.gz").read_bytes()).hexdigest() in text
