@@ -195,6 +195,8 @@ def _readable(path: str | Path) -> tuple[Loader, Callable[[Path], Anatomy]]:
             "it was made from"
         )
     if not suffix:
+        if not Path(path).suffix and not Path(path).exists():
+            raise InputError(f"{path}: expected a file of Gaussians or the folder of a run, found nothing")
         raise _unknown(path, (*FORMATS, *READ_ONLY))
     return READ_ONLY[suffix] if suffix in READ_ONLY else (FORMATS[suffix].load, FORMATS[suffix].anatomy)
 

@@ -116,6 +116,9 @@ def test_a_folder_is_no_scene(
     message = fails(capsys, "eval", tmp_path / "run", dataset, "-o", tmp_path / "eval")
     assert message.endswith(f"the scene in it is {original / 'point_cloud.ply'}")
     assert fails(capsys, "eval", dataset, dataset, "-o", tmp_path / "eval").endswith(expected)
+    missing = tmp_path / "missing"
+    message = fails(capsys, "export", missing, tmp_path / "x.spz")
+    assert message == f"clsplat: {missing}: expected a file of Gaussians or the folder of a run, found nothing"
 
 
 def test_unknown_device_lists_the_known(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
