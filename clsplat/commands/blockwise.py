@@ -86,14 +86,6 @@ def _run(jobs: list[Path], scene: "Scene", device: "Device", watch: "Watch", whe
         run_here(jobs, scene, device, watch)
 
 
-def began(out: Path) -> bool:
-    """Whether a folder holds a run that can be resumed."""
-    from clsplat.blocks.whole import BLOCKS
-    from clsplat.resuming import CHECKPOINT
-
-    return (out / CHECKPOINT).is_file() or (out / BLOCKS).is_dir()
-
-
 @dataclass(frozen=True)
 class Block:
     """Train one block of a scene, as `train --print-jobs` lists them."""

@@ -81,6 +81,47 @@ def check_method(folder: Path, method: str) -> None:
         raise InputError(f"--method: expected {began}, with which the run in {folder} began, found {method}")
 
 
+def began(out: Path) -> bool:
+    """Whether a folder holds a run that can be resumed."""
+    from clsplat.blocks.whole import BLOCKS
+    from clsplat.resuming import CHECKPOINT
+
+    return (out / CHECKPOINT).is_file() or (out / BLOCKS).is_dir()
+
+
+def check_new(out: Path, resume: bool) -> None:
+    """Raise an InputError if a folder holds a run and none resumes.
+
+    A run that ended before its first checkpoint is none yet: the same command starts it again.
+    """
+    from clsplat.fields.field_files import MODEL
+
+    if resume:
+        return
+    if began(out):
+        raise InputError(
+            f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
+        )
+    for name in (SCENE, MODEL):
+        if (out / name).exists():
+            raise InputError(f"{out}: expected a folder without {name}, found one; choose another folder with -o")
+
+
+def check_apart(data: Path, out: Path, config: DataConfig) -> None:
+    """Raise an InputError if the pictures of a run would lie among photos without cameras, and count as photos."""
+    from clsplat.dataset.loading import PHOTOS, RECOVERED, detect
+    from clsplat.dataset.photos import photo_folder
+
+    folder, run = photo_folder(data).resolve(), out.resolve()
+    # Only the folder `images` is searched with the folders in it.
+    among = run == folder or (photo_folder(data) != data and run.is_relative_to(folder))
+    if data.is_dir() and among and detect(data, config)[0] in (PHOTOS, RECOVERED):
+        raise InputError(
+            f"{out}: expected a folder apart from the photos, among which the pictures of a run would count as "
+            f"photos; use -o {data / 'run'}"
+        )
+
+
 def photos_of(data: Path, folder: Path) -> Path:
     """The photos of a run: its dataset, or if that is a video, the folder of the frames extracted from it."""
     from clsplat.dataset.video import is_video

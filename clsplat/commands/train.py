@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from clsplat.commands import console
-from clsplat.commands.blockwise import JobsPrinted, began, train_in_blocks
+from clsplat.commands.blockwise import JobsPrinted, train_in_blocks
 from clsplat.commands.console import (
     Out,
     picture_cameras,
@@ -28,7 +28,10 @@ from clsplat.commands.run_folders import (
     CONFIG,
     SCENE,
     MethodName,
+    began,
+    check_apart,
     check_method,
+    check_new,
     extracted,
     photos_of,
     read_config,
@@ -99,6 +102,8 @@ class Train:
             raise no_checkpoint(out)
         if self.resume:
             check_method(out, self.method)
+        else:
+            check_apart(self.data, out, self.settings.data)
         if self.method != "gaussians":
             train_method(self, out, suffix)
             return
@@ -210,24 +215,6 @@ class Train:
             write_json(out / CONFIG, {DATA_PATH: str(self.data.resolve()), **asdict(config)})
             say_cameras(data)
         return scene, config
-
-
-def check_new(out: Path, resume: bool) -> None:
-    """Raise an InputError if a folder holds a run and none resumes.
-
-    A run that ended before its first checkpoint is none yet: the same command starts it again.
-    """
-    from clsplat.fields.field_files import MODEL
-
-    if resume:
-        return
-    if began(out):
-        raise InputError(
-            f"{out}: holds a run already; --resume continues it, another folder after -o starts a new one"
-        )
-    for name in (SCENE, MODEL):
-        if (out / name).exists():
-            raise InputError(f"{out}: expected a folder without {name}, found one; choose another folder with -o")
 
 
 def train_method(command: Train, out: Path, suffix: str) -> None:

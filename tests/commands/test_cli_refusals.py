@@ -101,6 +101,19 @@ def test_bad_scenes(trained: Path, dataset: Path, tmp_path: Path, capsys: pytest
     assert not (tmp_path / "out.ply").exists()
 
 
+def test_the_folder_of_photos_without_cameras_takes_no_run(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos = shutil.copytree(dataset, tmp_path / "photos", ignore=shutil.ignore_patterns("transforms.json"))
+    before = sorted(photos.iterdir())
+    message = fails(capsys, "train", photos, "-o", photos, *TRAIN)
+    assert "expected a folder apart from the photos" in message and message.endswith(f"use -o {photos / 'run'}")
+    inside = tmp_path / "all" / "images" / "run"
+    shutil.copytree(photos, inside.parent)
+    assert "expected a folder apart from the photos" in fails(capsys, "train", tmp_path / "all", "-o", inside, *TRAIN)
+    assert sorted(photos.iterdir()) == before and not inside.exists()
+
+
 def test_a_folder_is_no_scene(
     trained: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
