@@ -169,8 +169,7 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
     """The configuration of a block.
 
     It trains for as many iterations as its photos alone would, counted by the part of them that it fills, and at most
-    those of the whole configuration. Its first Gaussians have been trained, so that all bands of their spherical
-    harmonics train from the first iterations on, and photos have their full size.
+    those of the whole configuration. All bands of its harmonics train from the first iterations on.
     """
     photos = max(1, round(block.visits))
     largest = max((scene.train[i] for i in block.photos), key=lambda view: view.camera.width * view.camera.height)

@@ -12,7 +12,6 @@ from clsplat.bench.stability.small import known_gaussians
 from clsplat.camera import Camera
 from clsplat.constants import ALPHA_MIN
 from clsplat.device import Device
-from clsplat.errors import InputError
 from clsplat.evaluate import mean_metrics
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
@@ -40,7 +39,7 @@ from clsplat.training.moving import (
     seeds_of,
     still,
 )
-from clsplat.training.moving_files import MOVING, load_masks, packed, save_masks, unpacked
+from clsplat.training.moving_files import MOVING, load_masks
 from clsplat.training.state import initial_state
 
 Array = NDArray[np.float64]
@@ -250,29 +249,6 @@ def test_masks_of_reduced_photos_apply_to_whole_ones() -> None:
     assert views[0] is other and (views[1].counts == expected).all()
     assert (views[2].counts == (masked.counts & expected)).all()
     assert (views[3].counts == hidden.counts).all(), "something of it must train"
-
-
-def test_masks_in_files(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    masks = {"a/ä.png": rng.random((7, 5)) < 0.5, "b": rng.random((4, 6)) < 0.5}
-    save_masks(tmp_path, masks)
-    found = load_masks(tmp_path)
-    assert list(found) == list(masks) and all((found[name] == masks[name]).all() for name in masks)
-    arrays = packed(masks)
-    for broken in (
-        arrays | {"moving.1": arrays["moving.1"][:-1]},
-        {k: v for k, v in arrays.items() if k != "moving.0"},
-        arrays | {"moving": "{"},
-        arrays | {"moving": '{"a": [1]}'},
-        arrays | {"moving.0": arrays["moving.0"].astype(np.float32)},
-    ):
-        with pytest.raises((KeyError, TypeError, ValueError)):
-            unpacked({name: np.asarray(array) for name, array in broken.items()})
-    (tmp_path / MOVING).write_bytes(b"PK")
-    with pytest.raises(InputError, match="expected masks of clsplat, found a damaged file"):
-        load_masks(tmp_path)
-    save_masks(tmp_path, {})
-    assert load_masks(tmp_path) == {} and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("exposure", [False, True])
