@@ -235,7 +235,8 @@ def _composited(
     if "ED" in render_mode:
         render[:, :, -1:] = np.divide(render[:, :, -1:], alpha, out=np.zeros_like(alpha), where=alpha > 0)
     meta = {name: download(getattr(splats, name)) for name in ("means2d", "conics", "depths", "opacities")}
-    meta["radii"] = np.ceil(download(splats.extents)).astype(np.int32)
+    # The largest number of single precision that fits.
+    meta["radii"] = np.ceil(np.minimum(download(splats.extents), np.float32(2**31 - 128))).astype(np.int32)
     meta["tiles_per_gauss"] = np.bincount(download(bins.gauss_ids), minlength=len(meta["depths"]))
     return RasterPass(camera, splats, colored, bins, image, render, alpha, background, render_mode, channels), meta
 

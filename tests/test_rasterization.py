@@ -161,6 +161,13 @@ def test_meta_counts_and_places(scene: tuple[Gaussians, list[Camera]], device: D
     np.testing.assert_allclose(meta["depths"][0][shown], homogeneous[shown, 2], rtol=1e-5)
 
 
+def test_radii_of_huge_gaussians_are_positive(device: Device) -> None:
+    K, one = np.array([[[300, 0, 50], [0, 300, 50], [0, 0, 1.0]]]), np.ones((1, 3))
+    given = np.array([[0, 0, 1.0]]), np.array([[1.0, 0, 0, 0]]), 1e7 * one, np.array([0.9]), one, np.eye(4)[None], K
+    meta = rasterization(*given, 100, 100, device=device)[2]
+    assert (meta["radii"] > 10**9).all() and (meta["tiles_per_gauss"] > 0).all()
+
+
 def test_opacities_and_scales_at_their_bounds(scene: tuple[Gaussians, list[Camera]], device: Device) -> None:
     gaussians, cameras = scene
     given = arguments(gaussians, cameras) | {"colors": np.ones((len(gaussians), 3))}
