@@ -98,8 +98,7 @@ def make_mesh(
     if not (size > 0).all():
         raise InputError(f"box: expected a box with a positive size, found {low} to {high}")
     shape = tuple(int(n) for n in np.maximum(np.ceil(size / voxel), 1) + 1)
-    distances, colors = _fused(views, corner, voxel, (shape[0], shape[1], shape[2]))
-    return _zeros(distances, colors, corner, voxel)
+    return _zeros(*_fused(views, corner, voxel, (shape[0], shape[1], shape[2])), corner, voxel)
 
 
 def _box(views: list[_View]) -> tuple[Array, Array]:
@@ -121,10 +120,11 @@ def _box(views: list[_View]) -> tuple[Array, Array]:
 
 def _fused(
     views: list[_View], corner: Array, voxel: float, shape: tuple[int, int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean signed distances, in voxels, positive in front of surfaces, and mean colours; NaN: nothing is seen."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Mean signed distances, in voxels, positive in front of surfaces (NaN: nothing is seen); mean colours; and which
+    voxels have a colour, those near a surface."""
     distances = np.full(shape, np.nan, np.float32)
-    colors = np.zeros((*shape, 3), np.float32)
+    colors, has_color = np.zeros((*shape, 3), np.float32), np.zeros(shape, bool)
     y, z = (corner[k] + voxel * np.arange(shape[k]) for k in (1, 2))
     for first in range(0, shape[0], SLAB):
         x = corner[0] + voxel * np.arange(first, min(first + SLAB, shape[0]))
@@ -154,10 +154,17 @@ def _fused(
         with np.errstate(invalid="ignore"):
             distances[near] = (total / weights).reshape(-1, *shape[1:])
         colors[near] = (color / np.maximum(coloured, 1)[:, None]).reshape(-1, *shape[1:], 3)
-    return distances, colors
+        has_color[near] = (coloured > 0).reshape(-1, *shape[1:])
+    return distances, colors, has_color
 
 
-def _zeros(distances: NDArray[np.float32], colors: NDArray[np.float32], corner: Array, voxel: float) -> Mesh:
+def _zeros(
+    distances: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    has_color: NDArray[np.bool_],
+    corner: Array,
+    voxel: float,
+) -> Mesh:
     """The mesh where the distances change their sign, between voxels that cameras see."""
     from scipy.ndimage import binary_erosion, map_coordinates
     from skimage.measure import marching_cubes
@@ -171,8 +178,10 @@ def _zeros(distances: NDArray[np.float32], colors: NDArray[np.float32], corner: 
         vertices, faces, _, _ = marching_cubes(np.where(known, distances, np.float32(TRUNCATION)), 0.0, mask=inside)
     except RuntimeError as error:  # voxels in front of surfaces and behind them do not touch
         raise InputError(NO_SURFACE) from error
-    at = [map_coordinates(colors[..., k], vertices.T, order=1, mode="nearest") for k in range(3)]
-    rgb = np.rint(np.clip(np.stack(at, axis=1), 0, 255)).astype(np.uint8)
+    # Voxels without a colour have no part in the mean. Those behind a surface have one, so that the weight is not 0.
+    layers = (colors[..., 0], colors[..., 1], colors[..., 2], has_color)
+    *at, weight = (map_coordinates(layer, vertices.T, np.float32, 1, "nearest") for layer in layers)
+    rgb = np.rint(np.clip(np.stack(at, axis=1) / weight[:, None], 0, 255)).astype(np.uint8)
     return Mesh(corner + voxel * vertices.astype(np.float64), faces.astype(np.int64), rgb)
 
 

@@ -9,7 +9,7 @@ from plyfile import PlyData
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.meshing import Mesh, _zeros, make_mesh, save_mesh
+from clsplat.meshing import TRUNCATION, Mesh, _zeros, make_mesh, save_mesh
 from clsplat.renderer import Renderer
 
 
@@ -85,11 +85,19 @@ def test_views_past_the_surface_do_not_darken_it(device):
     assert colors[1].mean() == pytest.approx(colors[0].mean(), rel=0.02)
 
 
+def test_voxels_without_a_colour_do_not_darken_the_surface():
+    """Where most views look past a thin surface, the voxels in front of it have no colour."""
+    distances, colors = np.full((12, 12, 12), TRUNCATION, np.float32), np.zeros((12, 12, 12, 3), np.float32)
+    distances[6:], colors[6:] = -1, [200, 100, 50]
+    mesh = _zeros(distances, colors, distances < 0, np.zeros(3), 1.0)
+    assert len(mesh.vertices) and (mesh.colors == [200, 100, 50]).all()
+
+
 def test_voxels_of_both_signs_that_do_not_touch():
     distances = np.full((12, 12, 12), np.nan, np.float32)
     distances[:5], distances[7:] = 1, -1
     with pytest.raises(InputError, match="expected surfaces in the box, found none"):
-        _zeros(distances, np.zeros((12, 12, 12, 3), np.float32), np.zeros(3), 1.0)
+        _zeros(distances, np.zeros((12, 12, 12, 3), np.float32), distances < 0, np.zeros(3), 1.0)
 
 
 def test_a_mesh_far_from_the_origin_keeps_its_shape(tmp_path):
