@@ -44,7 +44,8 @@ class Mesh(NamedTuple):
 
 
 class _View(NamedTuple):
-    """A camera with its image (H, W, 3) and its depths (H, W), 0 where there is no surface: seven bytes per pixel."""
+    """A camera with its image (H, W, 3) and its depths (H, W): seven bytes per pixel. A depth is 0 where less than
+    half of the light is stopped, and NaN where half of it is, but at no depth."""
 
     camera: Camera
     rgb: NDArray[np.uint8]
@@ -91,7 +92,9 @@ def make_mesh(
         if camera.model != "pinhole":
             raise InputError(f"mesh: expected pinhole cameras, found one of model {camera.model}")
         rendering = next(renderings(renderer, gaussians, [camera], gradients=True))
-        views.append(_View(camera, to_uint8(rendering.rgb), rendering.surface().depth.astype(np.float32)))
+        depth = rendering.surface().depth.astype(np.float32)
+        depth[(depth == 0) & (rendering.alpha >= 0.5)] = np.nan
+        views.append(_View(camera, to_uint8(rendering.rgb), depth))
     low, high = box if box is not None else _box(views)
     corner, size = np.asarray(low, np.float64), np.asarray(high, np.float64) - np.asarray(low, np.float64)
     voxel = float(size.max()) / resolution
@@ -141,8 +144,9 @@ def _fused(
             which = np.flatnonzero(front)
             columns, rows = u[which].astype(int), v[which].astype(int)
             surface = depth[rows, columns]
-            # A pixel without a surface shows that all of its ray is free. Behind a surface, nothing is known.
-            ahead = (np.where(surface > 0, surface, np.inf) - p[which, 2]) / voxel
+            # A pixel without a surface shows that all of its ray is free. Behind a surface, nothing is known, and NaN
+            # counts nowhere.
+            ahead = (np.where(surface == 0, np.inf, surface) - p[which, 2]) / voxel
             counts = ahead > -TRUNCATION
             which, ahead = which[counts], np.minimum(ahead[counts], TRUNCATION)
             total[which] += ahead

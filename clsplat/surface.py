@@ -22,10 +22,11 @@ class Surface(NamedTuple):
     Attributes
     ----------
     ids : (H, W) int32
-        Index of this Gaussian; -1 where the transmittance stays above 1/2.
+        Index of this Gaussian; -1 where the transmittance stays above 1/2, or there is no depth.
     depth : (H, W) float64
         Median depth: where the pixel's ray has the largest density of this Gaussian, world units (z; distances for a
-        fisheye and a panorama); 0 where there is none.
+        fisheye and a panorama); 0 where there is none. The affine projection can draw a Gaussian in pixels whose rays
+        would have its largest density behind the camera: these have no depth.
     normals : (H, W, 3) float64
         Unit vectors in world coordinates: the Gaussian's shortest axis, turned to the camera; 0 where there is none.
     """
@@ -82,10 +83,11 @@ def surface_of(gaussians: Gaussians, camera: Camera, ids: NDArray[np.int32]) -> 
     along = np.einsum("nij,nj->ni", whiten[inverse], directions)
     to_centre = np.einsum("nij,nj->ni", whiten[inverse], points[inverse] - origins)
     t = (along * to_centre).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-300)
+    ahead = t > 0
     depth, normals = np.zeros(ids.shape), np.zeros((*ids.shape, 3))
-    depth[seen] = t * (directions[:, 2] if camera.model in ("pinhole", "orthographic") else 1)
+    depth[seen] = np.where(ahead, t * (directions[:, 2] if camera.model in ("pinhole", "orthographic") else 1), 0)
 
     shortest = np.take_along_axis(world_axes, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0][inverse]
     away = (shortest * (directions @ view)).sum(axis=1, keepdims=True) > 0
-    normals[seen] = np.where(away, -shortest, shortest)
-    return Surface(ids, depth, normals)
+    normals[seen] = np.where(away, -shortest, shortest) * ahead[:, None]
+    return Surface(np.where(depth > 0, ids, np.int32(-1)), depth, normals)

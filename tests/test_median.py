@@ -105,6 +105,19 @@ def test_the_median_does_not_mix_surfaces(device):
     assert (abs(mixed[z > 0]) > 0.3).any()  # which is what the expected depth does
 
 
+def test_no_surface_lies_behind_the_camera(device):
+    """The affine projection draws a steep disc in pixels whose rays meet its plane behind the camera."""
+    camera = Camera(np.eye(4), 64, 64, 32, 32, 64, 64)
+    shape = [[0.3, 0, 0.5]], np.log([[0.6, 0.6, 0.01]]), [[0.8, 0, 0.6, 0]], [6.0], [[[0.0] * 3]]
+    disc = Gaussians(*map(np.array, shape))
+    rendering = render(disc, camera, device=device)
+    surface = rendering.surface()
+    behind = (rendering.alpha >= 0.5) & (surface.ids == -1)
+    assert behind.sum() > 500 and (surface.ids == 0).sum() > 500
+    assert (surface.depth[surface.ids == 0] > 0).all()
+    assert not surface.depth[behind].any() and not surface.normals[behind].any()
+
+
 def test_empty_scenes_and_panoramas(device):
     camera = CAMERAS["equirectangular"]
     empty = plane().take(np.zeros(0, int))

@@ -85,6 +85,20 @@ def test_views_past_the_surface_do_not_darken_it(device):
     assert colors[1].mean() == pytest.approx(colors[0].mean(), rel=0.02)
 
 
+def test_pixels_whose_surface_has_no_depth_free_nothing(device):
+    """A disc before the camera fills the image. In pixels over the ball, its largest density is behind the camera."""
+    viewmat = np.eye(4)
+    viewmat[:3, 3] = [-1.5, 0, 4]
+    blocked = Camera(viewmat, 64, 64, 32, 32, 64, 64, near=1e-3)
+    disc = ball(1)
+    disc.means[:], disc.quats[:] = [1.515, 0, -3.975], [0.8, 0, 0.6, 0]
+    disc.log_scales[:], disc.logit_opacities[:] = np.log([0.03, 0.03, 5e-4]), 6
+    scene, box = Gaussians.concatenate([ball(), disc]), ([-1.2] * 3, [1.2] * 3)
+    views = around()
+    alone, mesh = (make_mesh(scene, v, Renderer(device), resolution=24, box=box) for v in (views, [*views, blocked]))
+    np.testing.assert_array_equal(mesh.vertices, alone.vertices)
+
+
 def test_voxels_without_a_colour_do_not_darken_the_surface():
     """Where most views look past a thin surface, the voxels in front of it have no colour."""
     distances, colors = np.full((12, 12, 12), TRUNCATION, np.float32), np.zeros((12, 12, 12, 3), np.float32)

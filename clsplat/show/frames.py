@@ -126,8 +126,8 @@ def normals(depth: NDArray[Any], camera: Camera) -> NDArray[np.float64]:
 
 
 def scaled_depth(depth: NDArray[Any]) -> NDArray[np.uint16]:
-    """Depths (H, W) as 16-bit levels of the largest one."""
-    return np.rint(depth / max(float(depth.max()), 1e-12) * 65535).astype(np.uint16)
+    """Depths (H, W) as 16-bit levels of the largest one; 0 where they are negative."""
+    return np.rint(np.clip(depth / max(float(depth.max()), 1e-12), 0, 1) * 65535).astype(np.uint16)
 
 
 def colored_normals(normals: NDArray[Any], camera: Camera) -> NDArray[np.uint8]:

@@ -38,7 +38,7 @@ def test_colours_of_normals_in_the_world_are_those_of_the_camera():
     camera = Camera.look_at((0, 0, 0), (1, 0, 0), (0, 0, 1), 100, 4, 1)
     found = colored_normals(np.array([[[0, -1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, 0]]]), camera)
     np.testing.assert_array_equal(found, [[[255, 128, 128], [128, 255, 128], [128, 128, 255], [0, 0, 0]]])
-    np.testing.assert_array_equal(scaled_depth(np.array([[0.0, 1.0, 4.0]])), [[0, 16384, 65535]])
+    np.testing.assert_array_equal(scaled_depth(np.array([[0.0, -1.0, 1.0, 4.0]])), [[0, 0, 16384, 65535]])
 
 
 def test_a_surface_to_the_camera_is_blue(device):
