@@ -136,7 +136,7 @@ def _fused(
         color, coloured = np.zeros((len(points), 3)), np.zeros(len(points))
         for camera, rgb, depth in views:
             p = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-            front = p[:, 2] > camera.near_depth
+            front = p[:, 2] > 0  # also before the near plane, all of the ray is free
             with np.errstate(divide="ignore", invalid="ignore"):
                 u = np.floor(camera.fx * p[:, 0] / p[:, 2] + camera.cx)
                 v = np.floor(camera.fy * p[:, 1] / p[:, 2] + camera.cy)

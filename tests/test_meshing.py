@@ -55,6 +55,17 @@ def test_the_mesh_of_a_ball_is_a_sphere(device, tmp_path, resolution):
     np.testing.assert_array_equal(np.stack(ply["face"]["vertex_indices"]), mesh.faces)
 
 
+def test_the_size_of_the_world_does_not_matter(device):
+    """The near plane of cameras without one follows the Gaussians. A fixed one would hide this scene."""
+    small = replace(ball(), means=1e-3 * ball().means, log_scales=ball().log_scales + np.float32(np.log(1e-3)))
+    cameras = [replace(c, viewmat=np.vstack([c.viewmat[:3] * [1, 1, 1, 1e-3], c.viewmat[3:]])) for c in around()]
+    box = np.full(3, -1.2), np.full(3, 1.2)
+    large = make_mesh(ball(), around(), Renderer(device), resolution=32, box=box)
+    mesh = make_mesh(small, cameras, Renderer(device), resolution=32, box=(1e-3 * box[0], 1e-3 * box[1]))
+    assert len(mesh.vertices) == pytest.approx(len(large.vertices), rel=0.01)
+    assert abs(np.linalg.norm(mesh.vertices, axis=1) - 1e-3).max() < 2e-4
+
+
 def test_a_box_cuts_the_mesh(device):
     mesh = make_mesh(ball(), around(), Renderer(device), resolution=32, box=([0, -1.2, -1.2], [1.2, 1.2, 1.2]))
     assert mesh.vertices[:, 0].min() > -0.01 and mesh.vertices[:, 1].min() < -0.9
