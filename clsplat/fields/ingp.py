@@ -182,6 +182,8 @@ class IngpBase(Field):
         occupied = np.unpackbits(arrays["occupied"])[: self.occupancy.values.size].reshape(shape)
         if "occupancy" in arrays:
             self.occupancy, self._rays = Occupancy(arrays["occupancy"]), int(arrays["rays"])
+        else:  # a model, which has no optical depths: `model` writes the same cells again
+            self.occupancy = Occupancy(occupied.astype(np.float32))
         self._occupied = self.device.upload("occupied", occupied, np.uint8)
 
     def finish(self) -> None:

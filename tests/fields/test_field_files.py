@@ -81,6 +81,10 @@ def test_the_file_renders_what_was_trained(device, method, room, tmp_path):
     loaded = load_field(str(tmp_path / MODEL), {method.name: method}, device)
     camera = scene.test[0].camera
     np.testing.assert_array_equal(loaded.image(camera, WHITE), field.image(camera, WHITE))
+    save_field(tmp_path / "again.npz", loaded)
+    first, again = (dict(np.load(tmp_path / name)) for name in (MODEL, "again.npz"))
+    for name, array in first.items():
+        np.testing.assert_array_equal(again[name], array)
 
 
 @EACH
