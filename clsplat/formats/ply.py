@@ -253,7 +253,7 @@ def to_gaussians(path: str | Path, data: Array, names: list[str], first: int = 0
 
 
 def _table(data: Array, names: list[str]) -> Array:
-    """Fields of a structured array (N,) as columns of float32."""
+    """Fields of a structured array (N,) as columns of float32; a copy, which may be changed."""
     from numpy.lib.recfunctions import structured_to_unstructured
 
     stored = data.dtype.names or ()
@@ -261,7 +261,7 @@ def _table(data: Array, names: list[str]) -> Array:
         columns = [stored.index(name) for name in names]
         return np.take(data.view(np.float32).reshape(len(data), -1), columns, axis=1)
     with np.errstate(over="ignore"):  # values that overflow float32 are rejected later
-        return structured_to_unstructured(data[names], dtype=np.float32)
+        return structured_to_unstructured(data[names], dtype=np.float32, copy=True)
 
 
 def comments_of(mode: Mode, offset: ArrayLike | None) -> list[str]:

@@ -42,6 +42,19 @@ def test_leaves_are_those_of_cuts_in_memory(scene, tmp_path, monkeypatch, depth)
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
 
 
+def test_rows_with_a_property_of_another_type_are_cut(tmp_path):
+    names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    rows = np.zeros(64, [*((name, "<f4") for name in names), ("label", "u1")])
+    for name, values in zip(names, np.random.default_rng(0).normal(size=(14, 64)), strict=True):
+        rows[name] = values
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 64\n"
+    header += "".join(f"property float {name}\n" for name in names) + "property uchar label\nend_header\n"
+    (tmp_path / "scene.ply").write_bytes(header.encode() + rows.tobytes())
+    found = cut_on_disk(PlyParts(tmp_path / "scene.ply"), tmp_path, 1)
+    expected = leaves(load_gaussians(tmp_path / "scene.ply")[0], 1)
+    assert all(equal(one, other) for one, other in zip(found, expected, strict=True))
+
+
 def test_levels_of_a_file_are_those_of_the_scene(scene, tmp_path):
     found = list(detail_tree_of_file(PlyParts(tmp_path / "scene.ply"), tmp_path, leaf=100))
     expected = list(detail_tree(scene, leaf=100))
