@@ -39,8 +39,8 @@ def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[C
     Parameters
     ----------
     cameras : list of Camera
-        The training cameras. Each frame has the field of view of the first one, so that it shows at least what the
-        first photo shows.
+        The training cameras. Each frame has square pixels and the field of view of the first one, so that it shows at
+        least what the first photo shows.
     frames : int
         Number of cameras on the path, at least 1.
     width, height : int
@@ -82,7 +82,7 @@ def orbit(cameras: list[Camera], frames: int, width: int, height: int) -> list[C
         path = start + arc / 2 * (1 - np.cos(turn))
 
     first = cameras[0]
-    fx = first.fx * min(width / first.width, height / first.height)
+    fx = min(first.fx * width / first.width, first.fy * height / first.height)
     rim = radii.mean() * (np.cos(path)[:, None] * east + np.sin(path)[:, None] * north)
     return [Camera.look_at(centre + arm + heights.mean() * up, centre, up, fx, width, height) for arm in rim]
 

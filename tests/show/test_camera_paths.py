@@ -112,6 +112,12 @@ def test_the_first_cameras_field_of_view_fits_the_frame(width, height, fx):
     assert camera.fx == camera.fy == fx
 
 
+@pytest.mark.parametrize("fy", [250, 1000])
+def test_pixels_of_the_first_camera_need_not_be_square(fy):
+    cameras = [replace(camera, fy=fy) for camera in ring([0, 1, 2])]
+    assert orbit(cameras, 1, 640, 480)[0].fx == min(500, fy)
+
+
 def test_radius_and_height_are_means():
     turn = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     top = Camera.look_at(TARGET + 9 * UP, TARGET, EAST, 500.0, 640, 480)
