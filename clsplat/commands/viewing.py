@@ -58,7 +58,7 @@ class View:
                 views = scene.train + scene.test
             start = first_photo([view.camera for view in views]) if views else overview(gaussians)
             renderer = Renderer(device, replace(self.render, mode=mode), BACKGROUNDS[self.data_config.background])
-            edited = path.with_name(f"{path.name.removesuffix('.ply').removesuffix('.compressed')}_edited.ply")
+            edited = edited_file(path)
 
             def save(rest: "Gaussians") -> str:
                 save_gaussians(edited, rest, mode, offset)
@@ -72,6 +72,15 @@ class View:
                 viewer.hold(gaussians)
         finally:
             viewer.close()
+
+
+def edited_file(scene: Path) -> Path:
+    """The file for a session's edit of a scene, which replaces no file: from the second on, its name has a number."""
+    stem = f"{scene.name.removesuffix('.ply').removesuffix('.compressed')}_edited"
+    edited, number = scene.with_name(f"{stem}.ply"), 2
+    while edited.exists():
+        edited, number = scene.with_name(f"{stem}-{number}.ply"), number + 1
+    return edited
 
 
 def open_viewer(options: ServerOptions) -> "Viewer":

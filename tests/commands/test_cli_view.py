@@ -3,6 +3,7 @@
 import shutil
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,23 @@ def test_view_of_a_run_has_its_cameras_and_saves_edits_beside_its_scene(
     assert seen == ["reading scene.ply", "reading the photos", "compiling kernels", 9, f"{path}: 5 Gaussians"]
     assert len(load_gaussians(path)[0]) == 5
     assert (folder / "scene.ply").read_bytes() == (trained / "scene.ply").read_bytes()
+
+
+def test_a_session_keeps_the_edits_of_earlier_ones(
+    trained: Path, held: list[tuple[str, Gaussians]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from clsplat.show.viewer import Viewer
+
+    def save_twice(self: Viewer, gaussians: Gaussians, save: Callable[[Gaussians], str]) -> None:
+        for count in (9, 5 + len(held)):
+            save(gaussians.take(np.arange(count)))
+
+    monkeypatch.setattr(Viewer, "edit", save_twice)
+    shutil.copy(trained / "scene.ply", tmp_path)
+    for _ in range(3):
+        run("view", tmp_path / "scene.ply", "--port", 18090)
+    files = ("scene_edited.ply", "scene_edited-2.ply", "scene_edited-3.ply")
+    assert [len(load_gaussians(tmp_path / name)[0]) for name in files] == [5, 6, 7]
 
 
 @pytest.mark.parametrize("found", [True, False])
