@@ -4,7 +4,6 @@ import json
 import math
 import os
 import re
-import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,7 +18,7 @@ from clsplat.dataset.finding import without_suffix
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, psnr_fitted, ssim, to_uint8
-from clsplat.render import Rendering, Stored, renderings
+from clsplat.render import Stored, renderings
 from clsplat.renderer import Renderer
 from clsplat.scene import View, in_turn
 from clsplat.show.comparisons import save_difference, save_png
@@ -106,11 +105,6 @@ def evaluate(
     ------
     InputError
         If there is no view, a view's photo is not of its camera's size, or `out` cannot be written.
-
-    Warns
-    -----
-    UserWarning
-        If a view shows nothing of the scene.
     """
     views, renderer = list(views), renderer or Renderer()
     about = {
@@ -118,25 +112,7 @@ def evaluate(
         "sh_degree": gaussians.sh_degree,
         "mode": renderer.config.mode,
     }
-    shown: list[bool] = []
-
-    def picture(each: Rendering) -> NDArray[np.uint8]:
-        shown.append(bool(each.alpha.any()))
-        return to_uint8(each.rgb)
-
-    images = map(picture, renderings(renderer, gaussians, [view.camera for view in views]))
-    result = evaluate_images(images, views, out, about, renderer.label, metrics)
-    warn_of_nothing(shown)
-    return result
-
-
-def warn_of_nothing(shown: list[bool]) -> None:
-    """Warn if some views show nothing of a scene, as do cameras of another one; `shown` tells of each whether not."""
-    if not all(shown):
-        warnings.warn(
-            f"{shown.count(False)} of {len(shown)} views show nothing of the scene; do the cameras belong to it?",
-            stacklevel=3,
-        )
+    return evaluate_images(rendered(gaussians, views, renderer), views, out, about, renderer.label, metrics)
 
 
 def evaluate_images(

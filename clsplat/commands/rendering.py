@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from clsplat.scene import Scene
     from clsplat.surface import Surface
 
+REDUCED = 8
+"""Divisor of the edges of images that only tell whether a view shows anything."""
+
 
 @dataclass(frozen=True)
 class Eval:
@@ -63,6 +66,7 @@ class Eval:
         from clsplat.evaluate import METRICS, evaluate
         from clsplat.formats import load_gaussians
         from clsplat.metrics import lpips, lpips_network
+        from clsplat.render import renderings
         from clsplat.renderer import Renderer
 
         data, out = dataset_of("eval", self.data), place_of(self.out, self.scene, "eval")
@@ -80,6 +84,9 @@ class Eval:
         renderer = Renderer(device, replace(self.render, mode=mode), background)
         metrics = (*METRICS, lpips) if self.lpips else METRICS
         say_scores(evaluate(gaussians, scene.test, out, renderer, metrics), out)
+        cameras = [view.camera for view in scene.test]
+        small = [camera.resized(-(-camera.width // REDUCED), -(-camera.height // REDUCED)) for camera in cameras]
+        warn_of_nothing([bool(each.alpha.any()) for each in renderings(renderer, gaussians, small, gradients=False)])
 
 
 @dataclass(frozen=True)
@@ -115,7 +122,6 @@ class Render:
         from tqdm import tqdm
 
         from clsplat.dataset import load_scene_with_points
-        from clsplat.evaluate import warn_of_nothing
         from clsplat.formats import load_gaussians
         from clsplat.render import renderings
         from clsplat.renderer import Renderer
@@ -168,6 +174,13 @@ class Render:
         first = scene.train[0].camera
         path = orbit([view.camera for view in scene.train], self.frames, first.width, first.height)
         return {f"{i:04d}": camera for i, camera in enumerate(path)}
+
+
+def warn_of_nothing(shown: list[bool]) -> None:
+    """Warn if some views show nothing of a scene, as do cameras of another one; `shown` has a value for each view."""
+    if not all(shown):
+        count = f"{shown.count(False)} of {len(shown)}"
+        warn(f"warning: {count} views show nothing of the scene; do the cameras belong to it?")
 
 
 def write_maps(path: Path, rendering: "Rendering", surface: "Surface | None", camera: "Camera") -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from failing_calls import Point
 
 from clsplat.dataset.sfm.reconstruction import WORK
+from clsplat.resuming import CHECKPOINT
 
 PHOTOS = 5
 """Photos of the dataset: one is held out."""
@@ -29,8 +30,11 @@ COMMANDS = {
 
 
 def stays(name: str, point: Point) -> bool:
-    """Whether a file is left since it could not be removed, or the folder of structure from motion that it is in."""
+    """Whether a file is left since it could not be removed, or the folder of structure from motion that it is in; or
+    it is the last checkpoint, without which a run ends well."""
     about = Path(point.about).name
+    if CHECKPOINT in about and Path(name).name == CHECKPOINT:
+        return True
     workspace = Path(name).parts[0].startswith(WORK) and about in (WORK, "lock")
     return point.kind in ("unlink", "open", "list") and (
         workspace or (point.kind == "unlink" and about == Path(name).name)

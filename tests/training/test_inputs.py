@@ -152,8 +152,8 @@ def test_an_older_checkpoint_is_refused_in_a_sentence(scene: Scene, device: Devi
         InputError, match=r"checkpoint\.npz: expected a checkpoint of format 3, found format 1 of another"
     ):
         load_state(path, scene.extent, SHORT)
-    np.savez(path, **arrays, **(added | {"format": np.array(3)}))
-    with pytest.raises(InputError, match="found format 3 of another version; continue it with that version, or"):
+    np.savez(path, **arrays, **(added | {"format": np.array(4)}))
+    with pytest.raises(InputError, match="found format 4 of another version; continue it with that version, or"):
         load_state(path, scene.extent, SHORT)
     for damage in ('{"train": 1}', '{"train": {"a": [1, 2, "x"]}, "test": {}}', "[]", "{", '{"more": 1}'):
         np.savez(path, **arrays, **(added | {"inputs": np.array(damage)}))
