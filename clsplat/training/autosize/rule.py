@@ -320,10 +320,10 @@ def most_grown(search: Search, config: TrainConfig) -> int:
 def most_with_all(search: Search, trained: int, photos: int, config: TrainConfig) -> int:
     """Largest number of Gaussians once all photos train, not only `trained` of them.
 
-    If growth paid until its end, it is in proportion to the photos: what only those show that were held back has few
-    Gaussians until then.
+    Unless growth ended since it did not pay, it is in proportion to the photos: what only those show that were held
+    back has few Gaussians until then.
     """
-    if search.growth is None or search.growth.takes_smaller:
+    if search.growth and search.growth.takes_smaller:
         return search.most
     return min(ceil(search.most * photos / trained), most_allowed(config))
 

@@ -82,17 +82,15 @@ def _grown(training: Training, search: Search, iteration: int) -> tuple[State, S
 def _compared(training: Training, search: Search, iteration: int) -> Search:
     """The search after a comparison of the present Gaussians with the last candidate that paid.
 
-    One that was trained on smaller photos is not compared: larger photos would decide, not more Gaussians.
+    One that was trained on smaller photos is not compared: larger photos would decide, not more Gaussians. Neither is
+    any where something moves: what is left out of the photos differs from window to window.
     """
     if not search.validated:  # the run is too short
         return search
     present, paid = _candidate(training, iteration, search.validated), search.small_side
-    if paid and paid.candidate.n < present.n and _same_photos(paid.candidate, present, training.config):
+    comparable = paid and not training.state.moving and _same_photos(paid.candidate, present, training.config)
+    if paid and comparable and paid.candidate.n < present.n:
         trial = Trial(True, paid.candidate, present)
-        if training.state.moving:  # other pixels counted when the smaller one was validated
-            before = training.fork(_continued(training.state, paid))
-            smaller = _candidate(before, paid.candidate.iteration, [_validate(before)])
-            trial = Trial(True, smaller, _candidate(training, iteration, search.validated[-1:]))
         search = replace(search, trials=[*search.trials, trial])
         if trial.takes_smaller:
             return search
