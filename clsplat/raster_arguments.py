@@ -53,8 +53,12 @@ def on_host(name: str, array: Any) -> NDArray[Any]:
 
 
 def arrays(**given: ArrayLike) -> list[NDArray[np.float64]]:
-    """Arguments by name as arrays of NumPy."""
-    return [np.asarray(on_host(name, array), np.float64) for name, array in given.items()]
+    """Arguments by name as arrays of NumPy. The kernels would leave out what is not finite, without a word."""
+    found = [np.asarray(on_host(name, array), np.float64) for name, array in given.items()]
+    for name, array in zip(given, found, strict=True):
+        if not np.isfinite(array).all():
+            raise InputError(f"{name}: expected finite numbers, found NaN or infinity")
+    return found
 
 
 def values_of(colors: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -74,8 +78,6 @@ def behind_of(backgrounds: ArrayLike | None, shape: tuple[int, int]) -> NDArray[
         return np.zeros(shape)
     (behind,) = arrays(backgrounds=backgrounds)
     check_shape("backgrounds", behind, shape)
-    if not np.isfinite(behind).all():
-        raise InputError("backgrounds: expected finite numbers, found NaN or infinity")
     return behind
 
 

@@ -35,6 +35,22 @@ class RasterPass(NamedTuple):
     channels: int
 
 
+class RasterPasses(NamedTuple):
+    """Forward passes of all cameras, and what their gradients need.
+
+    placed, gaussians: the Gaussians where the stages run, and on the host; sh_degree: as given to `rasterization`;
+    shared: whether all cameras have the same values.
+    """
+
+    renderer: Renderer
+    placed: Gaussians
+    gaussians: Gaussians
+    runs: list[RasterPass]
+    sh_degree: int | None
+    antialiased: bool
+    shared: bool
+
+
 class RasterGradients(NamedTuple):
     """Gradients of a scalar with respect to the arguments of `rasterization`, in the arguments' shapes.
 
@@ -79,20 +95,11 @@ class _Outputs(NamedTuple):
 class Rasterization(_Outputs):
     """The result of `rasterization`: the tuple (render, alpha, meta), and its gradients."""
 
-    _kept: tuple[Renderer, Gaussians, Gaussians, list[RasterPass], int | None, bool, bool] | None = None
+    _passes: RasterPasses | None = None
 
-    def remember(
-        self,
-        renderer: Renderer,
-        placed: Gaussians,
-        gaussians: Gaussians,
-        passes: list[RasterPass],
-        sh_degree: int | None,
-        antialiased: bool,
-        shared: bool,
-    ) -> None:
-        """Keep what `backward` needs; `rasterization` calls it. shared: whether all cameras have the same values."""
-        self._kept = (renderer, placed, gaussians, passes, sh_degree, antialiased, shared)
+    def remember(self, passes: RasterPasses) -> None:
+        """Keep what `backward` needs; `rasterization` calls it."""
+        self._passes = passes
 
     def backward(self, v_render: Any, v_alpha: Any = None, *, absgrad: bool = False) -> RasterGradients:
         """Gradients of a scalar with respect to the Gaussians and the cameras.
@@ -117,14 +124,14 @@ class Rasterization(_Outputs):
         InputError
             If `gradients` was not set, or a shape does not fit.
         """
-        if self._kept is None:
+        if self._passes is None:
             raise InputError("gradients: expected a rasterization made with gradients=True, found another")
-        renderer, placed, gaussians, passes, sh_degree, antialiased, shared = self._kept
+        renderer, placed, gaussians, runs, sh_degree, antialiased, shared = self._passes
         v_render = _checked("v_render", v_render, self.render.shape)
         v_alpha = np.zeros(self.alpha.shape) if v_alpha is None else _checked("v_alpha", v_alpha, self.alpha.shape)
         total = {name: np.zeros(array.shape) for name, array in gaussians.arrays().items()}
         values, viewmats, intrinsics, backgrounds, means2d, sums = [], [], [], [], [], []
-        for run, v_image, v_cover in zip(passes, v_render, v_alpha, strict=True):
+        for run, v_image, v_cover in zip(runs, v_render, v_alpha, strict=True):
             placed_v = _placed(renderer, run, v_image, v_cover)
             v_splats, v_values = _to_splats(renderer, run, placed_v, sh_degree is not None)
             if absgrad:

@@ -22,7 +22,7 @@ from clsplat.raster_arguments import (
     rows_of,
     values_of,
 )
-from clsplat.raster_gradients import Rasterization, RasterPass
+from clsplat.raster_gradients import Rasterization, RasterPass, RasterPasses
 from clsplat.renderer import Renderer, download
 from clsplat.stages import AnySplats
 from clsplat.surface import surface_of
@@ -118,8 +118,8 @@ def rasterization(
     Raises
     ------
     InputError
-        If shapes do not fit each other, a number is out of range, or an array of another library is not in the memory
-        of the host; the message names the argument.
+        If shapes do not fit each other, a number is out of range or not finite, or an array of another library is not
+        in the memory of the host; the message names the argument.
     DeviceError
         If there is no OpenCL device, a buffer exceeds its limits, or the pixels of a tile exceed the local memory,
         which holds them for the gradients.
@@ -157,7 +157,7 @@ def rasterization(
     stacked |= {"width": width, "height": height, "tile_size": tile_size, "n_cameras": count}
     result = Rasterization(np.stack([run.render for run in passes]), np.stack([run.alpha for run in passes]), stacked)
     if gradients:
-        result.remember(renderer, placed, gaussians, passes, sh_degree, antialiased, shared)
+        result.remember(RasterPasses(renderer, placed, gaussians, passes, sh_degree, antialiased, shared))
     return result
 
 

@@ -210,6 +210,10 @@ def test_opacities_and_scales_at_their_bounds(scene: tuple[Gaussians, list[Camer
         ({"scales": np.full((60, 3), -2.0)}, r"scales: expected numbers of 0 or more, found -2.0; take exp\(\)"),
         ({"opacities": np.ones((60, 1))}, r"^opacities: expected shape \(60,\), found \(60, 1\)"),
         ({"opacities": np.linspace(0, 3, 60)}, "opacities: expected numbers from 0 to 1, found 0.0 to 3.0; take"),
+        *(
+            ({name: np.where(np.arange(60 * size).reshape(60, size) == 7, value, 0.5)}, f"^{name}: expected finite")
+            for name, size, value in (("means", 3, np.nan), ("quats", 4, np.inf), ("colors", 3, -np.inf))
+        ),
         ({"sh_degree": 4, "colors": np.zeros((60, 16, 3))}, "sh_degree: expected 0 to 3"),
         ({"sh_degree": 3.0, "colors": np.zeros((60, 16, 3))}, "sh_degree: expected an integer, found 3.0"),
     ],
