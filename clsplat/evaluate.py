@@ -68,7 +68,7 @@ def mean_metrics_of(
         return [metric(image, view.image, view.mask) for metric in metrics]
 
     figures = zip(*compared(compare, views, images), strict=True)
-    return {m.__name__: _mean(values) for m, values in zip(metrics, figures, strict=True)}
+    return {m.__name__: mean_of(values) for m, values in zip(metrics, figures, strict=True)}
 
 
 def evaluate(
@@ -158,7 +158,7 @@ def evaluate_images(
     records = compared(compare, views, images)
 
     result = {
-        "mean": {metric.__name__: _mean([r[metric.__name__] for r in records]) for metric in metrics},
+        "mean": {metric.__name__: mean_of([r[metric.__name__] for r in records]) for metric in metrics},
         **about,
         "resolution": ", ".join(sorted({f"{r['width']}x{r['height']}" for r in records})),
         "device": device,
@@ -204,7 +204,8 @@ def compared(
         return results + [future.result() for future in waiting]
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
+def mean_of(values: Sequence[float | None]) -> float | None:
+    """The mean of figures of views; None if one is missing."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if len(known) == len(values) else None
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.bench.results import Record
-from clsplat.evaluate import compared, mean_metrics, rendered
+from clsplat.evaluate import compared, mean_metrics, mean_of, rendered
 from clsplat.formats import save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import flip, psnr, ssim
@@ -92,15 +92,10 @@ def quality_of(images: Iterable[NDArray[np.uint8]], views: list[View], rare: Mas
         return [*figures, *_squared_error(image, view, masks[index])]
 
     psnrs, ssims, flips, errors, numbers = zip(*compared(compare, views, images), strict=True)
-    figures = {"psnr": _mean(psnrs), "ssim": _mean(ssims), "flip": _mean(flips), "worst": min(psnrs)}
+    figures = {"psnr": mean_of(psnrs), "ssim": mean_of(ssims), "flip": mean_of(flips), "worst": min(psnrs)}
     error, number = sum(errors), sum(numbers)
     figures["rare_psnr"] = -10 * math.log10(error / number) if error else None
     return finite(figures)
-
-
-def _mean(values: tuple[float | None, ...]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if len(known) == len(values) else None
 
 
 def finite(figures: dict[str, float | None]) -> Record:

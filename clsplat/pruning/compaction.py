@@ -129,16 +129,15 @@ def compact(
     InputError
         If no version is within the limits; the message names the nearest one.
     """
-    search = _Search(gaussians, loss, limits, stored)
-    search.reduction = reduce(gaussians, views, search.far_enough, renderer)
-    search.choices = [search.reduction.pool]
+    goal = _Goal(gaussians, loss, limits, stored)
+    reduction = reduce(gaussians, views, goal.far_enough, renderer)
+    choices = [reduction.pool]
     if limits.loss is not None or limits.bytes is not None:
-        search.choices = choices_of(
-            gaussians, search.reduction, views, search.degree, search.sharing_pays(), renderer
-        )
+        choices = choices_of(gaussians, reduction, views, goal.degree, goal.sharing_pays(), renderer)
+    search = _Search(goal, reduction, choices)
     if limits.loss is not None:
         return search.smallest(limits.loss)
-    versions = [search.measured(search.largest_number(choice), choice) for choice in range(len(search.choices))]
+    versions = [search.measured(search.largest_number(choice), choice) for choice in range(len(choices))]
     return min(versions, key=lambda version: version.loss)
 
 
@@ -179,33 +178,39 @@ def choices_of(
     ]
 
 
-class _Search:
-    """Search among versions of a scene, by number of Gaussians and choice of harmonics."""
-
-    reduction: Reduction
-    choices: list[Gaussians]
+class _Goal:
+    """What a compaction is to reach: a scene, its limits, and how loss and bytes are measured; degree: the highest
+    one of the harmonics that the format stores."""
 
     def __init__(self, gaussians: Gaussians, loss: LossMeter, limits: Limits, stored: Stored):
-        self._gaussians, self._loss, self._limits, self._stored = gaussians, loss, limits, stored
+        self.gaussians, self.loss, self.limits, self.stored = gaussians, loss, limits, stored
         again, self._bytes = stored(gaussians)
         self.degree = again.sh_degree
 
     def sharing_pays(self) -> bool:
         """Whether the file becomes smaller if Gaussians share their harmonics."""
-        sh = self._gaussians.sh.copy()
+        sh = self.gaussians.sh.copy()
         sh[:, 1:] = 0
-        return self._stored(replace(self._gaussians, sh=sh))[1] < (1 - SHARING_MIN) * self._bytes
+        return self.stored(replace(self.gaussians, sh=sh))[1] < (1 - SHARING_MIN) * self._bytes
 
     def far_enough(self, left: Gaussians) -> bool:
         """Whether the reduction can stop at the Gaussians that are left."""
-        limits = self._limits
+        limits = self.limits
         if limits.loss is not None:
-            return self._loss(left) > limits.loss
-        most = [limits.gaussians, limits.bytes and limits.bytes / self._bytes * len(self._gaussians)]
+            return self.loss(left) > limits.loss
+        most = [limits.gaussians, limits.bytes and limits.bytes / self._bytes * len(self.gaussians)]
         return len(left) <= min(m for m in most if m is not None)
 
+
+class _Search:
+    """Search among versions of a scene, by number of Gaussians and choice of harmonics."""
+
+    def __init__(self, goal: _Goal, reduction: Reduction, choices: list[Gaussians]):
+        self._gaussians, self._loss, self._limits, self._stored = goal.gaussians, goal.loss, goal.limits, goal.stored
+        self._reduction, self._choices = reduction, choices
+
     def version(self, n: int, choice: int) -> Gaussians:
-        return self.choices[choice].take(self.reduction.rows(n))
+        return self._choices[choice].take(self._reduction.rows(n))
 
     def measured(self, n: int, choice: int) -> Compacted:
         version = self.version(n, choice)
@@ -242,7 +247,7 @@ class _Search:
 
     def smallest(self, limit: float) -> Compacted:
         """The smallest file whose loss, rounding by the format included, is within the limit."""
-        last, most = len(self.choices) - 1, self._limits.gaussians
+        last, most = len(self._choices) - 1, self._limits.gaussians
         numbers = {c: n for c in range(last + 1) if (n := self.smallest_number(c, limit)) is not None}
         # Cheaper harmonics may need more Gaussians than the limit.
         allowed = {c: n for c, n in numbers.items() if most is None or n <= most}

@@ -1,14 +1,16 @@
 """Contributions of Gaussians to photos and to the errors in them."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.gaussians import Gaussians
 from clsplat.pruning.prices import measure_removals
-from clsplat.renderer import Renderer, download
+from clsplat.renderer import Pass, Renderer, download
 from clsplat.scene import View
-from clsplat.stages import Removal
+from clsplat.stages import Image, Removal
 from clsplat.training.densify import Contributions
 
 FIELDS = {
@@ -46,3 +48,28 @@ def contributions(
             renderer.stages.add_column(measured.sums, Removal._fields.index(field), sums[name])
         del measured
     return Contributions(**{name: download(parts).astype(np.float64).sum(axis=1) for name, parts in sums.items()})
+
+
+def weighted_sums(renderer: Renderer, run: Pass, values: NDArray[Any]) -> NDArray[np.float64]:
+    """Sum values over the pixels of an image, weighted by each Gaussian's compositing weight alpha T.
+
+    The image is linear in a splat's colour, and the derivative of a pixel by it is the splat's weight: the backward
+    pass of these values gives the sums.
+
+    Parameters
+    ----------
+    renderer : Renderer
+    run : Pass
+        Of N Gaussians.
+    values : (H, W, C)
+        Of 1 to 3 channels, on the host.
+
+    Returns
+    -------
+    (N, C) float64
+    """
+    channels = values.shape[2]
+    rgb = np.zeros((*values.shape[:2], 3))
+    rgb[:, :, :channels] = values
+    v_image = Image(renderer.upload("v_image", rgb), renderer.no_alpha_gradient(run.camera))
+    return np.asarray(download(renderer.backward_to_splats(run, v_image).colors)[:, :channels], np.float64)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Pass, Renderer, download
 from clsplat.scene import View, evenly_spaced, in_turn
-from clsplat.stages import Image
 from clsplat.training.coarse_to_fine import shrunk
+from clsplat.training.contributions import weighted_sums
 
 Array = NDArray[np.float64]
 Masks = Mapping[str, NDArray[np.bool_]]
@@ -185,15 +185,8 @@ def _differences(run: Pass, view: View) -> Array:
 
 
 def _contributions(renderer: Renderer, run: Pass, counts: NDArray[np.bool_], differences: Array) -> Array:
-    """Sums over pixels (N, 2) of each Gaussian's weight, and of its weight times the squared difference.
-
-    The derivative of a pixel by a Gaussian's colour is its weight: one backward pass gives both, as two channels.
-    """
-    channels = np.zeros((*counts.shape, 3))
-    channels[:, :, 0] = counts
-    channels[:, :, 1] = (differences**2).sum(axis=2)
-    v_image = Image(renderer.upload("v_image", channels), renderer.no_alpha_gradient(run.camera))
-    return np.asarray(download(renderer.backward_to_splats(run, v_image).colors)[:, :2], np.float64)
+    """Sums over pixels (N, 2) of each Gaussian's weight, and of its weight times the squared difference."""
+    return weighted_sums(renderer, run, np.stack([counts, (differences**2).sum(axis=2)], axis=2))
 
 
 def seeds_of(evidence: Evidence) -> NDArray[np.bool_]:

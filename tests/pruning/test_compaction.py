@@ -15,7 +15,7 @@ from clsplat.formats import FORMATS, load_gaussians, save_gaussians
 from clsplat.gaussians import Gaussians
 from clsplat.metrics import psnr, to_uint8
 from clsplat.pruning import compaction, viewpoints
-from clsplat.pruning.compaction import ASSUMED_PSNR, Limits, LossMeter, _Search, choices_of
+from clsplat.pruning.compaction import ASSUMED_PSNR, Limits, LossMeter, _Goal, _Search, choices_of
 from clsplat.pruning.prices import price
 from clsplat.pruning.reductions import Reduction
 from clsplat.pruning.viewpoints import automatic_cameras, own_views
@@ -72,9 +72,9 @@ def test_loss_against_photos_is_the_difference_of_psnr(device, bloated):
 def test_the_reduction_goes_as_far_as_the_limits(limits, enough, more):
     """Of 100 Gaussians in 1000 bytes, each of which loses 0.01 dB."""
     scene = synthetic_scene(100)[0]
-    search = _Search(scene, lambda left: 0.01 * (100 - len(left)), limits, lambda version: (version, 1000))
-    assert search.far_enough(scene.take(np.arange(enough)))
-    assert not search.far_enough(scene.take(np.arange(more)))
+    goal = _Goal(scene, lambda left: 0.01 * (100 - len(left)), limits, lambda version: (version, 1000))
+    assert goal.far_enough(scene.take(np.arange(enough)))
+    assert not goal.far_enough(scene.take(np.arange(more)))
 
 
 def test_a_loss_just_above_the_limit_does_not_end_the_search():
@@ -85,9 +85,9 @@ def test_a_loss_just_above_the_limit_does_not_end_the_search():
         own = 0.0 if len(version) == 1000 else 0.3 if len(version) >= 550 else 0.46 if len(version) >= 500 else 0.9
         return own + 0.040026 * (version.means.dtype == np.float32)
 
-    search = _Search(scene, loss, Limits(loss=0.5), lambda version: (version.astype(np.float32), len(version)))
-    search.reduction = Reduction(scene, np.zeros((0, 2), np.intp), np.zeros(1000, np.intp), np.arange(1, 1001))
-    search.choices = [scene]
+    goal = _Goal(scene, loss, Limits(loss=0.5), lambda version: (version.astype(np.float32), len(version)))
+    reduction = Reduction(scene, np.zeros((0, 2), np.intp), np.zeros(1000, np.intp), np.arange(1, 1001))
+    search = _Search(goal, reduction, [scene])
     found = search.smallest(0.5)
     assert 550 <= len(found.gaussians) <= 1.02 * 550 and found.loss == pytest.approx(0.340026)
 
@@ -100,9 +100,9 @@ def test_the_whole_scene_is_the_last_resort():
         rounded = version.means.dtype == np.float32
         return 0.09 if len(version) == 100 and rounded else 0.01 * (100 - len(version)) + 0.2 * rounded
 
-    search = _Search(scene, loss, Limits(loss=0.1), lambda version: (version.astype(np.float32), len(version)))
-    search.reduction = Reduction(scene, np.zeros((0, 2), np.intp), np.zeros(100, np.intp), np.arange(1, 101))
-    search.choices = [scene]
+    goal = _Goal(scene, loss, Limits(loss=0.1), lambda version: (version.astype(np.float32), len(version)))
+    reduction = Reduction(scene, np.zeros((0, 2), np.intp), np.zeros(100, np.intp), np.arange(1, 101))
+    search = _Search(goal, reduction, [scene])
     assert len(search.smallest(0.1).gaussians) == 100
     with pytest.raises(InputError, match=r"expected more than the 0\.090 dB that the format costs"):
         search.smallest(0.05)
@@ -117,10 +117,9 @@ def test_a_choice_that_needs_more_gaussians_than_the_limit_is_none():
             return 0.0 if len(version) >= (800 if version.sh_degree == 0 else 500) else 1.0
 
         stored = lambda version: (version, len(version) * (100 + version.sh_degree))  # noqa: E731
-        search = _Search(full, loss, Limits(gaussians=most, loss=0.5), stored)
-        search.reduction = Reduction(full, np.zeros((0, 2), np.intp), np.zeros(1000, np.intp), np.arange(1, 1001))
-        search.choices = [cheap, full]
-        return search
+        goal = _Goal(full, loss, Limits(gaussians=most, loss=0.5), stored)
+        reduction = Reduction(full, np.zeros((0, 2), np.intp), np.zeros(1000, np.intp), np.arange(1, 1001))
+        return _Search(goal, reduction, [cheap, full])
 
     assert 500 <= len(search_within(600).smallest(0.5).gaussians) <= 1.02 * 500
     with pytest.raises(InputError, match=r"^--max-gaussians: expected at least 50[0-9], which --max-psnr-loss 0.5"):
