@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,9 +67,9 @@ def train_block(
 ) -> Path:
     """Train a block, unless its result exists; continue where an interrupted run has left a checkpoint.
 
-    The Gaussians of the scene in the block and its margin train; the others that its photos show are drawn and stay
-    as they are. The result is what lies in the block after the training. A block without a margin keeps all that it
-    has trained, since nothing else trains what has left it.
+    The Gaussians of the scene in the block and its margin train; the sky and the others that its photos show are
+    drawn and stay as they are. The result is what lies in the block after the training. A block without a margin
+    keeps all that it has trained, since nothing else trains what has left it.
 
     Parameters
     ----------
@@ -101,13 +101,11 @@ def train_block(
         return result
     job = read_job(job_file)
     start = _start(job_file, job)
-    coefficients = (job.config.init.sh_degree + 1) ** 2
-    points = [with_coefficients(read_part(job_file.parent, part), coefficients) for part in points_of(job_file, job)]
     views = job.views(_loaded(job, beside) if loaded is None else loaded)
     device = device or open_device(job.config)
     with held(work):
         if not result.exists():
-            gaussians = _trained(job, start, points, views, device, work, progress, beside)
+            gaussians = _trained(job, start, views, device, work, progress, beside)
             with replacing(log_of(job_file)) as file:
                 file.write((work / LOG).read_bytes())
             save_gaussians(result, gaussians, job.config.render.mode)
@@ -122,10 +120,9 @@ def _loaded(job: Job, beside: int) -> list[View]:
     return read_depth_maps(views, job.data, job.config.data) if job.depths else views
 
 
-def needed_parts(job_file: Path, job: Job) -> Iterator[tuple[bool, Part, list[Camera]]]:
-    """Yield the parts of scenes that a block trains or its photos may show, in their order: whether the part's
-    Gaussians are used in the surroundings that are drawn as they were trained, or beyond them; the part; and the
-    cameras that may show it.
+def needed_parts(job_file: Path, job: Job) -> Iterator[tuple[str, Part, list[Camera]]]:
+    """Yield the parts of scenes that a block trains or its photos may show, in their order: the field of the job that
+    names the scene; the part; and the cameras that may show it.
 
     Raises
     ------
@@ -133,14 +130,17 @@ def needed_parts(job_file: Path, job: Job) -> Iterator[tuple[bool, Part, list[Ca
         If an index cannot be read or has been changed.
     """
     cameras = job.posed()
-    for near in (True,) if job.near == EVERYWHERE else (True, False):
-        parts = read_index(job_file.with_name(job.scene if near else job.far))
+    used = {"scene": True, "far": job.near != EVERYWHERE, "sky": bool(job.sky)}
+    for scene in compress(used, used.values()):
+        parts = read_index(job_file.with_name(getattr(job, scene)))
         bounds = bounds_of(parts)
         looking = looking_at(cameras, bounds, job.config.render)
-        wanted = job.wide.meets(bounds.low, bounds.high) | looking.any(axis=0)
-        if near:
+        wanted = looking.any(axis=0)
+        if scene != "sky":
+            wanted |= job.wide.meets(bounds.low, bounds.high)
+        if scene == "scene":
             wanted &= job.near.meets(bounds.low, bounds.high)
-        yield from ((near, parts[k], [*compress(cameras, looking[:, k])]) for k in np.flatnonzero(wanted))
+        yield from ((scene, parts[k], [*compress(cameras, looking[:, k])]) for k in np.flatnonzero(wanted))
 
 
 def points_of(job_file: Path, job: Job) -> list[Part]:
@@ -154,14 +154,30 @@ def points_of(job_file: Path, job: Job) -> list[Part]:
     return read_index(job_file.with_name(job.points)) if job.points else []
 
 
-def _start(job_file: Path, job: Job) -> Gaussians:
-    """The Gaussians from which a block starts, and those around it that its photos may show, in their order."""
-    coefficients, found = (job.config.init.sh_degree + 1) ** 2, []
-    for near, part, cameras in needed_parts(job_file, job):
-        gaussians = with_coefficients(read_part(job_file.parent, part), coefficients)
-        here = gaussians.take(job.near.contains(gaussians.means) == near)
-        found.append(here.take(job.wide.contains(here.means) | seen(cameras, Bounds.of(here), job.config.render)))
-    return Gaussians.concatenate(found)
+class _Start(NamedTuple):
+    """Where a block starts: the Gaussians in it and those around it that its photos may show; which of these the
+    block trains, (N,); and those at sparse points, which it trains, too."""
+
+    gaussians: Gaussians
+    trains: NDArray[np.bool_]
+    points: list[Gaussians]
+
+
+def _start(job_file: Path, job: Job) -> _Start:
+    def read(part: Part) -> Gaussians:
+        return with_coefficients(read_part(job_file.parent, part), (job.config.init.sh_degree + 1) ** 2)
+
+    found, own = [], []
+    for scene, part, cameras in needed_parts(job_file, job):
+        gaussians = read(part)
+        if scene != "sky":
+            gaussians = gaussians.take(job.near.contains(gaussians.means) == (scene == "scene"))
+        trains = job.wide.contains(gaussians.means) & (scene != "sky")
+        rows = trains | seen(cameras, Bounds.of(gaussians), job.config.render)
+        found.append(gaussians.take(rows))
+        own.append(trains[rows])
+    points = [read(part) for part in points_of(job_file, job)]
+    return _Start(Gaussians.concatenate(found), np.concatenate(own), points)
 
 
 def _scene(views: list[View]) -> Scene:
@@ -171,8 +187,7 @@ def _scene(views: list[View]) -> Scene:
 
 def _seen(
     device: "Device",
-    start: Gaussians,
-    trains: NDArray[np.bool_],
+    start: _Start,
     views: list[View],
     config: TrainConfig,
     folder: Path,
@@ -183,19 +198,18 @@ def _seen(
     most = Footprint.of(_scene(views), config, device).most_drawn(device.memory_limit)
     budget = photo_budget(photo_memory(config))
     if budget is None or not any(view.ahead for view in views):
-        return seen_by_block(renderer, start, trains, views, most=most)
+        return seen_by_block(renderer, start.gaussians, start.trains, views, most=most)
     budget //= beside
     folder.mkdir(parents=True, exist_ok=True)
     files = Files(folder)
-    _, shown = seen_by_block(renderer, start, trains, views, files.write, most)
+    _, shown = seen_by_block(renderer, start.gaussians, start.trains, views, files.write, most)
     streamed = files.views(views, budget)
     return [made.with_depth(view.depth) for made, view in zip(streamed, views, strict=True)], shown
 
 
 def _trained(
     job: Job,
-    start: Gaussians,
-    points: list[Gaussians],
+    start: _Start,
     views: list[View],
     device: "Device",
     work: Path,
@@ -204,19 +218,18 @@ def _trained(
 ) -> Gaussians:
     """Train the block in a folder that is held, and return what it keeps."""
     config = job.config
-    trains = job.wide.contains(start.means)
     device.buffers.forget()  # another block's sizes
-    seen, shown = _seen(device, start, trains, views, job.config, work / SEEN, beside)
+    seen, shown = _seen(device, start, views, job.config, work / SEEN, beside)
     device.buffers.forget()  # those of all that was drawn; less of it trains
     scene = _scene(seen)
     inputs = Inputs.of(scene, device)
     if (work / CHECKPOINT).exists():
         state = load_state(work / CHECKPOINT, scene.extent, config, inputs)
     else:
-        first = Gaussians.concatenate([start.take(trains), *points])
+        first = Gaussians.concatenate([start.gaussians.take(start.trains), *start.points])
         state = replace(initial_state(scene, config, first), inputs=inputs)
     state.inputs.demand(scene)
-    training = Training(scene, config, device, state, start.take(shown & ~trains))
+    training = Training(scene, config, device, state, start.gaussians.take(shown & ~start.trains))
     gaussians = complete(training, work, progress=progress)
     kept = gaussians if job.wide == job.box else gaussians.take(job.box.contains(gaussians.means))
     if not len(kept):

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from clsplat.atomic import replacing
-from clsplat.blocks.partition import EVERYWHERE, Box
-from clsplat.blocks.plan import Block
+from clsplat.blocks.partition import EVERYWHERE, Block, Box
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
 from clsplat.dataset.brightness import even
@@ -23,10 +22,13 @@ from clsplat.training.presets import with_settings
 BOXES = ("near", "box", "wide")
 """Boxes of a job."""
 
+SCENES = ("data", "scene", "far", "sky", "points")
+"""Names of folders and files of a job."""
+
 FIT = ("inverse", "scale", "shift")
 """Fields of a depth map that its fit to the scene's points determines."""
 
-FORMAT = 3
+FORMAT = 4
 """Version of the files of jobs."""
 
 
@@ -36,16 +38,18 @@ class Job:
 
     data: folder of the dataset; scene: name of the index (`clsplat.blocks.parts`), beside the job's file, of the
     Gaussians from which the block starts and that surround it; near: where these are used; far: the index of those
-    elsewhere; points: the index of Gaussians at sparse points, which the block trains, too, or empty; box, wide: what
-    the block keeps and trains; photos: digests of pixels and mask, by name; cameras: as the scene has them, by name;
-    depths: for photos with a depth map, by name, the digest of its values and its fit to the points; gains: factors
-    by which the colours of photos are divided, by name; config: settings of the block.
+    elsewhere; sky: the index of those of the sky, which no block trains, or empty; points: the index of Gaussians at
+    sparse points, which the block trains, too, or empty; box, wide: what the block keeps and trains; photos: digests
+    of pixels and mask, by name; cameras: as the scene has them, by name; depths: for photos with a depth map, by
+    name, the digest of its values and its fit to the points; gains: factors by which the colours of photos are
+    divided, by name; config: settings of the block.
     """
 
     data: str
     scene: str
     near: Box
     far: str
+    sky: str
     points: str
     box: Box
     wide: Box
@@ -69,6 +73,7 @@ class Job:
             "data": self.data,
             "scene": self.scene,
             "far": self.far,
+            "sky": self.sky,
             "points": self.points,
             **{name: [_face(side) for side in getattr(self, name)] for name in BOXES},
             "photos": {
@@ -129,11 +134,13 @@ class Job:
         return replace(view.depth, **fit)
 
 
-def make_job(data: Path, file: str, block: Block, scene: Scene, photos: dict[str, Photo], config: TrainConfig) -> Job:
-    """Make the job of a block in a scene's file, without sparse points.
+def make_job(
+    data: Path, scenes: dict[str, str], block: Block, scene: Scene, photos: dict[str, Photo], config: TrainConfig
+) -> Job:
+    """Make the job of a block in the coarse scene, without sparse points.
 
-    file: name of the index of the Gaussians; scene: with the photos of the block; photos: digests of all photos;
-    config: settings of the block.
+    scenes: the names of its indices "far" and "sky"; scene: with the photos of the block; photos: digests of all
+    photos; config: settings of the block.
     """
     views = [scene.train[i] for i in block.photos]
     names = [view.name for view in views]
@@ -145,7 +152,9 @@ def make_job(data: Path, file: str, block: Block, scene: Scene, photos: dict[str
         if (depth := view.depth)
     }
     gains = {name: scene.gains[name].tolist() for name in names if name in scene.gains}
-    return Job(str(data), file, EVERYWHERE, file, "", block.box, block.wide, own, cameras, depths, gains, config)
+    names_of: dict[str, Any] = {"data": str(data), "scene": scenes["far"], **scenes, "points": ""}
+    boxes: dict[str, Any] = {"near": EVERYWHERE, "box": block.box, "wide": block.wide}
+    return Job(**names_of, **boxes, photos=own, cameras=cameras, depths=depths, gains=gains, config=config)
 
 
 def read_job(path: Path) -> Job:
@@ -161,7 +170,7 @@ def read_job(path: Path) -> Job:
         if content["format"] != FORMAT:
             raise InputError(f"{path}: expected a job of format {FORMAT}, found {content['format']!r}")
         boxes: dict[str, Any] = {n: Box(_corner(content[n][0], -1), _corner(content[n][1], 1)) for n in BOXES}
-        scenes: dict[str, Any] = {name: str(content[name]) for name in ("data", "scene", "far", "points")}
+        scenes: dict[str, Any] = {name: str(content[name]) for name in SCENES}
         photos = {name: Photo(str(p["pixels"]), str(p["mask"]), []) for name, p in content["photos"].items()}
         cameras = {name: dict(p["camera"]) for name, p in content["photos"].items()}
         depths = {str(name): dict(depth) for name, depth in content.get("depths", {}).items()}

@@ -41,6 +41,24 @@ class Box(NamedTuple):
 EVERYWHERE = Box((-np.inf,) * 3, (np.inf,) * 3)
 
 
+class Block(NamedTuple):
+    """A part of the scene.
+
+    box: what it keeps; wide: what it trains, with the margin; near: what later trainings draw as it was trained;
+    photos: indices of training photos; gaussians: expected number, margin included; backdrop: expected Gaussians
+    that its photos show around it in any training; visits: photos, each counted by the part that the block
+    fills, over `WHOLE`.
+    """
+
+    box: Box
+    wide: Box
+    near: Box
+    photos: NDArray[np.intp]
+    gaussians: int
+    backdrop: int
+    visits: float
+
+
 def cut(points: Array, count: int, costs: Array | None = None, between: bool = False) -> list[Box]:
     """Cut space into boxes that cost about the same.
 

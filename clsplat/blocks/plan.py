@@ -1,48 +1,24 @@
-"""The numbers of a training in blocks: the coarse run, how many blocks, their photos, Gaussians and memory."""
+"""The plan of a training in blocks: how many there are, their photos, Gaussians and memory."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.blocks.partition import EVERYWHERE, MARGIN, Box, cut
+from clsplat.blocks.partition import EVERYWHERE, MARGIN, Block, Box, cut
+from clsplat.blocks.settings import COARSE_SHARE, REFINING_LENGTHS, block_config
 from clsplat.blocks.survey import block_weights, chosen_photos, shown_in, survey
-from clsplat.config import CoarseConfig, TrainConfig
+from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene
-from clsplat.training.autosize.validation import FEWEST_PHOTOS
 from clsplat.training.memory import Footprint, bytes_text
 from clsplat.training.outcome import FEWEST_GAUSSIANS
-from clsplat.training.preparation import of_fixed_size
-from clsplat.training.run_length import with_length
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
-
-    from clsplat.device import Device
-
-COARSE_FACTOR: Literal[2] = 2
-"""Divisor of the photos' edges in the coarse run."""
-
-COARSE_LENGTH = 1 / 3
-"""Iterations of the coarse run, as a fraction of those that the configuration has."""
-
-COARSE_SHARE = 1 / COARSE_FACTOR**2
-"""Gaussians of the coarse run, as a fraction of those of the whole scene: as many per pixel."""
-
-REFINING_LENGTHS = 1 / 2, 1
-"""Iterations of the trainings of a block among the trained ones, as fractions of those of its first one (measured:
-docs/experiments/blocks.md)."""
-
-REFINING_MEANS = 1 / 10
-"""Factor on the first learning rate of the means in these trainings. It becomes that of the middle of a training,
-in which the rate falls by a factor of 100."""
-
-REFINING_RATES = 1 / 2
-"""Factor on the other learning rates in these trainings (measured: docs/experiments/blocks.md)."""
 
 NEAR = 0.25
 """Width of the surroundings that later trainings draw as they were trained, where memory is too small for all of
@@ -59,34 +35,12 @@ RESERVE = 1 / 10
 """Fraction of the memory's limit that a plan leaves free: trained Gaussians are not spread as the coarse ones
 (effect: docs/experiments/blocks.md)."""
 
-COARSE_MEMORY = 1 / 2
-"""Fraction of the memory's limit that the Gaussians of the coarse run may take. With less, they are larger, and
-photos belong to more blocks (effect: docs/experiments/blocks.md)."""
-
-
-class Block(NamedTuple):
-    """A part of the scene.
-
-    box: what it keeps; wide: what it trains, with the margin; near: what later trainings draw as it was trained;
-    photos: indices of training photos; gaussians: expected number, margin included; backdrop: expected Gaussians
-    that its photos show around it in any training; visits: photos, each counted by the part that the block
-    fills, over `WHOLE`.
-    """
-
-    box: Box
-    wide: Box
-    near: Box
-    photos: NDArray[np.intp]
-    gaussians: int
-    backdrop: int
-    visits: float
-
 
 class Plan(NamedTuple):
     """Two cuts of a scene into blocks, whose borders differ.
 
     blocks: those of the first and the last training; between: those of the one in between; total: expected number of
-    the scene's Gaussians; memory: expected bytes of the largest block.
+    the scene's Gaussians, with the sky; memory: expected bytes of the largest block.
     """
 
     blocks: list[Block]
@@ -128,92 +82,21 @@ class Plan(NamedTuple):
         )
 
 
-def check_blocks(config: TrainConfig) -> None:
-    """Raise an InputError if the configuration cannot train blocks."""
-    for name in ("exposure", "poses"):
-        if getattr(config, name):
-            raise InputError(
-                f"--{name}: expected a training without --blocks, found both: each block would learn its own values "
-                "for the same photo; leave out one of them"
-            )
-    if config.filter_3d:
-        raise InputError(
-            "--filter-3d: expected a training without --blocks, found both: a block trains several times, and each "
-            "training would widen its Gaussians again; leave out one of them"
-        )
-
-
-def one_fits(scene: Scene, config: TrainConfig, device: "Device") -> bool:
-    """Whether blocks are not needed, as far as this is known before the coarse run."""
-    if config.blocks != "auto" or config.max_gaussians is None:
-        return config.blocks == 1
-    return Footprint.of(scene, config, device).total(config.max_gaussians) <= device.memory_limit
-
-
-def coarse_config(config: TrainConfig, scene: Scene, device: "Device") -> TrainConfig:
-    """The configuration of the run over all photos from which blocks are cut."""
-    most = Footprint.of(scene, config, device).most_gaussians(round(COARSE_MEMORY * device.memory_limit))
-    wanted = most if config.max_gaussians is None else max(1, round(COARSE_SHARE * config.max_gaussians))
-    return replace(
-        config,
-        blocks=1,
-        iterations=max(1, round(COARSE_LENGTH * config.iterations)),
-        max_gaussians=max(1, min(most, wanted)),
-        coarse=CoarseConfig(factor=COARSE_FACTOR, until=1.0),
-        init=replace(config.init, sky=False),  # no block would contain the sky
-        eval_every=0,
-    )
-
-
-def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig:
-    """The configuration of a block.
-
-    It trains for as many iterations as its photos alone would, counted by the part of them that it fills, and at most
-    those of the whole configuration. All bands of its harmonics train from the first iterations on.
-    """
-    photos = max(1, round(block.visits))
-    largest = max((scene.train[i] for i in block.photos), key=lambda view: view.camera.width * view.camera.height)
-    alone = with_length(replace(config, iterations=0), replace(scene, train=[largest] * photos)).iterations
-    return replace(
-        config,
-        blocks=1,
-        iterations=min(config.iterations, max(alone, round(config.iterations * photos / len(scene.train)))),
-        max_gaussians=None if config.max_gaussians is None else block.gaussians,
-        optim=replace(config.optim, sh_degree_every=1),
-        coarse=CoarseConfig(factor=1),
-        eval_every=0,
-    )
-
-
-def refining_config(config: TrainConfig, scene: Scene, block: Block, gaussians: int, length: float) -> TrainConfig:
-    """The configuration of a block's training among the trained blocks; gaussians: number that the block has; length:
-    its iterations, as a fraction of those of the first training."""
-    first = block_config(config, scene, block)
-    iterations = max(1, round(length * first.iterations))
-    made = of_fixed_size(first, gaussians, REFINING_MEANS)
-    names = ("log_scales_lr", "quats_lr", "logit_opacities_lr", "sh0_lr", "sh_rest_lr")
-    rates = {name: REFINING_RATES * getattr(made.optim, name) for name in names}
-    return replace(made, iterations=iterations, optim=replace(made.optim, **rates))
-
-
-def expected_total(config: TrainConfig, coarse: int) -> int:
-    """Expected number of Gaussians of the whole scene, by the configuration or by those of the coarse run."""
-    return round(coarse / COARSE_SHARE) if config.max_gaussians is None else config.max_gaussians
-
-
-def make_plan(coarse: Gaussians, scene: Scene, config: TrainConfig, renderer: Renderer) -> Plan:
+def make_plan(coarse: Gaussians, scene: Scene, config: TrainConfig, renderer: Renderer, sky: int = 0) -> Plan:
     """Cut a scene into blocks and choose the photos of each.
 
     Parameters
     ----------
     coarse : Gaussians
-        The result of the coarse run, on the host.
+        The result of the coarse run without the sky, on the host.
     scene : Scene
     config : TrainConfig
         Its `blocks` is the number of blocks, or "auto" for a number of which each fits the device's limit, while one
         block less would not.
     renderer : Renderer
         With a device.
+    sky : int
+        Number of Gaussians of the sky: each block draws them, and none trains them.
 
     Returns
     -------
@@ -228,37 +111,40 @@ def make_plan(coarse: Gaussians, scene: Scene, config: TrainConfig, renderer: Re
     assert renderer.device
     need, limit = Footprint.of(scene, config, renderer.device), renderer.device.memory_limit
     usable = round((1 - RESERVE) * limit)
-    total, most = expected_total(config, len(coarse)), max(1, len(coarse) // FEWEST_GAUSSIANS)
-    if config.blocks == "auto" and need.total(total) <= limit:
+    cap, most = config.max_gaussians, max(1, len(coarse) // FEWEST_GAUSSIANS)
+    total = round(len(coarse) / COARSE_SHARE) if cap is None else max(1, cap - sky)
+    if config.blocks == "auto" and need.total(total + sky) <= limit:
         whole = Block(EVERYWHERE, EVERYWHERE, EVERYWHERE, np.arange(len(scene.train)), total, 0, len(scene.train))
-        return Plan([whole], [whole], total, need.total(total))
+        return Plan([whole], [whole], total + sky, need.total(total + sky))
     if config.blocks != "auto" and config.blocks > most:
         raise InputError(
             f"--blocks: expected at most {most}, as the coarse scene has {len(coarse)} Gaussians, found "
             f"{config.blocks}; use fewer blocks"
         )
-    fewest = max(config.few.below, FEWEST_PHOTOS)  # so that a block may search its size
+    fewest = config.few.below  # with fewer, a block would need its settings for few photos
     fitting = config.blocks == "auto"
-    ground = _Ground(coarse.means, survey(renderer, coarse, scene.train), total, fewest, need, usable, fitting)
+    ground = _Ground(coarse.means, survey(renderer, coarse, scene.train), total, sky, fewest, need, usable, fitting)
     if config.blocks == "auto":
         cuts = _fitting(ground, -(-total // max(1, need.most_gaussians(usable))), most)
     else:
         cuts, _ = _cuts(ground, config.blocks)
     blocks, between = ([_among_all(ground, block) for block in each] for each in cuts)
-    return Plan(blocks, between, total, max(_memory(block, need) for block in (*blocks, *between)))
+    return Plan(blocks, between, total + sky, max(_memory(block, need) for block in (*blocks, *between)))
 
 
 class _Ground(NamedTuple):
     """What the cuts of a scene are made from.
 
     means (N, 3): of the coarse Gaussians; surveyed (V, N): their weights in the photos; total: expected Gaussians of
-    the scene; fewest: photos that a block has at least; need: memory of training without surroundings; limit: bytes
-    that a block may take; fitting: whether blocks must fit, as their number is found by that.
+    the scene without the sky; sky: those of the sky; fewest: photos that a block has at least; need: memory of
+    training without surroundings; limit: bytes that a block may take; fitting: whether blocks must fit, as their
+    number is found by that.
     """
 
     means: NDArray[np.float64]
     surveyed: "csr_array"
     total: int
+    sky: int
     fewest: int
     need: Footprint
     limit: int
@@ -332,7 +218,7 @@ def _block(ground: _Ground, box: Box, photos: NDArray[np.intp], everything_near:
     around = shown_in(ground.surveyed, photos) & ~trains
     ratio = ground.total / len(ground.means)
     second = round(ratio * (around & drawn).sum()) + int((around & ~drawn).sum())
-    backdrop = max(int(around.sum()), second)
+    backdrop = ground.sky + max(int(around.sum()), second)
     shown = ground.surveyed[photos].astype(np.float64)
     part = (shown @ trains) / np.maximum(shown.sum(axis=1), np.finfo(float).tiny)
     visits = float(part.sum() / WHOLE)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.blocks.plan import Block
+from clsplat.blocks.partition import Block
 from clsplat.config import TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.randomness import stream

@@ -13,7 +13,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.metrics import to_uint8
 from clsplat.renderer import Pass, Renderer, download
 from clsplat.scene import View, in_turn
-from clsplat.stages import Image
+from clsplat.training.contributions import weighted_sums
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -27,9 +27,6 @@ little of it each."""
 
 def weights(renderer: Renderer, gaussians: Gaussians, views: Iterable[View]) -> Iterator[Array]:
     """Sum the compositing weights alpha T of each Gaussian over the pixels of photos.
-
-    The image is linear in a splat's colour, and its derivative by the colour is the splat's weight: one backward pass
-    with an image of ones gives the sums of all Gaussians.
 
     Parameters
     ----------
@@ -49,11 +46,8 @@ def weights(renderer: Renderer, gaussians: Gaussians, views: Iterable[View]) -> 
 
 
 def _weights(renderer: Renderer, run: Pass, mask: NDArray[np.bool_] | None = None) -> Array:
-    shape = run.camera.height, run.camera.width
-    ones = np.zeros((*shape, 3))
-    ones[:, :, 0] = 1 if mask is None else mask
-    v = Image(renderer.upload("v_image", ones), renderer.upload("v_alpha", np.zeros(shape)))
-    return np.asarray(download(renderer.backward_to_splats(run, v).colors)[:, 0], np.float64)
+    shape = run.camera.height, run.camera.width, 1
+    return weighted_sums(renderer, run, np.ones(shape) if mask is None else mask.reshape(shape))[:, 0]
 
 
 def survey(renderer: Renderer, gaussians: Gaussians, views: list[View]) -> "csr_array":

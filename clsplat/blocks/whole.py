@@ -14,19 +14,18 @@ from numpy.typing import NDArray
 from clsplat.atomic import replacing
 from clsplat.blocks.block import Progress, log_of, result_of, train_block
 from clsplat.blocks.jobs import digest_of, make_job, read_job
+from clsplat.blocks.partition import Block
 from clsplat.blocks.parts import read_index, read_part, read_scene, write_index
-from clsplat.blocks.plan import (
+from clsplat.blocks.plan import Plan, make_plan
+from clsplat.blocks.points import sparse_start
+from clsplat.blocks.settings import (
     COARSE_FACTOR,
-    Block,
-    Plan,
     block_config,
     check_blocks,
     coarse_config,
-    make_plan,
     one_fits,
     refining_config,
 )
-from clsplat.blocks.points import sparse_start
 from clsplat.config import BACKGROUNDS, TrainConfig
 from clsplat.errors import InputError
 from clsplat.formats import save_gaussians
@@ -41,6 +40,7 @@ from clsplat.scene import Scene, in_turn
 from clsplat.show.training_curve import read_log
 from clsplat.training.checkpoint import without_free
 from clsplat.training.loop import train
+from clsplat.training.sky_start import beyond, may_have_sky
 
 if TYPE_CHECKING:
     from clsplat.device import Device
@@ -97,31 +97,32 @@ def plan_blocks(
         return [], None
     folder = out / BLOCKS
     folder.mkdir(parents=True, exist_ok=True)
-    file, seconds = _coarse(scene, config, device, folder, watch)
+    scenes, seconds = _coarse(scene, config, device, folder, watch)
     photos = _read_photos(scene)
-    coarse = read_scene(file, (config.init.sh_degree + 1) ** 2)
+    coarse = read_scene(folder / scenes["far"], (config.init.sh_degree + 1) ** 2)
+    sky = sum(part.rows for part in read_index(folder / scenes["sky"])) if scenes["sky"] else 0
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
-    plan = make_plan(coarse, scene, config, renderer)
+    plan = make_plan(coarse, scene, config, renderer, sky)
     if len(plan.blocks) == 1:
         tell(f"blocks: one is enough for about {plan.total} Gaussians")
         return [], None
     tell(plan.describe(config, scene, seconds * COARSE_FACTOR**2))
     jobs = []
     for block in plan.blocks:
-        job = make_job(data.resolve(), file.name, block, scene, photos, block_config(config, scene, block))
+        job = make_job(data.resolve(), scenes, block, scene, photos, block_config(config, scene, block))
         if start := sparse_start(scene, coarse.means, block, config):
-            job = replace(job, points=_written(start, folder, config).name)
+            job = replace(job, points=_written(start, "points", folder, config))
         jobs.append(job.write(folder))
     return jobs, plan
 
 
-def _written(gaussians: Gaussians, folder: Path, config: TrainConfig) -> Path:
-    """Write Gaussians into a folder, and return their index."""
+def _written(gaussians: Gaussians, name: str, folder: Path, config: TrainConfig) -> str:
+    """Write Gaussians into a folder, in a file of a name and their digest, and return the name of their index."""
     digest = digest_of(*(array.tobytes() for array in gaussians.arrays().values()))
-    file = folder / f"points-{digest}.ply"
+    file = folder / f"{name}-{digest}.ply"
     if not file.exists():
         save_gaussians(file, gaussians, config.render.mode)
-    return write_index([file])
+    return write_index([file]).name
 
 
 def plan_refinement(
@@ -155,10 +156,11 @@ def plan_refinement(
     for part in read_index(index):
         means = read_part(folder, part).means
         counts += [block.wide.contains(means).sum() for block in blocks]
-    photos, coarse, refined = _read_photos(scene), read_job(latest[0]).far, []
+    photos, before, refined = _read_photos(scene), read_job(latest[0]), []
+    scenes = {"far": before.far, "sky": before.sky}
     for block, count in zip(blocks, counts.tolist(), strict=True):
         settings = refining_config(config, scene, block, count, length)
-        job = make_job(data.resolve(), coarse, block, scene, photos, settings)
+        job = make_job(data.resolve(), scenes, block, scene, photos, settings)
         refined.append(replace(job, scene=index.name, near=block.near).write(folder))
     return refined
 
@@ -173,8 +175,11 @@ def _read_photos(scene: Scene) -> dict[str, Photo]:
     return photos_of(scene.train, scene.offset)
 
 
-def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, watch: Watch) -> tuple[Path, float]:
-    """Train the coarse scene, unless it exists. Returns its index and the seconds that an iteration took.
+def _coarse(
+    scene: Scene, config: TrainConfig, device: "Device", folder: Path, watch: Watch
+) -> tuple[dict[str, str], float]:
+    """Train the coarse scene, unless it exists. Returns the names of its index, "far", and of that of its sky, "sky",
+    which is empty if there is none; and the seconds that an iteration took.
 
     Photos that stream have not been read before. The run is then named by their names and cameras alone, and the
     record holds a digest of their pixels.
@@ -191,11 +196,13 @@ def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, w
             resume = (work / CHECKPOINT).exists()
             gaussians = train(scene, settings, work, device, resume=resume, progress=progress)
         seconds = read_log(work / LOG)[-1]["seconds"] / settings.iterations
+        ground, sky = _parted(gaussians, scene, settings)
+        scenes = {
+            "far": _written(ground, "coarse", folder, settings),
+            "sky": _written(sky, "sky", folder, settings) if len(sky) else "",
+        }
         with replacing(done) as file:
-            save_gaussians(done.with_suffix(".ply"), gaussians, settings.render.mode)
-            index = write_index([done.with_suffix(".ply")])
-            record = {"scene": index.name, "seconds": seconds, "photos": _digest(scene)}
-            file.write(json.dumps(record).encode())
+            file.write(json.dumps({"scenes": scenes, "seconds": seconds, "photos": _digest(scene)}).encode())
         shutil.rmtree(work, ignore_errors=True)
     record = json.loads(done.read_text())
     if record.get("photos", _digest(scene)) != _digest(scene):
@@ -203,7 +210,18 @@ def _coarse(scene: Scene, config: TrainConfig, device: "Device", folder: Path, w
             f"{done}: expected the photos of the coarse run, found other pixels or masks; start a new run in another "
             "folder"
         )
-    return folder / record["scene"], record["seconds"]
+    return record["scenes"], record["seconds"]
+
+
+def _parted(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> tuple[Gaussians, Gaussians]:
+    """Part a coarse scene into what blocks train, and the sky.
+
+    All photos show the sky: it would belong to no block, and whoever trained it would need them all.
+    """
+    sky = beyond(gaussians, scene) if may_have_sky(scene, config) else np.zeros(len(gaussians), bool)
+    if sky.all():
+        sky[:] = False
+    return gaussians.take(~sky), gaussians.take(sky)
 
 
 def _digest(scene: Scene) -> str:
@@ -223,17 +241,25 @@ def run_here(jobs: list[Path], scene: Scene, device: "Device", watch: Watch) -> 
                 train_block(job, scene.train, device, progress)
 
 
-def merge(jobs: list[Path], path: Path, offset: NDArray[np.float64] | None = None) -> int:
-    """Join the results of blocks in their order, whoever computed them, into a PLY.
+def files_of(jobs: list[Path]) -> list[Path]:
+    """The files of a scene: the results of its blocks in their order, whoever computed them, and the sky."""
+    sky = read_job(jobs[0]).sky
+    parts = read_index(jobs[0].with_name(sky)) if sky else []
+    return [*map(result_of, jobs), *(jobs[0].with_name(name) for name in dict.fromkeys(part.file for part in parts))]
 
-    A part of a result is in memory at a time, so that the memory does not grow with the scene.
+
+def merge(files: list[Path], path: Path, offset: NDArray[np.float64] | None = None) -> int:
+    """Join PLYs in their order.
+
+    A part of a file is in memory at a time, so that the memory does not grow with the scene.
 
     Parameters
     ----------
-    jobs : list of Path
+    files : list of Path
+        At least one, as `files_of` returns them.
     path : Path
         The file to write, whole or not at all: in the scene's coordinates, with the highest degree of spherical
-        harmonics that a block has.
+        harmonics that a file has.
     offset : (3,) array, optional
         What was subtracted from the world's coordinates, in world units.
 
@@ -245,12 +271,12 @@ def merge(jobs: list[Path], path: Path, offset: NDArray[np.float64] | None = Non
     Raises
     ------
     InputError
-        If a result cannot be read, or the file cannot be written.
+        If a file cannot be read or written.
     """
-    results = [PlyParts(result_of(job)) for job in jobs]
-    count, most = sum(rows.count for rows in results), max(rows.coefficients for rows in results)
-    parts = (part for rows in results for _, part in rows.chunks())
-    save_ply_parts(path, parts, count, most, results[0].mode, offset)
+    opened = [PlyParts(file) for file in files]
+    count, most = sum(rows.count for rows in opened), max(rows.coefficients for rows in opened)
+    parts = (part for rows in opened for _, part in rows.chunks())
+    save_ply_parts(path, parts, count, most, opened[0].mode, offset)
     return count
 
 

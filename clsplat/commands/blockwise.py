@@ -34,9 +34,9 @@ def train_in_blocks(
     JobsPrinted
         If `where.print_jobs` is set, and blocks have to be trained.
     """
-    from clsplat.blocks.plan import REFINING_LENGTHS
+    from clsplat.blocks.settings import REFINING_LENGTHS
     from clsplat.blocks.stored import StoredScene
-    from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
+    from clsplat.blocks.whole import files_of, merge, plan_blocks, plan_refinement, write_log
     from clsplat.evaluate import mean_metrics
 
     @contextmanager
@@ -55,7 +55,7 @@ def train_in_blocks(
     for training, length in enumerate(REFINING_LENGTHS, 1):
         trained.append(plan_refinement(trained[-1], plan.cut(training), length, scene, config, data))
         _run(trained[-1], scene, renderer.device, watch, where)
-    merge(trained[-1], out / SCENE, scene.offset)
+    merge(files_of(trained[-1]), out / SCENE, scene.offset)
     gaussians = StoredScene(out / SCENE)
     scores = mean_metrics(gaussians, scene.test, renderer) if scene.test else {}
     write_log(out, list(chain(*trained)), {"num_gaussians": len(gaussians)} | scores)

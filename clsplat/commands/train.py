@@ -122,7 +122,7 @@ class Train:
 
     def _check(self) -> None:
         """Refuse settings that exclude each other before anything takes time."""
-        from clsplat.blocks.plan import check_blocks
+        from clsplat.blocks.settings import check_blocks
         from clsplat.training.preparation import check_settings
 
         check_settings(self.settings)

@@ -133,9 +133,16 @@ def empty_space(scene: Scene, config: TrainConfig) -> list[Grid]:
 
 
 def beyond(gaussians: Gaussians, scene: Scene) -> NDArray[np.bool_]:
-    """Tell which Gaussians are so far away that no part of the scene is behind them."""
+    """Tell which Gaussians are at least half as far away as the sky: no part of the scene is behind them."""
+    centre, distance = _around(scene)
+    return np.asarray(np.linalg.norm(gaussians.means - centre, axis=1) > distance / 2)
+
+
+def _around(scene: Scene) -> tuple[Array, float]:
+    """Centre (3,) and radius of the sphere of the sky of a scene with points, world units."""
     centre = np.mean([view.camera.position for view in scene.train], axis=0)
-    return np.asarray(np.linalg.norm(gaussians.means - centre, axis=1) > BEYOND * scene.extent)
+    reach = REACH * float(np.quantile(np.linalg.norm(scene.points - centre, axis=1), FARTHEST))
+    return centre, max(DISTANCE * scene.extent, reach)
 
 
 def sky_gaussians(scene: Scene, config: TrainConfig, plain: bool = False) -> Gaussians | None:
@@ -153,9 +160,7 @@ def sky_gaussians(scene: Scene, config: TrainConfig, plain: bool = False) -> Gau
     if up is None and color is None:
         return None
     directions = sphere(round(4 * np.pi / SPACING**2))
-    centre = np.mean([view.camera.position for view in scene.train], axis=0)
-    reach = REACH * float(np.quantile(np.linalg.norm(scene.points - centre, axis=1), FARTHEST))
-    distance = max(DISTANCE * scene.extent, reach)
+    centre, distance = _around(scene)
     means = centre + distance * directions
     colors, shown, as_sky = np.zeros_like(means), np.zeros(len(means), int), np.zeros(len(means), int)
     for view in in_turn(views):

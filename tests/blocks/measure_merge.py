@@ -63,7 +63,7 @@ def main() -> None:
         parts = (part.take(np.arange(min(CHUNK, size - first))) for first in range(0, size, CHUNK))
         save_ply_parts(result_of(job), parts, size, 16)
     count, results = size * blocks, [result_of(job) for job in jobs]
-    measured("merge", count, lambda: merge(jobs, folder / "scene.ply"))
+    measured("merge", count, lambda: merge(results, folder / "scene.ply"))
     measured("index", count, lambda: write_index(results))
     index = write_index(results)
     measured("read", count, lambda: [len(read_part(folder, part)) for part in read_index(index)])

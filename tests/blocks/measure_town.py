@@ -22,7 +22,7 @@ import numpy as np
 from town import write_town
 
 from clsplat.atomic import replacing
-from clsplat.blocks.plan import REFINING_LENGTHS
+from clsplat.blocks.settings import REFINING_LENGTHS
 from clsplat.blocks.whole import BLOCKS
 from clsplat.device import Device
 from clsplat.training.memory import Footprint

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from small_run import with_strategy
 
-from clsplat.blocks.plan import Block, Plan
+from clsplat.blocks.partition import Block
+from clsplat.blocks.plan import Plan
 from clsplat.blocks.whole import plan_blocks, plan_refinement
 from clsplat.config import FewViewsConfig, TrainConfig
 from clsplat.dataset import load_scene
@@ -17,7 +18,7 @@ from clsplat.device import Device
 from clsplat.scene import Scene
 from clsplat.training.preparation import prepare
 
-CONFIG = replace(with_strategy("error"), max_gaussians=240, iterations=40, few=FewViewsConfig(below=3))
+CONFIG = replace(with_strategy("error"), max_gaussians=240, iterations=40, few=FewViewsConfig(below=8))
 
 
 @contextmanager

@@ -11,13 +11,13 @@ import pytest
 from PIL import Image
 from small_plan import Planned, plan, unseen
 
-from clsplat.blocks.block import _start, _trained, result_of, train_block
+from clsplat.blocks.block import _Start, _start, _trained, result_of, train_block
 from clsplat.blocks.jobs import read_job
 from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.parts import read_index, read_scene
-from clsplat.blocks.plan import REFINING_LENGTHS
+from clsplat.blocks.settings import REFINING_LENGTHS
 from clsplat.blocks.survey import seen_by_block
-from clsplat.blocks.whole import merge, plan_blocks, plan_refinement, write_log
+from clsplat.blocks.whole import files_of, merge, plan_blocks, plan_refinement, write_log
 from clsplat.config import DataConfig
 from clsplat.dataset import loading
 from clsplat.dataset.decoding import Dataset, load_views
@@ -46,7 +46,7 @@ def test_results_merge_to_the_same_bits_in_any_order(planned: Planned, device: D
         train_block(job)
     assert [result_of(j).read_bytes() for j in others] == [result_of(j).read_bytes() for j in planned.jobs]
 
-    count = merge(planned.jobs, tmp_path / "scene.ply")
+    count = merge(files_of(planned.jobs), tmp_path / "scene.ply")
     means = [load_gaussians(result_of(job))[0].means for job in planned.jobs]
     np.testing.assert_array_equal(load_gaussians(tmp_path / "scene.ply")[0].means, np.concatenate(means))
     for job, inside in zip(planned.jobs, means, strict=True):
@@ -131,14 +131,15 @@ def test_a_block_takes_the_memory_of_its_training(planned: Planned, tmp_path: Pa
     opacities = np.where(np.arange(7000) < 3500, 1.0, -9.0).astype(np.float32)  # the last ones are invisible
     sh = np.zeros((7000, (job.config.init.sh_degree + 1) ** 2, 3), np.float32)
     quats = np.tile(np.float32([1, 0, 0, 0]), (7000, 1))
-    start = Gaussians(means[rows], np.full((7000, 3), -4, np.float32), quats, opacities, sh)
+    gaussians = Gaussians(means[rows], np.full((7000, 3), -4, np.float32), quats, opacities, sh)
+    start = _Start(gaussians, trains[rows], [])
     config = replace(job.config, max_gaussians=2000)
     views = job.views(planned.scene.train)
     limit = Footprint.of(planned.scene, config, Device(), backdrop=1500).total(2000)
     device = Device(memory_limit=limit)
     (tmp_path / "work").mkdir()
     for _ in range(2):
-        _trained(replace(job, config=config), start, [], views, device, tmp_path / "work", lambda record: None, 1)
+        _trained(replace(job, config=config), start, views, device, tmp_path / "work", lambda record: None, 1)
     assert 0.5 * limit < device.memory_peak <= limit
 
 
@@ -174,7 +175,7 @@ def test_only_the_photos_of_a_block_are_decoded(
 
 DAMAGE = {
     "changed": (lambda c: c | {"wide": c["box"]}, "expected a job as it was written, found a changed one"),
-    "format": (lambda c: c | {"format": 9}, "expected a job of format 3, found 9"),
+    "format": (lambda c: c | {"format": 9}, "expected a job of format 4, found 9"),
     "no photos": (lambda c: {k: v for k, v in c.items() if k != "photos"}, "found KeyError"),
     "setting": (lambda c: c | {"config": {"nonsense": 1}}, "found no such setting"),
     "list": (lambda c: [c], "found TypeError"),
@@ -224,7 +225,7 @@ def test_a_second_training_is_surrounded_by_the_first_ones(
     second = planned.again()
     assert second == planned.again()
     assert not set(second) & set(planned.jobs)
-    merge(planned.jobs, tmp_path / "first.ply")
+    merge(files_of(planned.jobs), tmp_path / "first.ply")
     first = load_gaussians(tmp_path / "first.ply")[0]
     job = read_job(second[0])
     np.testing.assert_array_equal(read_scene(second[0].with_name(job.scene), 1).means, first.means)
@@ -237,7 +238,7 @@ def test_a_second_training_is_surrounded_by_the_first_ones(
     path = planned.again([block._replace(near=near) for block in planned.plan.between])[0]
     far = read_scene(path.with_name(job.far), 1)
     monkeypatch.setattr("clsplat.blocks.sight.may_see", lambda camera, bounds, config: bounds.radius > 0)
-    start = _start(path, read_job(path))
+    start = _start(path, read_job(path)).gaussians
     inside = near.contains(first.means)
     np.testing.assert_array_equal(
         start.means, np.concatenate([first.means[inside], far.means[~near.contains(far.means)]])

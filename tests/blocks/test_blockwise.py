@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from cli_runs import fails, run
 
-from clsplat.blocks.plan import REFINING_LENGTHS
+from clsplat.blocks.settings import REFINING_LENGTHS
 from clsplat.formats import load_gaussians
 
 TRAIN = (

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.blocks.block import result_of
 from clsplat.blocks.whole import merge
 from clsplat.errors import InputError
 from clsplat.formats import load_gaussians, save_gaussians
@@ -20,15 +19,15 @@ ROWS = 500
 """Rows in memory at a time."""
 
 
-def results(folder: Path, degrees: list[int], count: int) -> list[Path]:
-    """Jobs with results of some degrees of spherical harmonics."""
-    jobs = []
+def written(folder: Path, degrees: list[int], count: int) -> list[Path]:
+    """PLYs of some degrees of spherical harmonics."""
+    files = []
     for k, degree in enumerate(degrees):
         gaussians = synthetic_scene(count, seed=k)[0]
         part = Gaussians(**gaussians.arrays() | {"sh": gaussians.sh[:, : (degree + 1) ** 2]})
-        jobs.append(folder / f"{k}.json")
-        save_gaussians(result_of(jobs[-1]), part, "antialiased")
-    return jobs
+        files.append(folder / f"{k}.ply")
+        save_gaussians(files[-1], part, "antialiased")
+    return files
 
 
 @pytest.fixture(autouse=True)
@@ -37,33 +36,33 @@ def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_merge_has_the_bytes_of_the_whole_scene(tmp_path: Path) -> None:
-    jobs = results(tmp_path, [1, 2, 0], 3 * ROWS - 7)
-    parts = [with_coefficients(load_gaussians(result_of(job))[0], 9) for job in jobs]
+    files = written(tmp_path, [1, 2, 0], 3 * ROWS - 7)
+    parts = [with_coefficients(load_gaussians(file)[0], 9) for file in files]
     save_gaussians(tmp_path / "expected.ply", Gaussians.concatenate(parts), "antialiased", OFFSET)
-    assert merge(jobs, tmp_path / "scene.ply", OFFSET) == 3 * (3 * ROWS - 7)
+    assert merge(files, tmp_path / "scene.ply", OFFSET) == 3 * (3 * ROWS - 7)
     assert (tmp_path / "scene.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()
 
 
 def test_the_memory_does_not_grow_with_the_scene(tmp_path: Path) -> None:
-    jobs = results(tmp_path, [2] * 8, 4 * ROWS)
+    files = written(tmp_path, [2] * 8, 4 * ROWS)
     peaks = []
     for count in (2, 2, 8):  # the first one imports modules
         tracemalloc.start()
-        merge(jobs[:count], tmp_path / "scene.ply")
+        merge(files[:count], tmp_path / "scene.ply")
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     whole = 8 * 4 * ROWS * 4 * (14 + 3 * 9)  # bytes of float32
-    # The headers of six more results take some kilobytes each.
+    # The headers of six more files take some kilobytes each.
     assert peaks[2] < peaks[1] + 0.1 * whole and peaks[2] < 0.6 * whole
 
 
 def test_a_damaged_result_leaves_the_earlier_scene(tmp_path: Path) -> None:
-    jobs = results(tmp_path, [1, 1], 2 * ROWS)
+    files = written(tmp_path, [1, 1], 2 * ROWS)
     (tmp_path / "scene.ply").write_bytes(b"earlier")
-    content = bytearray(result_of(jobs[1]).read_bytes())
+    content = bytearray(files[1].read_bytes())
     content[-4:] = np.float32(np.nan).tobytes()
-    result_of(jobs[1]).write_bytes(content)
+    files[1].write_bytes(content)
     with pytest.raises(InputError, match=r"1\.ply: expected finite values"):
-        merge(jobs, tmp_path / "scene.ply")
+        merge(files, tmp_path / "scene.ply")
     assert (tmp_path / "scene.ply").read_bytes() == b"earlier"
     assert {path.suffix for path in tmp_path.iterdir()} == {".ply"}

@@ -87,4 +87,4 @@ def test_a_second_training_reads_what_its_photos_show(
     (folder / "hidden.ply").unlink()
     assert train_block(second, planned.scene.train, device).read_bytes() == expected
     assert train_block(path, planned.scene.train, device).read_bytes() == expected
-    assert merge([path], tmp_path / "scene.ply") > 40
+    assert merge([result_of(path)], tmp_path / "scene.ply") > 40

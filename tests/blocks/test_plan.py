@@ -7,27 +7,25 @@ import pytest
 from small_plan import CONFIG
 from small_run import known_scene
 
-from clsplat.blocks.partition import EVERYWHERE
-from clsplat.blocks.plan import (
+from clsplat.blocks.partition import EVERYWHERE, Block, Box
+from clsplat.blocks.plan import RESERVE, WHOLE, make_plan
+from clsplat.blocks.settings import (
     REFINING_LENGTHS,
-    RESERVE,
-    WHOLE,
-    Block,
     block_config,
     check_blocks,
     coarse_config,
-    make_plan,
     one_fits,
     refining_config,
 )
 from clsplat.camera import Camera
-from clsplat.config import TrainConfig
+from clsplat.config import FewViewsConfig, TrainConfig
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.renderer import Renderer
 from clsplat.scene import Scene
 from clsplat.testing import synthetic_scene
+from clsplat.training.autosize.rule import full_size, reach
 from clsplat.training.memory import Footprint
 from clsplat.training.preparation import check_memory
 
@@ -159,11 +157,26 @@ def test_one_block_is_known_before_the_coarse_run(device: Device) -> None:
     assert one_fits(scene, CONFIG, device)
 
 
+def test_the_size_of_a_block_is_not_searched() -> None:
+    """It is the expected one, and at most what a search would let its photos and points grow to."""
+    scene, config = known_scene(), replace(CONFIG, size="auto", max_gaussians=None)
+    block = Block(EVERYWHERE, EVERYWHERE, EVERYWHERE, np.arange(3), 900, 0, 3.0)
+    searched = full_size(scene, len(scene.points), config)
+    assert 900 < searched < 9000
+    for gaussians, expected in ((900, 900), (9000, round(searched))):
+        settings = block_config(config, scene, block._replace(gaussians=gaussians))
+        assert (settings.size, settings.max_gaussians) == ("fixed", expected)
+    nowhere = block._replace(wide=Box((9, 9, 9), (10, 10, 10)), gaussians=9000)
+    assert block_config(config, scene, nowhere).max_gaussians == round(reach(scene, config)), "one per pixel"
+    without = replace(scene, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8))
+    assert block_config(config, without, block).max_gaussians == 900
+
+
 def test_configurations(device: Device) -> None:
     scene = known_scene()
-    config = replace(CONFIG, iterations=9000, max_gaussians=1000)
+    config = replace(CONFIG, iterations=9000, max_gaussians=1000, few=FewViewsConfig(below=3))
     coarse = coarse_config(config, scene, device)
-    assert (coarse.iterations, coarse.max_gaussians, coarse.coarse.factor) == (3000, 250, 2)
+    assert (coarse.iterations, coarse.max_gaussians, coarse.coarse.factor) == (9000, 250, 2)
     block = Block(EVERYWHERE, EVERYWHERE, EVERYWHERE, np.arange(3), 300, 0, 3.0)
     settings = block_config(config, scene, block)
     # Three photos alone would train for 3000 iterations; a quarter of all photos' visits are 2250.

@@ -19,12 +19,15 @@ from clsplat.blocks import cluster, transport
 from clsplat.blocks.block import log_of, result_of, train_block
 from clsplat.blocks.cluster import run_on_cluster
 from clsplat.blocks.jobs import make_job, read_job
+from clsplat.blocks.parts import write_index
 from clsplat.blocks.transport import Cache, Desk
 from clsplat.dataset.brightness import evened
 from clsplat.device import Device
 from clsplat.errors import InputError
+from clsplat.formats import save_gaussians
 from clsplat.inputs import photos_of
 from clsplat.scene import DepthMap
+from clsplat.testing import synthetic_scene
 
 distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
 
@@ -53,12 +56,20 @@ def two_workers(**options: Any) -> Iterator[Any]:
         yield started
 
 
+def under_a_sky(planned: Planned) -> Planned:
+    """The same blocks before Gaussians that none of them trains."""
+    folder, sky = planned.jobs[0].parent, synthetic_scene(50, seed=3)[0]
+    save_gaussians(folder / "sky.ply", replace(sky, means=sky.means + np.float32([0, 0, 9])))
+    index = write_index([folder / "sky.ply"]).name
+    return replace(planned, jobs=[replace(read_job(job), sky=index).write(folder) for job in planned.jobs])
+
+
 def test_workers_without_a_shared_folder_give_the_same_bytes(
     dataset: Path, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected = plan(dataset, device, tmp_path / "alone", 3)
+    expected = under_a_sky(plan(dataset, device, tmp_path / "alone", 3))
     results = [train_block(job, expected.scene.train, device).read_bytes() for job in expected.jobs]
-    planned = plan(dataset, device, tmp_path / "run", 3)
+    planned = under_a_sky(plan(dataset, device, tmp_path / "run", 3))
     monkeypatch.setattr(transport, "CHUNK", SMALL)
     sizes: list[int] = []
     monkeypatch.setattr(transport, "crc32", lambda data: sizes.append(len(data)) or crc32(data))
@@ -155,7 +166,7 @@ def test_photos_arrive_with_all_their_layers(
     config = replace(CONFIG, memory_limit=memory)
     block = planned.plan.blocks[0]._replace(photos=np.arange(len(views)))
     scene = replace(planned.scene, train=views, gains={views[1].name: np.array([2.0, 1.0, 1.0])})
-    job = make_job(tmp_path, "scene", block, scene, photos_of(views, np.zeros(3)), config)
+    job = make_job(tmp_path, {"far": "scene", "sky": ""}, block, scene, photos_of(views, np.zeros(3)), config)
     assert read_job(job.write(tmp_path)).gains == job.gains == {views[1].name: [2.0, 1.0, 1.0]}
     with Desk(None, tmp_path, views) as desk:
         found = Cache(tmp_path / "cache", desk.name).photos(job)
