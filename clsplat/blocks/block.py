@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.atomic import replacing
 from clsplat.blocks.jobs import Job, read_job
+from clsplat.blocks.masks import masks_of
 from clsplat.blocks.partition import EVERYWHERE
 from clsplat.blocks.parts import Part, bounds_of, read_index, read_part
 from clsplat.blocks.sight import Bounds, looking_at, seen
@@ -33,6 +34,7 @@ from clsplat.streaming import Files, photo_budget
 from clsplat.training.checkpoint import load_state
 from clsplat.training.loop import complete
 from clsplat.training.memory import Footprint
+from clsplat.training.moving import still
 from clsplat.training.preparation import open_device, photo_memory
 from clsplat.training.run_folder import held
 from clsplat.training.session import Training
@@ -101,7 +103,7 @@ def train_block(
         return result
     job = read_job(job_file)
     start = _start(job_file, job)
-    views = job.views(_loaded(job, beside) if loaded is None else loaded)
+    views = still(job.views(_loaded(job, beside) if loaded is None else loaded), masks_of(job_file, job))
     device = device or open_device(job.config)
     with held(work):
         if not result.exists():

@@ -22,8 +22,8 @@ from clsplat.training.presets import with_settings
 BOXES = ("near", "box", "wide")
 """Boxes of a job."""
 
-SCENES = ("data", "scene", "far", "sky", "points")
-"""Names of folders and files of a job."""
+NAMES = ("data", "scene", "far", "sky", "points", "moving")
+"""Folders and files of a job."""
 
 FIT = ("inverse", "scale", "shift")
 """Fields of a depth map that its fit to the scene's points determines."""
@@ -39,7 +39,8 @@ class Job:
     data: folder of the dataset; scene: name of the index (`clsplat.blocks.parts`), beside the job's file, of the
     Gaussians from which the block starts and that surround it; near: where these are used; far: the index of those
     elsewhere; sky: the index of those of the sky, which no block trains, or empty; points: the index of Gaussians at
-    sparse points, which the block trains, too, or empty; box, wide: what the block keeps and trains; photos: digests
+    sparse points, which the block trains, too, or empty; moving: the file of the masks of what moves
+    (`clsplat.blocks.masks`), or empty; box, wide: what the block keeps and trains; photos: digests
     of pixels and mask, by name; cameras: as the scene has them, by name; depths: for photos with a depth map, by
     name, the digest of its values and its fit to the points; gains: factors by which the colours of photos are
     divided, by name; config: settings of the block.
@@ -51,6 +52,7 @@ class Job:
     far: str
     sky: str
     points: str
+    moving: str
     box: Box
     wide: Box
     photos: dict[str, Photo]
@@ -75,6 +77,7 @@ class Job:
             "far": self.far,
             "sky": self.sky,
             "points": self.points,
+            "moving": self.moving,
             **{name: [_face(side) for side in getattr(self, name)] for name in BOXES},
             "photos": {
                 name: {"pixels": photo.pixels, "mask": photo.mask, "camera": self.cameras[name]}
@@ -135,26 +138,25 @@ class Job:
 
 
 def make_job(
-    data: Path, scenes: dict[str, str], block: Block, scene: Scene, photos: dict[str, Photo], config: TrainConfig
+    data: Path, names: dict[str, str], block: Block, scene: Scene, photos: dict[str, Photo], config: TrainConfig
 ) -> Job:
     """Make the job of a block in the coarse scene, without sparse points.
 
-    scenes: the names of its indices "far" and "sky"; scene: with the photos of the block; photos: digests of all
-    photos; config: settings of the block.
+    names: files of the coarse run, "far", "sky" and "moving"; scene: with the photos of the block; photos: digests of
+    all photos; config: settings of the block.
     """
     views = [scene.train[i] for i in block.photos]
-    names = [view.name for view in views]
     cameras = {view.name: asdict(view.camera) | {"viewmat": view.camera.viewmat.tolist()} for view in views}
-    own = {name: photos[name] for name in names}
+    own = {view.name: photos[view.name] for view in views}
     depths = {
         view.name: {"values": digest(depth.values), "fit": {name: getattr(depth, name) for name in FIT}}
         for view in views
         if (depth := view.depth)
     }
-    gains = {name: scene.gains[name].tolist() for name in names if name in scene.gains}
-    names_of: dict[str, Any] = {"data": str(data), "scene": scenes["far"], **scenes, "points": ""}
+    gains = {name: scene.gains[name].tolist() for name in own if name in scene.gains}
+    files: dict[str, Any] = {"data": str(data), "scene": names["far"], **names, "points": ""}
     boxes: dict[str, Any] = {"near": EVERYWHERE, "box": block.box, "wide": block.wide}
-    return Job(**names_of, **boxes, photos=own, cameras=cameras, depths=depths, gains=gains, config=config)
+    return Job(**files, **boxes, photos=own, cameras=cameras, depths=depths, gains=gains, config=config)
 
 
 def read_job(path: Path) -> Job:
@@ -170,13 +172,13 @@ def read_job(path: Path) -> Job:
         if content["format"] != FORMAT:
             raise InputError(f"{path}: expected a job of format {FORMAT}, found {content['format']!r}")
         boxes: dict[str, Any] = {n: Box(_corner(content[n][0], -1), _corner(content[n][1], 1)) for n in BOXES}
-        scenes: dict[str, Any] = {name: str(content[name]) for name in SCENES}
+        files: dict[str, Any] = {name: str(content[name]) for name in NAMES}
         photos = {name: Photo(str(p["pixels"]), str(p["mask"]), []) for name, p in content["photos"].items()}
         cameras = {name: dict(p["camera"]) for name, p in content["photos"].items()}
         depths = {str(name): dict(depth) for name, depth in content.get("depths", {}).items()}
         gains = {str(name): [float(x) for x in factor] for name, factor in content.get("gains", {}).items()}
         config = with_settings(TrainConfig(), content["config"], str(path))
-        job = Job(**scenes, **boxes, photos=photos, cameras=cameras, depths=depths, gains=gains, config=config)
+        job = Job(**files, **boxes, photos=photos, cameras=cameras, depths=depths, gains=gains, config=config)
         found = job.digest
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error

@@ -81,7 +81,8 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
 
     It trains for as many iterations as its photos alone would, counted by the part of them that it fills, and at most
     those of the whole configuration. All bands of its harmonics train from the first iterations on. Its size is not
-    searched: the coarse run has seen the photos that would be held back (measured: docs/experiments/blocks.md).
+    searched: the coarse run has seen the photos that would be held back (measured: docs/experiments/blocks.md). What
+    moves has been found by the coarse run, which has all photos.
     """
     photos = max(1, round(block.visits))
     largest = max((scene.train[i] for i in block.photos), key=lambda view: view.camera.width * view.camera.height)
@@ -94,6 +95,7 @@ def block_config(config: TrainConfig, scene: Scene, block: Block) -> TrainConfig
         max_gaussians=_most_of(config, scene, block),
         optim=replace(config.optim, sh_degree_every=1),
         coarse=CoarseConfig(factor=1),
+        mask_moving=False,
         eval_every=0,
     )
 

@@ -291,8 +291,8 @@ def train_from(desk: str, name: str, folder: Path) -> None:
         stack.callback(cache.close)
         job_file = cache.file(name)
         job = read_job(job_file)
-        for scene in {job.scene, job.far, job.sky, job.points} - {""}:
-            cache.file(scene)
+        for named in {job.scene, job.far, job.sky, job.points, job.moving} - {""}:
+            cache.file(named)
         for part in chain((part for _, part, _ in needed_parts(job_file, job)), points_of(job_file, job)):
             cache.rows(part)
         result = train_block(job_file, cache.photos(job))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clsplat.atomic import replacing
 from clsplat.blocks.block import Progress, log_of, result_of, train_block
 from clsplat.blocks.jobs import digest_of, make_job, read_job
+from clsplat.blocks.masks import write_masks
 from clsplat.blocks.partition import Block
 from clsplat.blocks.parts import read_index, read_part, read_scene, write_index
 from clsplat.blocks.plan import Plan, make_plan
@@ -40,6 +41,7 @@ from clsplat.scene import Scene, in_turn
 from clsplat.show.training_curve import read_log
 from clsplat.training.checkpoint import without_free
 from clsplat.training.loop import train
+from clsplat.training.moving_files import load_masks
 from clsplat.training.sky_start import beyond, may_have_sky
 
 if TYPE_CHECKING:
@@ -97,10 +99,10 @@ def plan_blocks(
         return [], None
     folder = out / BLOCKS
     folder.mkdir(parents=True, exist_ok=True)
-    scenes, seconds = _coarse(scene, config, device, folder, watch)
+    names, seconds = _coarse(scene, config, device, folder, watch)
     photos = _read_photos(scene)
-    coarse = read_scene(folder / scenes["far"], (config.init.sh_degree + 1) ** 2)
-    sky = sum(part.rows for part in read_index(folder / scenes["sky"])) if scenes["sky"] else 0
+    coarse = read_scene(folder / names["far"], (config.init.sh_degree + 1) ** 2)
+    sky = sum(part.rows for part in read_index(folder / names["sky"])) if names["sky"] else 0
     renderer = Renderer(device, config.render, BACKGROUNDS[config.data.background])
     plan = make_plan(coarse, scene, config, renderer, sky)
     if len(plan.blocks) == 1:
@@ -109,7 +111,7 @@ def plan_blocks(
     tell(plan.describe(config, scene, seconds * COARSE_FACTOR**2))
     jobs = []
     for block in plan.blocks:
-        job = make_job(data.resolve(), scenes, block, scene, photos, block_config(config, scene, block))
+        job = make_job(data.resolve(), names, block, scene, photos, block_config(config, scene, block))
         if start := sparse_start(scene, coarse.means, block, config):
             job = replace(job, points=_written(start, "points", folder, config))
         jobs.append(job.write(folder))
@@ -157,10 +159,10 @@ def plan_refinement(
         means = read_part(folder, part).means
         counts += [block.wide.contains(means).sum() for block in blocks]
     photos, before, refined = _read_photos(scene), read_job(latest[0]), []
-    scenes = {"far": before.far, "sky": before.sky}
+    names = {"far": before.far, "sky": before.sky, "moving": before.moving}
     for block, count in zip(blocks, counts.tolist(), strict=True):
         settings = refining_config(config, scene, block, count, length)
-        job = make_job(data.resolve(), scenes, block, scene, photos, settings)
+        job = make_job(data.resolve(), names, block, scene, photos, settings)
         refined.append(replace(job, scene=index.name, near=block.near).write(folder))
     return refined
 
@@ -178,8 +180,10 @@ def _read_photos(scene: Scene) -> dict[str, Photo]:
 def _coarse(
     scene: Scene, config: TrainConfig, device: "Device", folder: Path, watch: Watch
 ) -> tuple[dict[str, str], float]:
-    """Train the coarse scene, unless it exists. Returns the names of its index, "far", and of that of its sky, "sky",
-    which is empty if there is none; and the seconds that an iteration took.
+    """Train the coarse scene, unless it exists.
+
+    Returns the names of its index, "far", and of what is empty if there is none: the index of its sky, "sky", and the
+    masks of what moves, "moving"; and the seconds that an iteration took.
 
     Photos that stream have not been read before. The run is then named by their names and cameras alone, and the
     record holds a digest of their pixels.
@@ -197,12 +201,13 @@ def _coarse(
             gaussians = train(scene, settings, work, device, resume=resume, progress=progress)
         seconds = read_log(work / LOG)[-1]["seconds"] / settings.iterations
         ground, sky = _parted(gaussians, scene, settings)
-        scenes = {
+        names = {
             "far": _written(ground, "coarse", folder, settings),
             "sky": _written(sky, "sky", folder, settings) if len(sky) else "",
+            "moving": write_masks(load_masks(work), folder),
         }
         with replacing(done) as file:
-            file.write(json.dumps({"scenes": scenes, "seconds": seconds, "photos": _digest(scene)}).encode())
+            file.write(json.dumps({"names": names, "seconds": seconds, "photos": _digest(scene)}).encode())
         shutil.rmtree(work, ignore_errors=True)
     record = json.loads(done.read_text())
     if record.get("photos", _digest(scene)) != _digest(scene):
@@ -210,7 +215,7 @@ def _coarse(
             f"{done}: expected the photos of the coarse run, found other pixels or masks; start a new run in another "
             "folder"
         )
-    return record["scenes"], record["seconds"]
+    return record["names"], record["seconds"]
 
 
 def _parted(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> tuple[Gaussians, Gaussians]:

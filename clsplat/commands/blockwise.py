@@ -34,10 +34,13 @@ def train_in_blocks(
     JobsPrinted
         If `where.print_jobs` is set, and blocks have to be trained.
     """
+    from clsplat.blocks.jobs import read_job
+    from clsplat.blocks.masks import masks_of
     from clsplat.blocks.settings import REFINING_LENGTHS
     from clsplat.blocks.stored import StoredScene
     from clsplat.blocks.whole import files_of, merge, plan_blocks, plan_refinement, write_log
     from clsplat.evaluate import mean_metrics
+    from clsplat.training.moving_files import save_masks
 
     @contextmanager
     def watch(name: str, settings: "TrainConfig") -> Iterator[Callable[[dict[str, Any]], None]]:
@@ -56,6 +59,7 @@ def train_in_blocks(
         trained.append(plan_refinement(trained[-1], plan.cut(training), length, scene, config, data))
         _run(trained[-1], scene, renderer.device, watch, where)
     merge(files_of(trained[-1]), out / SCENE, scene.offset)
+    save_masks(out, masks_of(first[0], read_job(first[0])))
     gaussians = StoredScene(out / SCENE)
     scores = mean_metrics(gaussians, scene.test, renderer) if scene.test else {}
     write_log(out, list(chain(*trained)), {"num_gaussians": len(gaussians)} | scores)

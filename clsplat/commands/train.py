@@ -284,7 +284,7 @@ def report(
     if failed:
         warn(failed)
     training_curve(out / "log.jsonl", out / "training_curve.png")
-    if config.size == "auto" and config.blocks == 1:  # each block has chosen its own
+    if config.size == "auto" and config.blocks == 1:  # blocks do not search
         say_size(scene, out)
     if scene.test:
         evaluate_held_out(gaussians, scene, config, renderer, out)

@@ -57,9 +57,17 @@ def load_masks(out: Path) -> dict[str, NDArray[np.bool_]]:
     InputError
         If their file is damaged.
     """
-    path = out / MOVING
-    if not path.exists():
-        return {}
+    return read_masks(out / MOVING) if (out / MOVING).exists() else {}
+
+
+def read_masks(path: Path) -> dict[str, NDArray[np.bool_]]:
+    """Read a file of masks.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or is damaged.
+    """
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return unpacked(arrays)

@@ -28,7 +28,7 @@ DISTANCE = 30.0
 differ by a few degrees at most; larger distances gained nothing."""
 
 BEYOND = DISTANCE / 2
-"""Distance from which Gaussians count as sky, in extents of the scene. Dropout keeps them."""
+"""Distance from which dropout keeps Gaussians, in extents of the scene: half of that of the sky."""
 
 REACH = 3.0
 """Least distance of the sky as a factor on that of the points (`FARTHEST`)."""

@@ -4,11 +4,23 @@ import json
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 from cli_runs import fails, run
 
+from clsplat.blocks.block import result_of
+from clsplat.blocks.jobs import read_job
+from clsplat.blocks.masks import masks_of
 from clsplat.blocks.settings import REFINING_LENGTHS
+from clsplat.config import DataConfig
+from clsplat.dataset import load_scene
+from clsplat.errors import InputError
 from clsplat.formats import load_gaussians
+from clsplat.gaussians import Gaussians
+from clsplat.renderer import Renderer
+from clsplat.scene import View
+from clsplat.training import session
+from clsplat.training.moving import Masks
 
 TRAIN = (
     *("--iterations", 40, "--size", "fixed", "--max-gaussians", 240, "--init.no-triangulate", "--few.below", 3),
@@ -53,6 +65,41 @@ def test_a_run_is_like_any_other_and_printed_jobs_make_the_same(
     text = fails(capsys, "train", dataset, "-o", out, *TRAIN, "--blocks", 2, "--resume", "--seed", 1)
     assert "expected the configuration it was made with, --seed 0, found --seed 1" in text
     assert "holds a run already" in fails(capsys, "train", dataset, "-o", out, *TRAIN, "--blocks", 2)
+
+
+def test_what_the_coarse_run_finds_moving_trains_in_no_block(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks = []
+
+    def left_half(renderer: Renderer, gaussians: Gaussians, views: list[View], degree: int) -> Masks:
+        looks.append(len(views))
+        return {views[1].name: np.arange(8)[None].repeat(6, axis=0) < 4}
+
+    monkeypatch.setattr(session, "due", lambda iteration, iterations, found: iteration == 5)
+    monkeypatch.setattr(session, "moving", left_half)
+    out, count = tmp_path / "out", len(load_scene(dataset, DataConfig()).train)
+    run("train", dataset, "-o", out, *TRAIN, "--blocks", 2)
+    said = capsys.readouterr().err
+    assert looks == [count], "blocks do not look for themselves"
+    assert f"moving: 1 of {count} training photos" in said and (out / "moving.png").exists()
+    jobs = [path for path in (out / "blocks").glob("*.json") if not path.stem.startswith("coarse")]
+    assert len(jobs) == 2 + 3 + 2
+    for job in jobs:
+        (mask,) = masks_of(job, read_job(job)).values()
+        assert mask[:, :4].all() and not mask[:, 4:].any()
+
+    run("train", dataset, "-o", tmp_path / "all", *TRAIN, "--blocks", 2, "--no-mask-moving")
+    before = (out / "scene.ply").read_bytes()
+    assert (tmp_path / "all" / "scene.ply").read_bytes() != before
+    for path in (out / "scene.ply", out / "moving.npz", *map(result_of, jobs)):
+        path.unlink()
+    run("train", dataset, "-o", out, *TRAIN, "--blocks", 2, "--resume")
+    assert (out / "scene.ply").read_bytes() == before and looks == [count]
+
+    (out / "blocks" / read_job(jobs[0]).moving).write_bytes((out / "moving.npz").read_bytes() + b" ")
+    with pytest.raises(InputError, match="expected masks as they were written, found a changed file"):
+        masks_of(jobs[0], read_job(jobs[0]))
 
 
 def test_one_block_is_todays_training(dataset: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from clsplat.blocks import cluster, transport
 from clsplat.blocks.block import log_of, result_of, train_block
 from clsplat.blocks.cluster import run_on_cluster
 from clsplat.blocks.jobs import make_job, read_job
+from clsplat.blocks.masks import write_masks
 from clsplat.blocks.parts import write_index
 from clsplat.blocks.transport import Cache, Desk
 from clsplat.dataset.brightness import evened
@@ -57,11 +58,13 @@ def two_workers(**options: Any) -> Iterator[Any]:
 
 
 def under_a_sky(planned: Planned) -> Planned:
-    """The same blocks before Gaussians that none of them trains."""
+    """The same blocks before Gaussians that none of them trains, with masks of what moves."""
     folder, sky = planned.jobs[0].parent, synthetic_scene(50, seed=3)[0]
     save_gaussians(folder / "sky.ply", replace(sky, means=sky.means + np.float32([0, 0, 9])))
     index = write_index([folder / "sky.ply"]).name
-    return replace(planned, jobs=[replace(read_job(job), sky=index).write(folder) for job in planned.jobs])
+    moving = write_masks({view.name: np.arange(80).reshape(8, 10) < 30 for view in planned.scene.train}, folder)
+    jobs = [replace(read_job(job), sky=index, moving=moving).write(folder) for job in planned.jobs]
+    return replace(planned, jobs=jobs)
 
 
 def test_workers_without_a_shared_folder_give_the_same_bytes(
@@ -81,7 +84,7 @@ def test_workers_without_a_shared_folder_give_the_same_bytes(
     assert all(log_of(job).exists() for job in planned.jobs)
     assert max(sizes) == SMALL
     names = {name for names in folders.values() for name in names}
-    assert {Path(name).suffix for name in names} == {".json", ".parts", ".rows", ".npy"}
+    assert {Path(name).suffix for name in names} == {".json", ".parts", ".rows", ".npy", ".npz"}
     assert not list(planned.jobs[0].parent.glob(".*"))
 
 
@@ -166,7 +169,9 @@ def test_photos_arrive_with_all_their_layers(
     config = replace(CONFIG, memory_limit=memory)
     block = planned.plan.blocks[0]._replace(photos=np.arange(len(views)))
     scene = replace(planned.scene, train=views, gains={views[1].name: np.array([2.0, 1.0, 1.0])})
-    job = make_job(tmp_path, {"far": "scene", "sky": ""}, block, scene, photos_of(views, np.zeros(3)), config)
+    job = make_job(
+        tmp_path, {"far": "scene", "sky": "", "moving": ""}, block, scene, photos_of(views, np.zeros(3)), config
+    )
     assert read_job(job.write(tmp_path)).gains == job.gains == {views[1].name: [2.0, 1.0, 1.0]}
     with Desk(None, tmp_path, views) as desk:
         found = Cache(tmp_path / "cache", desk.name).photos(job)
