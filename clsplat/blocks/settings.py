@@ -18,6 +18,14 @@ if TYPE_CHECKING:
 COARSE_FACTOR: Literal[2] = 2
 """Divisor of the photos' edges in the coarse run."""
 
+COARSE_LENGTH = 1 / 3
+"""Iterations of the coarse run, as a fraction of those of the whole training. Longer runs of many photos are worse
+(measured: docs/experiments/blocks.md)."""
+
+COARSE_FEWEST = 1500
+"""Fewest iterations of the coarse run, unless the whole training has fewer. Much shorter runs end in a haze, whatever
+the number of photos (measured: docs/experiments/blocks.md)."""
+
 COARSE_SHARE = 1 / COARSE_FACTOR**2
 """Gaussians of the coarse run, as a fraction of those of the whole scene: as many per pixel."""
 
@@ -62,14 +70,15 @@ def one_fits(scene: Scene, config: TrainConfig, device: "Device") -> bool:
 def coarse_config(config: TrainConfig, scene: Scene, device: "Device") -> TrainConfig:
     """The configuration of the run over all photos from which blocks are cut.
 
-    It is as long as the whole training. What is wrong in the coarse scene, blocks mend by their share of a pixel
-    only: haze of a short run would remain (measured: docs/experiments/blocks.md).
+    It has at least `COARSE_FEWEST` iterations, or those of the whole training if these are fewer. What is wrong in
+    the coarse scene, blocks mend by their share of a pixel only: haze of a short run would remain.
     """
     most = Footprint.of(scene, config, device).most_gaussians(round(COARSE_MEMORY * device.memory_limit))
     wanted = most if config.max_gaussians is None else max(1, round(COARSE_SHARE * config.max_gaussians))
     return replace(
         config,
         blocks=1,
+        iterations=min(config.iterations, max(COARSE_FEWEST, round(COARSE_LENGTH * config.iterations))),
         max_gaussians=max(1, min(most, wanted)),
         coarse=CoarseConfig(factor=COARSE_FACTOR, until=1.0),
         eval_every=0,

@@ -176,7 +176,9 @@ def test_configurations(device: Device) -> None:
     scene = known_scene()
     config = replace(CONFIG, iterations=9000, max_gaussians=1000, few=FewViewsConfig(below=3))
     coarse = coarse_config(config, scene, device)
-    assert (coarse.iterations, coarse.max_gaussians, coarse.coarse.factor) == (9000, 250, 2)
+    assert (coarse.iterations, coarse.max_gaussians, coarse.coarse.factor) == (3000, 250, 2)
+    lengths = {n: coarse_config(replace(config, iterations=n), scene, device).iterations for n in (60, 3000, 30_000)}
+    assert lengths == {60: 60, 3000: 1500, 30_000: 10_000}
     block = Block(EVERYWHERE, EVERYWHERE, EVERYWHERE, np.arange(3), 300, 0, 3.0)
     settings = block_config(config, scene, block)
     # Three photos alone would train for 3000 iterations; a quarter of all photos' visits are 2250.
