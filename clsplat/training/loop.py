@@ -178,7 +178,7 @@ def finish(training: Training, out: Path) -> Gaussians:
     state.move(None)  # what follows needs the device's memory
     if state.search:
         held = [view.name for view in split(scene.train)[1]]
-        write_report(out / "size.json", state.search, training.config, held)
+        write_report(out / "size.json", state.search, len(gaussians), training.config, held)
         views = still(state.corrected(scene.train), state.moving)
         gaussians = without_useless_bands(gaussians, views, training.renderer)
     if state.strategy.leaves_room and training.renderer.backdrop is None:  # other photos may show those of a block

@@ -170,6 +170,7 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     # Each begins with what the one before it came to.
     assert all(a["taken"] in b["n"] for a, b in pairwise(trials))
     assert report["chosen"]["n"] == trials[-1]["taken"] == len(whole) == sizes[-1] < len(scene.points)
+    assert report["chosen"]["n_with_all_photos"] == len(whole)
     assert report["held_back"] == [view.name for view in split(scene.train)[1]]
     degrees = report["degrees"]
     assert report["chosen"]["sh_degree"] == max(degrees, key=lambda p: p["worth"])["sh_degree"] == whole.sh_degree

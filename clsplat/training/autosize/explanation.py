@@ -9,8 +9,10 @@ from clsplat.config import TrainConfig
 from clsplat.training.autosize.rule import SURE, Search, best_degree, sh_bytes
 
 
-def write_report(path: Path, search: Search, config: TrainConfig, held: list[str]) -> None:
+def write_report(path: Path, search: Search, grown: int, config: TrainConfig, held: list[str]) -> None:
     """Write size.json: the rule, the names of the held-back photos, all trials and candidates, and the choice.
+
+    grown is the number of Gaussians after the training with all photos.
 
     least_share is the price per doubling as one of a single Gaussian. A doubling that gains p dB lowers the squared
     error by the fraction p ln(10)/10 and is ln(2) on the natural scale of N. The last Gaussian must therefore lower
@@ -26,7 +28,7 @@ def write_report(path: Path, search: Search, config: TrainConfig, held: list[str
         "held_back": held,
         "price": config.size_price,
         "least_share": config.size_price * log(10) / (10 * log(2)),
-        "chosen": {"n": chosen.n, "sh_degree": chosen.sh_degree},
+        "chosen": {"n": chosen.n, "n_with_all_photos": grown, "sh_degree": chosen.sh_degree},
         "trials": [
             {
                 "iteration": trial.larger.iteration,
@@ -82,7 +84,8 @@ def size_chart(report: Path, path: Path) -> None:
         by_n.plot(trial["n"], price, "--", color=orange, linewidth=1, label=None if name in labelled else name)
         labelled.add(name)
     best = next(p for p in degrees if p["sh_degree"] == chosen["sh_degree"])
-    by_n.axvline(chosen["n"], color=orange, linewidth=0.8, label=f"chosen: {chosen['n']:,}")
+    more = f", {chosen['n_with_all_photos']:,} with all photos" * (chosen["n_with_all_photos"] > chosen["n"])
+    by_n.axvline(chosen["n"], color=orange, linewidth=0.8, label=f"chosen: {chosen['n']:,}{more}")
     by_n.set_xlabel("Gaussians; two sides of a comparison joined, the full one goes on")
     by_n.set_ylabel("quality on the held-back photos, dB")
     by_bytes.plot([p["bytes"] / 1e6 for p in degrees], [p["quality"] for p in degrees], "o-", color=green)
