@@ -70,8 +70,8 @@ def one_fits(scene: Scene, config: TrainConfig, device: "Device") -> bool:
 def coarse_config(config: TrainConfig, scene: Scene, device: "Device") -> TrainConfig:
     """The configuration of the run over all photos from which blocks are cut.
 
-    It has at least `COARSE_FEWEST` iterations, or those of the whole training if these are fewer. What is wrong in
-    the coarse scene, blocks mend by their share of a pixel only: haze of a short run would remain.
+    It has at least `COARSE_FEWEST` iterations, or those of the whole training if these are fewer. Blocks correct the
+    errors of the coarse scene only by their share of a pixel: haze of a short run would remain.
     """
     most = Footprint.of(scene, config, device).most_gaussians(round(COARSE_MEMORY * device.memory_limit))
     wanted = most if config.max_gaussians is None else max(1, round(COARSE_SHARE * config.max_gaussians))

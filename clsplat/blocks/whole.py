@@ -221,7 +221,7 @@ def _coarse(
 def _parted(gaussians: Gaussians, scene: Scene, config: TrainConfig) -> tuple[Gaussians, Gaussians]:
     """Part a coarse scene into what blocks train, and the sky.
 
-    All photos show the sky: it would belong to no block, and whoever trained it would need them all.
+    All photos show the sky. It belongs to no block: to train it, a block would need all of them.
     """
     sky = beyond(gaussians, scene) if may_have_sky(scene, config) else np.zeros(len(gaussians), bool)
     if sky.all():
