@@ -40,10 +40,10 @@ class Job:
     Gaussians from which the block starts and that surround it; near: where these are used; far: the index of those
     elsewhere; sky: the index of those of the sky, which no block trains, or empty; points: the index of Gaussians at
     sparse points, which the block trains, too, or empty; moving: the file of the masks of what moves
-    (`clsplat.blocks.masks`), or empty; box, wide: what the block keeps and trains; photos: digests
-    of pixels and mask, by name; cameras: as the scene has them, by name; depths: for photos with a depth map, by
-    name, the digest of its values and its fit to the points; gains: factors by which the colours of photos are
-    divided, by name; config: settings of the block.
+    (`clsplat.blocks.masks`), or empty; box, wide: what the block keeps and trains; photos: digests of pixels and
+    mask, by name; cameras: as the scene has them, by name; depths: for photos with a depth map, by name, the digest
+    of its values and its fit to the points; gains: factors by which the colours of photos are divided, by name;
+    config: settings of the block.
     """
 
     data: str

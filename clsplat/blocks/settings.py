@@ -19,8 +19,8 @@ COARSE_FACTOR: Literal[2] = 2
 """Divisor of the photos' edges in the coarse run."""
 
 COARSE_LENGTH = 1 / 3
-"""Iterations of the coarse run, as a fraction of those of the whole training. Longer runs of many photos are worse
-(measured: docs/experiments/blocks.md)."""
+"""Iterations of the coarse run, as a fraction of those of the whole training. Longer runs of many photos are not
+better (measured: docs/experiments/blocks.md)."""
 
 COARSE_FEWEST = 1500
 """Fewest iterations of the coarse run, unless the whole training has fewer. Much shorter runs end in a haze, whatever

@@ -2,13 +2,14 @@
 
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cli_runs import fails, run
 
-from clsplat.blocks.block import result_of
+from clsplat.blocks.block import result_of, train_block
 from clsplat.blocks.jobs import read_job
 from clsplat.blocks.masks import masks_of
 from clsplat.blocks.settings import REFINING_LENGTHS
@@ -88,6 +89,10 @@ def test_what_the_coarse_run_finds_moving_trains_in_no_block(
     for job in jobs:
         (mask,) = masks_of(job, read_job(job)).values()
         assert mask[:, :4].all() and not mask[:, 4:].any()
+
+    path, job = next((p, j) for p in jobs if (j := read_job(p)).scene == j.far and {*masks_of(p, j)} <= {*j.photos})
+    unmasked = train_block(replace(job, moving="").write(path.parent))
+    assert unmasked.read_bytes() != result_of(path).read_bytes()
 
     run("train", dataset, "-o", tmp_path / "all", *TRAIN, "--blocks", 2, "--no-mask-moving")
     before = (out / "scene.ply").read_bytes()

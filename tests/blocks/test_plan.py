@@ -116,6 +116,14 @@ def test_photos_count_by_the_part_that_a_block_fills() -> None:
     assert (visits > photos).any(), "a photo that a block fills counts as more than one"
 
 
+def test_each_block_draws_the_sky() -> None:
+    coarse, scene = street(40)
+    config = replace(CONFIG, blocks=4, max_gaussians=None)
+    without, under = (make_plan(coarse, scene, config, Renderer(), sky) for sky in (0, 100))
+    assert [block.backdrop for block in under.blocks] == [block.backdrop + 100 for block in without.blocks]
+    assert under.total == without.total + 100 and under.memory > without.memory
+
+
 def test_points_need_not_fit_if_blocks_do() -> None:
     scene, config = known_scene(), replace(CONFIG, max_gaussians=None)
     need = Footprint.of(scene, config, Device())

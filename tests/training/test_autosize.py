@@ -20,11 +20,13 @@ from clsplat.render import render
 from clsplat.renderer import Renderer, download
 from clsplat.scene import Scene, View
 from clsplat.testing import synthetic_scene
-from clsplat.training.autosize.explanation import size_chart
+from clsplat.training.autosize.explanation import size_chart, write_report
 from clsplat.training.autosize.reduction import costliest_rows, unvalidated
 from clsplat.training.autosize.rule import (
     CHEAPEST,
     TRIAL_RATES,
+    Search,
+    candidate,
     first_pruning,
     growth_bounds,
     most_grown,
@@ -148,6 +150,13 @@ def test_growth_has_a_pace(device: Device) -> None:
     assert most_grown(replace(search, grows=False), CONFIG) == 1000
 
 
+def test_the_report_has_the_size_before_and_after_all_photos_train(tmp_path: Path) -> None:
+    search = Search(40, degrees=[candidate(9, 30, 0, [[20.0, 21.0]], CONFIG)])
+    write_report(tmp_path / "size.json", search, 40, CONFIG, [])
+    chosen = json.loads((tmp_path / "size.json").read_text())["chosen"]
+    assert chosen == {"n": 30, "n_with_all_photos": 40, "sh_degree": 0}
+
+
 def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     """Cap and decisions hold in a short run; interrupted between two trials or within one, it ends with the same
     bits."""
@@ -170,7 +179,6 @@ def test_a_run_settles_and_explains(device: Device, tmp_path: Path) -> None:
     # Each begins with what the one before it came to.
     assert all(a["taken"] in b["n"] for a, b in pairwise(trials))
     assert report["chosen"]["n"] == trials[-1]["taken"] == len(whole) == sizes[-1] < len(scene.points)
-    assert report["chosen"]["n_with_all_photos"] == len(whole)
     assert report["held_back"] == [view.name for view in split(scene.train)[1]]
     degrees = report["degrees"]
     assert report["chosen"]["sh_degree"] == max(degrees, key=lambda p: p["worth"])["sh_degree"] == whole.sh_degree
